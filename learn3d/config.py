@@ -149,7 +149,9 @@ def load_config(path: Path) -> TrainConfig:
     try:
         content = read_bytes(path, limits.CONFIG_BYTES, "the options of a run")
     except FileNotFoundError:
-        raise ValueError(f"no {path}: is this the folder of a training run? One begins without --resume") from None
+        raise ValueError(
+            f"{path} is missing: is this the folder of a run? To start a new run, leave out --resume."
+        ) from None
     try:
         values = parse_json(content)
     except ValueError as error:
@@ -168,7 +170,8 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     """A line for each option of `config` that differs from the run `saved` and must not."""
     old, new = (_flat(c) for c in (saved, config))
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
-    varies = schedule or config.settings.varies_over_run
+    updates = "pose_updates" if config.poses is not None and config.pose_updates > 0 else ""
+    varies = schedule or config.settings.varies_over_run or updates
     allowed = _MAY_DIFFER_NAMES - ({"iterations"} if varies else set())
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"

@@ -16,7 +16,7 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
 from learn3d.data.dataset import ViewDataset
-from learn3d.losses import mmd_from_distances
+from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.surfaces import Surface
@@ -85,8 +85,9 @@ def evaluate(
     """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
 
     Shapes are voxelized in the data set's convention and compared with the object's voxels. If poses are known, the
-    silhouette of a mesh at the camera of another image of the object is compared with that image's mask. Without
-    voxels, an object's only image is compared with its own mask.
+    silhouette of a mesh at the camera of another image of the object is compared with that image's mask. An
+    object's only image is compared with its own mask. If voxels are known and no object has a second image, silhouettes
+    are left out. A method in training is measured with its EMA weights.
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
     detailed: add the voxel IoU with kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
@@ -101,9 +102,7 @@ def evaluate(
     generator = torch.Generator().manual_seed(0)
     surfaces = _true_surfaces(dataset, generator) if detailed else None
     codes, values = [], []
-    was_training = method.training
-    method.set_training(False)
-    try:
+    with method.in_use():
         for chosen in samples.split(batch_size):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
@@ -120,8 +119,6 @@ def evaluate(
             unknown = torch.full((len(chosen),), math.nan)
             values.append(torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1))
             codes.append(code.float().cpu())
-    finally:
-        method.set_training(was_training)
     object_ids, view_ids = (torch.from_numpy(ids[samples.numpy()]) for ids in (dataset.object_ids, dataset.view_ids))
     figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
     means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
@@ -152,9 +149,9 @@ def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, 
 def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
     """IoU of a batch's masks and the silhouettes at its cameras: sum of minima over sum of maxima (NaN: both empty)."""
     size = batch.masks.shape[-1]
-    seen = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
+    silhouettes = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
     masks = batch.masks.flatten(1)
-    return {"silhouette_iou": torch.minimum(seen, masks).sum(1) / torch.maximum(seen, masks).sum(1)}
+    return {"silhouette_iou": torch.minimum(silhouettes, masks).sum(1) / torch.maximum(silhouettes, masks).sum(1)}
 
 
 def _compare_surfaces(shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator) -> dict[str, Tensor]:
@@ -247,5 +244,5 @@ def mean_mmd(codes: Tensor, view_ids: Tensor, forms: Sequence[str] = ("mmd",)) -
         between = distances(i, j)
         for form, found in values.items():
             kind = "paper" if form == "mmd_paper" else "released"
-            found.append(float(mmd_from_distances(within[i], within[j], between, kind)))
+            found.append(float(mmd(within[i], within[j], between, kind)))
     return {form: sum(found) / len(found) for form, found in values.items()}

@@ -69,17 +69,17 @@ def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
     return total
 
 
-def silhouette_energy_distance(drawn: Tensor, real: Tensor) -> Tensor:
-    """Energy distance between the distributions of rendered silhouettes p and real ones t (Szekely and Rizzo 2013).
+def silhouette_energy_distance(silhouettes: Tensor, masks: Tensor) -> Tensor:
+    """Energy distance between the distributions of silhouettes p and masks t (Szekely and Rizzo 2013).
 
     2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k); the third term is constant and left out. The distance
     d(a, b) = 1 - a.b / (a.a + b.b - a.b) is 1 - IoU for silhouettes of 0 and 1 (Tanimoto's similarity, a positive
     definite kernel: Ralaivola et al. 2005), and 0 for two empty ones.
 
-    drawn: float [N,D], N >= 2, differentiable; real: float [M,D], M >= 1.
+    silhouettes: float [N,D], N >= 2, differentiable; masks: float [M,D], M >= 1.
     """
-    across, within = _tanimoto_distances(drawn, real), _tanimoto_distances(drawn, drawn)
-    pairs = len(drawn) * (len(drawn) - 1)
+    across, within = _tanimoto_distances(silhouettes, masks), _tanimoto_distances(silhouettes, silhouettes)
+    pairs = len(silhouettes) * (len(silhouettes) - 1)
     return 2 * across.mean() - (within.sum() - within.diagonal().sum()) / pairs
 
 
@@ -90,20 +90,15 @@ def _tanimoto_distances(x: Tensor, y: Tensor) -> Tensor:
     return torch.where(union > 0, 1 - product / union.clamp_min(1e-12), 0)
 
 
-def mmd(x: Tensor, y: Tensor, form: Literal["released", "paper"] = "released") -> Tensor:
-    """Maximum mean discrepancy between two sets of codes, 0 for equal sets. x, y: float [N,C]; differentiable.
+def mmd(xx: Tensor, yy: Tensor, xy: Tensor, form: Literal["released", "paper"] = "released") -> Tensor:
+    """Maximum mean discrepancy between two sets of N codes, x and y; 0 for equal sets.
 
-    b is the mean squared distance over all pairs of different rows of x and y together, a constant for the gradient.
-    "released", as in the published code and the paper's table: mean(XX + YY - XY - YX) of the sum of five kernels
-    exp(-d^2 / (b * 2^i)), i = -2..2. "paper", as printed: the square root of that mean for one kernel. The paper
-    gives no bandwidth for it; here i = 0.
+    xx, yy, xy: float [N,N], squared distances d^2 within x, within y and from x to y; differentiable. b is the mean of
+    d^2 over all pairs of different rows of x and y together, a constant for the gradient. "released", as in the
+    published code and the paper's table: mean(XX + YY - XY - YX) of the sum of five kernels exp(-d^2 / (b * 2^i)),
+    i = -2..2. "paper", as printed: the square root of that mean for one kernel. The paper gives no bandwidth for it;
+    here i = 0.
     """
-    xx, yy, xy = (_squared_distances(a, b) for a, b in ((x, x), (y, y), (x, y)))
-    return mmd_from_distances(xx, yy, xy, form)
-
-
-def mmd_from_distances(xx: Tensor, yy: Tensor, xy: Tensor, form: Literal["released", "paper"] = "released") -> Tensor:
-    """The MMD of `mmd` from squared distances [N,N] within x, within y and from x to y."""
     rows = 2 * xx.shape[0]
     width = ((xx.sum() + yy.sum() + 2 * xy.sum()) / (rows * rows - rows)).detach()
     width = width.clamp_min(1e-30)  # all codes equal: every kernel is 1, the MMD is 0
@@ -122,10 +117,3 @@ def _five_kernels(distances: Tensor, bandwidth: Tensor) -> Tensor:
         kernel = kernel.square()
         total = total + kernel
     return total
-
-
-def _squared_distances(x: Tensor, y: Tensor) -> Tensor:
-    """|x_i - y_j|^2 as [N,M], through a float64 product so that near codes keep their digits."""
-    x64, y64 = x.double(), y.double()
-    distances = x64.square().sum(1)[:, None] + y64.square().sum(1) - 2 * x64 @ y64.T
-    return distances.clamp_min(0).float()

@@ -19,7 +19,7 @@ from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import (
-    OBJECT_SHARE,
+    MEAN_OBJECT_SIZE,
     Crops,
     check_mask,
     largest_region,
@@ -34,11 +34,10 @@ from learn3d.files import limits, writing
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.fitting.fit import SHARE, Progress, belief, fit
+from learn3d.fitting.fit import Progress, belief, fit
 from learn3d.methods import MeshMethod, Method
-from learn3d.methods.many_views import ManyViews
 from learn3d.methods.refinement import refine
-from learn3d.networks.encoders import centre
+from learn3d.networks.encoders import CENTRED_SIZE, centre
 from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
 from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable
 from learn3d.runs import checkpoint
@@ -51,7 +50,7 @@ STRIP_SIZE = 192  # side of each picture in a strip, in pixels
 _OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
 _PLAIN_SIDE = 1024  # side in pixels to which a photograph with a plain background is reduced
 _COLORED = 256  # side in pixels of the picture that gives the colours
-_LEAST_SHARE = 0.05  # smallest share of the image's side that an object can take
+_MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
 class Model(NamedTuple):
@@ -59,13 +58,13 @@ class Model(NamedTuple):
 
     method: Method
     config: TrainConfig
-    object_share: float  # mean share of the side of its training images that objects take
+    object_size: float  # `ViewDataset.mean_object_size` of its training images
     known_codes: KnownCodes | None = None  # None if its file has none
 
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
-        """Call `prepare_image` with the image size, share and layout of these networks."""
+        """Call `prepare_image` with the image size, object size and layout of these networks."""
         size, layout = self.method.image_size, self.config.layout
-        return prepare_image(colors, mask, crop=crop, object_share=self.object_share, size=size, layout=layout)
+        return prepare_image(colors, mask, crop=crop, object_size=self.object_size, size=size, layout=layout)
 
 
 def load_model(run: Path | None, which: str = "last") -> Model:
@@ -74,7 +73,7 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     method, config, metadata = checkpoint.load_method(path)
     known = list(map(checkpoint.load(path)[0].get, KNOWN_CODES))
     known_codes = None if known[0] is None else KnownCodes(*known)
-    return Model(method, config, metadata.progress.object_share or OBJECT_SHARE, known_codes)
+    return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, known_codes)
 
 
 def cut_out_pictures(model: Model, folder: Path) -> Tensor:
@@ -179,13 +178,13 @@ def prepare_image(
     mask: np.ndarray,
     *,
     crop: bool = True,
-    object_share: float = OBJECT_SHARE,
+    object_size: float = MEAN_OBJECT_SIZE,
     size: int = 64,
     layout: Layout = "kato",
 ) -> np.ndarray:
     """Turn colours uint8 [H,W,3] and a mask uint8 [H,W] into a stored image uint8 [4,size,size] of a layout.
 
-    The background becomes white. crop: centre the object in a square, so that its larger side takes `object_share` of
+    The background becomes white. crop: centre the object in a square, so that its larger side takes `object_size` of
     it; without, the picture must be framed like that already and is only padded to a square and scaled. Colours are
     inverted if the layout inverts them. Layouts with stretched images (Pascal3D+) keep the background, and `crop` cuts
     out the mask's box as their reader does (`learn3d.data.framing`).
@@ -201,7 +200,7 @@ def prepare_image(
         planes = (colors, np.repeat(mask[..., None], 3, axis=2))
         cut, cut_mask = (Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes)
         return np.concatenate([cut, cut_mask[:1]])
-    side = max(right - left, bottom - top) / (max(object_share, _LEAST_SHARE) if crop else 1)
+    side = max(right - left, bottom - top) / (max(object_size, _MIN_OBJECT_SIZE) if crop else 1)
     reduction = max(1, int(side / (_OVERSAMPLING * size)))  # averaging blocks first is much faster
     alpha = mask.astype(np.float32) / 255
     planes = [(255 - colors[..., channel]) * alpha for channel in range(3)] + [255 * alpha]
@@ -244,12 +243,15 @@ def reconstruct_picture(
     """
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
-    probabilities = view_probabilities(model, image)
+    found = method.view_probabilities(image[None])
+    probabilities = None if found is None else found[0]
     if not refined or not isinstance(method, MeshMethod):
         (surface,) = reconstruct(method, stored[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], probabilities)
         return Reconstruction(surface, stored, azimuth_deg, None, None, None)
-    fine = prepare_image(colors, mask, object_share=SHARE, size=_COLORED, layout="kar")  # kar: colours not inverted
+    fine = prepare_image(
+        colors, mask, object_size=CENTRED_SIZE, size=_COLORED, layout="kar"
+    )  # kar: colours not inverted
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
     )
@@ -258,16 +260,6 @@ def reconstruct_picture(
         fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
     )
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, *recognize(model, image))
-
-
-def view_probabilities(model: Model, image: Tensor) -> Tensor | None:
-    """Probability of each azimuth cell of `fitting.fit` for a stored image uint8 [4, S, S]; None if not learnt."""
-    method, config = model.method, model.config
-    other_cells = config.layout != "around" or config.view_bins is not None
-    if not isinstance(method, MeshMethod) or (isinstance(method, ManyViews) and other_cells):
-        return None
-    probabilities = method.view_probabilities(image[None])
-    return None if probabilities is None else probabilities[0]
 
 
 def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
@@ -314,8 +306,8 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor 
     target, azimuths, losses = centre(small)[0], [15.0 * k for k in range(24)], []
     for elevation in (0.0, 10.0, 20.0, 30.0):
         cameras = nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG)
-        seen = centre(nmr.render_silhouette(surface.vertices, surface.faces, cameras, image_size=64)[:, None])
-        losses += [nmr.losses.soft_iou_loss(silhouette, target) for silhouette in seen]
+        silhouettes = centre(nmr.render_silhouette(surface.vertices, surface.faces, cameras, image_size=64)[:, None])
+        losses += [nmr.losses.soft_iou_loss(silhouette, target) for silhouette in silhouettes]
     losses = torch.stack(losses).view(-1, len(azimuths)) - belief(torch.tensor(azimuths), probabilities)
     return azimuths[int(losses.argmin()) % len(azimuths)]
 

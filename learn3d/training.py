@@ -48,7 +48,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         info = train_set.info(plane, train_set.solidity() if config.settings.wants_solidity else None)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **options)
-        method.check_batch(next(batches(train_set, config)))  # before `begin` removes an older run
+        empty_masks = train_set.check_masks()  # it may raise, like the next line, before `begin` removes an older run
+        method.check_batch(next(batches(train_set, config)))
         run = Run(config, method, info, describe_images(train_set), train_set.candidates)
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:
@@ -61,9 +62,9 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         with (
             run_folder.advice_on_errors(folder),
             stop_on_signal() as stop,
-            RunLog(folder, start=progress.step, total=config.iterations, config=config) as log,
+            RunLog(config, start=progress.step) as log,
         ):
-            for warning in filter(None, (*notes, train_set.check_masks())):
+            for warning in filter(None, (*notes, empty_masks)):
                 log.say(f"warning: {warning}")
             log.say(describe_run(run, progress, train_set, val_set, threads))
             for step, batch in enumerate(batches(train_set, config, start), start):

@@ -24,8 +24,7 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
     `Evaluation.selection_metric` says which IoU. Returns the progress with the best IoU and its step.
     """
     config, step = run.config, progress.step
-    with run.method.ema_weights():
-        result = evaluate(run.method, val_set, max_images=config.max_val_images)
+    result = evaluate(run.method, val_set, max_images=config.max_val_images)
     log.metrics(step, config.val_split, result.means)
     metric = result.selection_metric
     iou = result.means.get(metric)
@@ -44,9 +43,8 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images of different objects and views each time."""
-    with method.ema_weights():
-        samples = spread_samples(val_set.object_ids, val_set.view_ids, PICTURE_ROWS)
-        grid = picture_grid(method, val_set, samples)
+    samples = spread_samples(val_set.object_ids, val_set.view_ids, PICTURE_ROWS)
+    grid = picture_grid(method, val_set, samples)
     folder = config.output / PICTURES
     folder.mkdir(exist_ok=True)
     save_png(folder / f"{step:06}.png", grid)

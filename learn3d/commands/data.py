@@ -188,16 +188,17 @@ class EstimatePoses(Command):
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
         with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:
             views = estimate_views(datasets, self.cameras, self.options, self.candidates, bar.update)
-        table = views.table
+        table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
         say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below .5: {doubtful:.0%}")
         if self.compare:
             comparison = compare(views)
             say(comparison.text())
-            table = table.turned(comparison.offset_deg)
+            offset_deg = comparison.offset_deg
+            table = table.turned(offset_deg)
         for warning in views.warnings:
             note(f"warning: {warning}")
         table.write(self.output)
         sheet = self.output.with_suffix(".png")
-        save_png(sheet, draw_sheet(views))
+        save_png(sheet, draw_sheet(views, offset_deg))
         say(f"written to {self.output}; sheet {sheet}: {LEGEND}")

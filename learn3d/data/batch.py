@@ -48,7 +48,7 @@ class PoseCandidates:
         return len(self.weights)
 
     def draw(self, batch: Batch, indices: torch.Tensor, seed: int, step: int) -> Batch:
-        """The batch of the samples `indices` with one candidate pose for each, drawn from (seed, step) alone.
+        """The batch of the samples `indices` with one candidate pose for each, drawn by `weights`, seed and step.
 
         So the gradient is an unbiased estimate of that of the expected loss over the candidates, at the cost of one
         pose.

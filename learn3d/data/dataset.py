@@ -31,9 +31,9 @@ class DatasetInfo:
     """Properties of the data that methods need to build their networks. Every checkpoint has them."""
 
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K view classes
+    inverted: bool  # colours are stored as 255 - colour
     num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # number of categories
     pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # length of `features` of a pose; 0 if poses are unknown
-    inverted: bool = False  # colours are stored as 255 - colour
     mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None if none was found or looked for
     cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None if unknown
     solidity: float | None = None  # result of `ViewDataset.solidity`; None if not computed
@@ -57,14 +57,14 @@ class ViewDataset:
     object_names: tuple[str, ...]  # N names from the files
     voxels: Array | None  # bool [N, 32, 32, 32] ground truth in the data set's own axes; None if unknown
     convention: VoxelConvention  # axes of the voxels
+    inverted: bool  # True if colours are stored as 255 - colour, so that a white background is 0 (Kato's form)
     masks: Array | None = None  # uint8 [M, 64, 64] ground truth silhouettes; None: the images' fourth channel
     depth: Array | None = None  # uint8 [M, 64, 64], see `depth_levels`; None if unknown
     class_ids: np.ndarray | None = None  # int64 [N]: category of each object; None for a single category
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
     points: Array | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
-    inverted: bool = True  # True if colours are stored as 255 - colour, so that a white background is 0 (Kato's form)
     crops: Crops | None = None  # M original images for the augmentation "crop"; None if unknown
-    sides: np.ndarray | None = None  # float32 [M]: `object_sides`; None if not computed
+    stored_sizes: np.ndarray | None = None  # float32 [M]: `object_sizes`; None if not computed
     candidates: PoseCandidates | None = None  # M sets of poses for training to draw from; None: `poses` alone
 
     def __post_init__(self) -> None:
@@ -78,11 +78,13 @@ class ViewDataset:
             raise ValueError(f"depth must be [M, {MASK_SIZE}, {MASK_SIZE}], got {list(self.depth.shape)}")
         if self.voxels is not None and self.voxels.shape[1:] != (VOXEL_SIZE,) * 3:
             raise ValueError(f"voxels must be [N, {VOXEL_SIZE}, {VOXEL_SIZE}, {VOXEL_SIZE}]")
-        wanted = dict.fromkeys(("poses", "view_ids", "object_ids", "masks", "depth", "crops", "sides", "candidates"), m)
+        wanted = dict.fromkeys(
+            ("poses", "view_ids", "object_ids", "masks", "depth", "crops", "stored_sizes", "candidates"), m
+        )
         wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
         sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
         if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
-            raise ValueError(f"{m} images of {n} objects do not go with {wrong}")
+            raise ValueError(f"expected {m} images and {n} objects, got {wrong}")
         for name, end in (("view_ids", self.num_views), ("object_ids", n)):
             values = getattr(self, name)
             if m and not (values.min() >= 0 and values.max() < end):
@@ -115,7 +117,7 @@ class ViewDataset:
         """The properties that methods need; None for an unknown mirror plane or solidity."""
         features = 0 if self.poses is None else self.poses.num_features
         cube_side = None if self.voxels is None else self.convention.cube_side
-        known = self.num_views, self.num_classes, features, self.inverted, mirror_plane_deg, cube_side
+        known = self.num_views, self.inverted, self.num_classes, features, mirror_plane_deg, cube_side
         return DatasetInfo(*known, solidity)
 
     def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
@@ -171,15 +173,15 @@ class ViewDataset:
 
     def check_masks(self) -> str:
         """A warning if some masks are empty, else "". Raises ValueError if all masks are empty."""
-        empty = int((self.object_sides() == 0).sum())
+        empty = int((self.object_sizes() == 0).sum())
         if empty == len(self):
             found = f"all {empty} {self.split} images of {self.category} have an empty mask"
             raise ValueError(f"{found}; run learn3d check-dataset on the data")
         return f"{empty} of {len(self)} {self.split} images have an empty mask" if empty else ""
 
-    def object_share(self) -> float:
-        """Mean of `object_sides`: the scale at which `reconstruct` frames photographs."""
-        return float(self.object_sides().mean(dtype=np.float64))
+    def mean_object_size(self) -> float:
+        """Mean of `object_sizes`: the scale at which `reconstruct` frames photographs."""
+        return float(self.object_sizes().mean(dtype=np.float64))
 
     def solidity(self) -> float:
         """Mean ratio of a mask's area to that of its convex hull, for at most 256 images; 0 if all masks are empty."""
@@ -192,10 +194,10 @@ class ViewDataset:
         """The ground truth silhouettes of the samples `samples`, int64 [B]: uint8 [B, 64, 64]."""
         return self.images[samples][:, 3] if self.masks is None else self.masks[samples]
 
-    def object_sides(self) -> np.ndarray:
+    def object_sizes(self) -> np.ndarray:
         """The larger side of each mask's bounding box over the side of the image: float [M], 0 for an empty mask."""
-        if self.sides is not None:
-            return self.sides
+        if self.stored_sizes is not None:
+            return self.stored_sizes
         masks = self.images[:, 3] > 127
         sides = []
         for axis in (1, 2):
@@ -210,7 +212,11 @@ class ViewDataset:
         if not isinstance(self.poses, LookAtPoses):
             got = "no poses" if self.poses is None else "rotations"
             raise ValueError(f"cells of azimuth and elevation need look-at cameras; this data set has {got}")
-        return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), view_names=tuple(bins.names()))
+        candidates = self.candidates
+        if candidates is not None:
+            candidates = dataclasses.replace(candidates, view_ids=bins.ids(candidates.poses).numpy())
+        parts = {"view_names": tuple(bins.names()), "candidates": candidates}
+        return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), **parts)
 
     def with_few_views(self, count: int) -> ViewDataset:
         """`count` random views of each object, or all of an object with fewer; the same ones in every run.
@@ -227,7 +233,7 @@ class ViewDataset:
 
     def select(self, samples: np.ndarray) -> ViewDataset:
         """The samples `samples`, int64 [B], and all objects. Arrays on disk are not read."""
-        names = ("images", "masks", "depth", "view_ids", "object_ids", "sides", "crops", "poses")
+        names = ("images", "masks", "depth", "view_ids", "object_ids", "stored_sizes", "crops", "poses")
         parts = {name: part for name in names if (part := getattr(self, name)) is not None}
         chosen = {n: p.select(samples) if isinstance(p, DiskArray) else p[samples] for n, p in parts.items()}
         return dataclasses.replace(self, **chosen)
@@ -271,14 +277,14 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     def joined(name: str) -> Array | Crops | None:
         parts = [getattr(d, name) for d in datasets]
         if len({type(part) for part in parts}) > 1:
-            raise ValueError(f"not all of them have {name}, or only some have it as shards; convert all or none")
+            raise ValueError(f"some categories lack {name} or do not have it as shards; convert all categories or none")
         if parts[0] is None:
             return None
         join = {DiskArray: DiskArray.join, Crops: join_crops}.get(type(parts[0]), np.concatenate)
         return join(parts)
 
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1].tolist()
-    names = ("images", "masks", "depth", "view_ids", "voxels", "points", "sides", "crops")
+    names = ("images", "masks", "depth", "view_ids", "voxels", "points", "stored_sizes", "crops")
     return dataclasses.replace(
         first,
         **{name: joined(name) for name in names},

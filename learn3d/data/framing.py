@@ -18,7 +18,7 @@ from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile
 from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
 
-OBJECT_SHARE = 0.65  # mean of `ViewDataset.object_sides` in Kato's renderings
+MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 TOLERANCE = 0.12  # default of `threshold_mask`
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
@@ -51,7 +51,7 @@ class Framed(NamedTuple):
 
     image: np.ndarray  # uint8 [4, size, size], in Kato's form
     mask: np.ndarray  # uint8 [64, 64]
-    share: float  # larger side of the mask's bounding box over the longer side of the photograph
+    object_size: float  # larger side of the mask's bounding box over the longer side of the photograph
     touches_border: bool  # True if the mask touches the border of the photograph
 
 
@@ -63,9 +63,9 @@ def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
     except ValueError as error:
         raise DamagedFile(path, str(error)) from None
     left, top, right, bottom = mask_box(mask)
-    share = max(right - left, bottom - top) / max(mask.shape)
+    object_size = max(right - left, bottom - top) / max(mask.shape)
     touches_border = min(left, top) == 0 or bottom == mask.shape[0] or right == mask.shape[1]
-    return Framed(*frame(colors, mask, size), share, touches_border)
+    return Framed(*frame(colors, mask, size), object_size, touches_border)
 
 
 def _read_picture(path: Path, max_side: int) -> tuple[np.ndarray, np.ndarray | None]:

@@ -1,6 +1,7 @@
 """Samples and augments the batches of a training.
 
-They depend on (data set, seed, step) alone, so a resumed training needs no saved state of them.
+They depend on the data set, the seed, the step and the weights of the candidate poses. Checkpoints save only these
+weights.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ COLOR_GAIN = 0.3  # "colors" multiplies each colour by a factor in 1 - COLOR_GAI
 WITHOUT_COLOR = 0.3  # share of the images that "colors" makes black or white
 
 
-def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool = True) -> Batch:
+def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool) -> Batch:
     """The batch with the named augmentations, in this order, each drawn independently for every sample.
 
     "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato and Harada 2019).

@@ -10,7 +10,7 @@ A shard of n objects and m views has the tensors
     images                          uint8 [m, 4, S, S], see `ViewDataset`; also `masks` and `depth` if known
     voxels                          bool [n, 32, 32, 32] if known; also `points` float32 [n, P, 3]
     images.checksums ...            uint32: CRC-32 of each row of these arrays
-    object_ids, view_ids, sides     int32 [m] in 0 .. n-1, int32 [m], float32 [m]: tables of the views
+    object_ids, view_ids, sides     int32 [m] in 0 .. n-1, int32 [m], float32 [m]: tables of the views; object sizes
     azimuth_deg ... or rotation     float32 [m, ...]: the poses; fields with one value for all views are in set.json
 
 Its metadata are the names of the objects, and a CRC-32 of names and tables. The bytes of a shard depend on its content
@@ -102,7 +102,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
     """Write `part` of a data set, with its arrays in memory, as shard `number` in the folder of its split."""
     tensors = {name: getattr(part, name).astype(np.int32) for name in ("object_ids", "view_ids")}
-    tensors["sides"] = part.object_sides().astype(np.float32)
+    tensors["sides"] = part.object_sizes().astype(np.float32)
     tensors |= {name: v.numpy() for name, v in _fields(part.poses).items() if isinstance(v, Tensor)}
     arrays = {name: np.ascontiguousarray(a) for name in _ARRAYS if (a := getattr(part, name)) is not None}
     for name, array in arrays.items():
@@ -214,7 +214,8 @@ def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDa
                 object_names=tuple(names),
                 convention=READERS[facts.layout].PROPERTIES.convention,
                 inverted=READERS[facts.layout].PROPERTIES.inverted,
-                **{name: tables[name] for name in ("view_ids", "object_ids", "sides")},
+                stored_sizes=tables["sides"],
+                **{name: tables[name] for name in ("view_ids", "object_ids")},
                 **{"voxels": None} | arrays,
             )
             if dataset.image_size != facts.image_size:

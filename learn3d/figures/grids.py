@@ -31,10 +31,8 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
     and the shape from five more views around it.
     """
     batch = dataset.batch(indices)
-    training = method.training
-    method.set_training(False)
-    shapes = method.decode(method.encode(batch.images)).surfaces()
-    method.set_training(training)
+    with method.in_use():
+        shapes = method.decode(method.encode(batch.images)).surfaces()
     inputs = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     rows = []
     for i, (vertices, faces, _) in enumerate(shapes):

@@ -47,8 +47,11 @@ def open_runs(
     for path in paths:
         report_progress(f"opening {path}")
         method, config, metadata = checkpoint.load_method(path, which)
-        config = dataclasses.replace(config, data=data or config.data, category=category or config.category)
+        if data is not None or category is not None:  # without the poses and views of the training
+            own = {"poses": None, "views_per_object": None}
+            config = dataclasses.replace(config, data=data or config.data, category=category or config.category, **own)
         key = (config.layout, config.data.resolve(), config.category, method.image_size, config.view_bins)
+        key += (config.poses, config.views_per_object)
         if key not in datasets:
             datasets[key] = checkpoint.load_data(config, split)
         loaded.append((config, method, datasets[key], metadata))

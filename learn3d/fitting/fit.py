@@ -1,6 +1,6 @@
 """Fits a predicted shape to the mask of a picture with an unknown camera: the camera, the code, then the vertices.
 
-The picture must be framed: the bounding box of its mask is centred, and its longer side takes `SHARE` of the picture.
+The picture must be framed: the bounding box of its mask is centred, and its object size is `CENTRED_SIZE`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import wrap_deg
 from learn3d.device import upload
 from learn3d.methods import MeshMethod
-from learn3d.networks.encoders import CENTRED_SHARE as SHARE
+from learn3d.networks.encoders import CENTRED_SIZE
 
 HALF_FOV_DEG = 11.0  # half the field of view of a normal lens; the picture's own is unknown
 AZIMUTHS = 24  # azimuth cells from -180 degrees on, whose centres are tried
@@ -89,7 +89,7 @@ def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> 
         seen = (points[..., :2] + shift[:, None]) / scale[..., None]
         low, high = seen.amin(1), seen.amax(1)
         shift = shift - (low + high) / 2 * distance[:, None] * tangent
-        distance = (distance * (high - low).amax(1) / (2 * SHARE)).clamp(0.8, 30.0)
+        distance = (distance * (high - low).amax(1) / (2 * CENTRED_SIZE)).clamp(0.8, 30.0)
     return view._replace(log_distance=distance.log(), shift=shift)
 
 
@@ -165,9 +165,9 @@ def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
 
 def _ious(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> Tensor:
     """Soft IoU of the mask and each silhouette, [N]."""
-    seen = view.silhouettes(vertices.expand(len(view.azimuth_deg), -1, -1), faces)
-    both = (seen * mask).sum((1, 2))
-    return both / (seen + mask - seen * mask).sum((1, 2)).clamp(min=1e-6)
+    silhouettes = view.silhouettes(vertices.expand(len(view.azimuth_deg), -1, -1), faces)
+    both = (silhouettes * mask).sum((1, 2))
+    return both / (silhouettes + mask - silhouettes * mask).sum((1, 2)).clamp(min=1e-6)
 
 
 def _parameters(view: View) -> list[Tensor]:

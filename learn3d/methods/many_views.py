@@ -12,12 +12,10 @@ import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.sampling import GROUP_SIZE
-from learn3d.device import upload
-from learn3d.losses import depth_loss, gaussian_prior_loss, pose_classification_loss
+from learn3d.losses import depth_loss, gaussian_prior_loss
 from learn3d.methods.method import MeshMethod, MeshSettings, check_groups
 from learn3d.methods.surfaces import Meshes
 from learn3d.networks import EncoderName, SymmetryOption
-from learn3d.networks.encoders import ViewClassifier
 from learn3d.settings import Positive, Weight, checked
 
 
@@ -35,8 +33,8 @@ class ManyViewsSettings(MeshSettings):
     lambda_depth: Weight = 3.0
     """Weight of the depth loss, in views whose depth is known."""
     lambda_view: Weight = 0.0
-    """Weight of the loss of a small separate network that classifies the view of an image; reconstruction places the
-    camera of a picture by it. 0: no such network."""
+    """Weight of the loss of a small network that classifies the azimuth of an image; reconstruction places the camera
+    of a picture by it. 0: no such network."""
 
 
 class ManyViews(MeshMethod):
@@ -46,10 +44,7 @@ class ManyViews(MeshMethod):
 
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
-        if self.settings.lambda_view > 0:
-            classifier = ViewClassifier(self.info.num_views, inverted=self.info.inverted)
-            networks["view_classifier"] = classifier.to(memory_format=torch.channels_last)
-        return networks
+        return networks | self.create_view_classifier() if self.settings.lambda_view > 0 else networks
 
     @property
     def weights(self) -> dict[str, float]:
@@ -69,11 +64,13 @@ class ManyViews(MeshMethod):
         return self.clamp_to_cube(super().decode(codes))
 
     def check_batch(self, batch: Batch) -> None:
+        super().check_batch(batch)
         check_groups(batch, GROUP_SIZE, "groups")
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Render the shapes of the views a in all views of their object; the loss is projection + lambda_depth depth +
-        lambda_smooth smoothness + lambda_prior prior. Every second image of symmetric objects is flipped first.
+        """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
+        depth + lambda_smooth smoothness + lambda_prior prior + lambda_view view. Every second image of symmetric
+        objects is flipped first, but not for the loss view.
         """
         count = len(batch) // GROUP_SIZE
         images = batch.images[:count]
@@ -81,18 +78,17 @@ class ManyViews(MeshMethod):
         codes, vertices = self.predict(torch.where(flipped[:, None, None, None], images.flip(3), images))
         losses = {"prior": gaussian_prior_loss(codes, "squared")} if self.settings.lambda_prior > 0 else {}
         if self.settings.lambda_view > 0:
-            views = upload(batch.view_ids[:count], self.device)
-            losses["view"] = pose_classification_loss(self.view_logits(images), views)
+            losses["view"] = self.view_loss(images, batch.poses[:count])
         vertices = vertices.cpu()
         uses_depth = batch.depth is not None and self.settings.lambda_depth > 0
-        seen = nmr.render(
+        rendered = nmr.render(
             vertices.repeat(GROUP_SIZE, 1, 1),
             self.faces,
             batch.cameras,
             outputs=("alpha", "depth") if uses_depth else ("alpha",),
             image_size=MASK_SIZE,
         )
-        losses["projection"] = nmr.losses.soft_iou_loss(seen.alpha, batch.masks)
+        losses["projection"] = nmr.losses.soft_iou_loss(rendered.alpha, batch.masks)
         if uses_depth:
-            losses["depth"] = depth_loss(seen.depth, batch.depth)
+            losses["depth"] = depth_loss(rendered.depth, batch.depth)
         return self.backward_and_step(losses | self.surface_losses(vertices), step, *self.optimizers)

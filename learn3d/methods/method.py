@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -14,8 +14,10 @@ from torch import Tensor, nn
 import nmr
 from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE, DatasetInfo
-from learn3d.data.poses import Poses
-from learn3d.device import autocast
+from learn3d.data.poses import LookAtPoses, Poses
+from learn3d.data.view_bins import AngleBins
+from learn3d.device import autocast, upload
+from learn3d.losses import pose_classification_loss
 from learn3d.methods.optimization import CONSTANT_LR, EMA, TrainingSchedule, adam, backpropagate
 from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.networks import (
@@ -24,12 +26,15 @@ from learn3d.networks import (
     EncoderName,
     GeneratorName,
     MeshGenerator,
-    Symmetry,
     SymmetryOption,
     create_encoder,
     network_input,
 )
-from learn3d.settings import Positive, checked
+from learn3d.networks.encoders import ViewClassifier
+from learn3d.networks.resnet import check_pretrained, load_pretrained
+from learn3d.settings import FilePath, Positive, checked
+
+AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)  # classes of the view classifier: the azimuth cells of `fitting.fit`
 
 
 @checked
@@ -68,6 +73,10 @@ class MethodSettings:
         """These settings for a run of another length: phases of the training keep their share of it."""
         return self
 
+    def for_data(self, info: DatasetInfo) -> MethodSettings:
+        """These settings, with the values that suit the training data in place of "auto"."""
+        return self
+
 
 @checked
 class MeshSettings(MethodSettings):
@@ -88,6 +97,12 @@ class MeshSettings(MethodSettings):
     it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
     learning_rate: Positive = 1e-4
     """Adam's learning rate, the same for all networks."""
+    pretrained: FilePath | None = None
+    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
+    weights). VPL then freezes its batch norms."""
+
+    def __post_init__(self) -> None:
+        check_pretrained(self.pretrained, self.encoder)
 
     @property
     def image_size(self) -> int:
@@ -101,26 +116,20 @@ class MeshSettings(MethodSettings):
     def wants_solidity(self) -> bool:
         return self.generator == "auto"
 
-
-COMPACT = 0.8  # least solidity of the data that "auto" takes for compact
-INSIDE = 0.499  # share of the cube's side: the voxelizer kato18 counts a face on the border (0.5) as outside
-
-
-def plane_of(symmetry: SymmetryOption, info: DatasetInfo) -> Symmetry | None:
-    """The mirror plane of the shapes: the one of the settings, or for "auto" the one of the data."""
-    return info.mirror_plane_deg if symmetry == "auto" else symmetry
+    def for_data(self, info: DatasetInfo) -> MeshSettings:
+        plane = info.mirror_plane_deg if self.symmetry == "auto" else self.symmetry
+        sphere = "sphere-smooth" if is_compact(info) else "sphere"
+        generator = sphere if self.generator == "auto" else self.generator
+        return dataclasses.replace(self, symmetry=plane, generator=generator)
 
 
-def generator_name(name: GeneratorName, info: DatasetInfo) -> GeneratorName:
-    """The generator of the settings, or for "auto" the sphere that suits the masks of the data."""
-    if name != "auto":
-        return name
-    return "sphere-smooth" if is_compact(info) else "sphere"
+MIN_COMPACT_SOLIDITY = 0.8  # objects count as compact if the data's solidity is at least this
+CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts a face on the border (0.5) as outside
 
 
 def is_compact(info: DatasetInfo) -> bool:
     """Whether the training masks nearly fill their convex hulls; False if that is not known."""
-    return info.solidity is not None and info.solidity >= COMPACT
+    return info.solidity is not None and info.solidity >= MIN_COMPACT_SOLIDITY
 
 
 class Method(abc.ABC):
@@ -144,7 +153,7 @@ class Method(abc.ABC):
         precision: Literal["bf16", "fp32"],
         schedule: TrainingSchedule = CONSTANT_LR,
     ) -> None:
-        self.settings, self.info, self.schedule = settings, info, schedule
+        self.settings, self.info, self.schedule = settings.for_data(info), info, schedule
         self.image_size = settings.image_size
         self.device, self.precision = torch.device(device), precision
         self.networks = self.create_networks()
@@ -174,6 +183,10 @@ class Method(abc.ABC):
     @abc.abstractmethod
     def decode(self, codes: Tensor) -> Meshes | Grids:
         """The shapes of codes [B, C], on the CPU."""
+
+    def view_probabilities(self, images: Tensor) -> Tensor | None:
+        """Probability of each cell of `AZIMUTHS`, float32 [B, K], for stored images; None if they were not learnt."""
+        return None
 
     @property
     def weights(self) -> Mapping[str, float]:
@@ -224,6 +237,17 @@ class Method(abc.ABC):
         """Context in which the networks have their EMA weights, if the run keeps an EMA."""
         return contextlib.nullcontext() if self.ema is None else self.ema.in_place()
 
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Context for evaluation during a training: `ema_weights`, and networks in evaluation mode. Do not nest it."""
+        was_training = self.training
+        self.set_training(False)
+        try:
+            with self.ema_weights():
+                yield
+        finally:
+            self.set_training(was_training)
+
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision."""
         return autocast(self.device, self.precision)
@@ -252,12 +276,24 @@ class MeshMethod(Method):
 
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = create_encoder(self.settings.encoder, inverted=self.info.inverted)
-        plane = plane_of(self.settings.symmetry, self.info)
-        generator = GENERATORS[generator_name(self.settings.generator, self.info)](symmetry=plane)
+        generator = GENERATORS[self.settings.generator](symmetry=self.settings.symmetry)
         return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
+
+    def create_view_classifier(self) -> dict[str, nn.Module]:
+        """The network "view_classifier", which predicts the azimuth of an image."""
+        classifier = ViewClassifier(AZIMUTHS.count, inverted=self.info.inverted)
+        return {"view_classifier": classifier.to(memory_format=torch.channels_last)}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         return {name: adam(network, self.settings.learning_rate) for name, network in self.networks.items()}
+
+    def start_from_pretrained(self) -> None:
+        if self.settings.pretrained is not None:
+            load_pretrained(getattr(self.encoder, "resnet", self.encoder), self.settings.pretrained)
+
+    def check_batch(self, batch: Batch) -> None:
+        if "view_classifier" in self.networks and not isinstance(batch.poses, LookAtPoses):
+            raise ValueError("--lambda-view needs azimuths, and the poses of these data are rotations; leave it out")
 
     def encode(self, images: Tensor) -> Tensor:
         with self.autocast():
@@ -279,7 +315,7 @@ class MeshMethod(Method):
         """
         if self.info.cube_side is None:
             return shapes
-        limit = INSIDE * self.info.cube_side
+        limit = CLAMP_LIMIT * self.info.cube_side
         return dataclasses.replace(shapes, vertices=shapes.vertices.clamp(-limit, limit))
 
     def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -291,11 +327,13 @@ class MeshMethod(Method):
 
     @torch.no_grad()
     def view_probabilities(self, images: Tensor) -> Tensor | None:
-        """Probability of each view class, float32 [B, K], for stored images uint8 [B, 4, S, S]; None if not learnt."""
-        return self.view_logits(images).softmax(1).cpu() if "view_classifier" in self.networks else None
+        return self._view_logits(images).softmax(1).cpu() if "view_classifier" in self.networks else None
 
-    def view_logits(self, images: Tensor) -> Tensor:
-        """Logits float32 [B, K] of the network "view_classifier"."""
+    def view_loss(self, images: Tensor, poses: LookAtPoses) -> Tensor:
+        """The loss of the network "view_classifier" on stored images of these poses."""
+        return pose_classification_loss(self._view_logits(images), upload(AZIMUTHS.ids(poses), self.device))
+
+    def _view_logits(self, images: Tensor) -> Tensor:
         with self.autocast():
             return self.networks["view_classifier"](network_input(images, self.device, self.image_size)).float()
 

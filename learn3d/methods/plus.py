@@ -13,18 +13,13 @@ from torch import Tensor, nn
 
 from learn3d.data.batch import Batch
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.poses import LookAtPoses
-from learn3d.data.view_bins import AngleBins
-from learn3d.device import upload
-from learn3d.losses import pose_classification_loss, silhouette_energy_distance
+from learn3d.losses import silhouette_energy_distance
 from learn3d.methods.optimization import adam
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.networks import EncoderName, GeneratorName, PoseDiscriminator, SymmetryOption
-from learn3d.networks.encoders import ViewClassifier
 from learn3d.settings import Count, Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks in the mask bank
-AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)  # classes of the view classifier: the azimuth cells of `fitting.fit`
 
 
 @checked
@@ -102,10 +97,7 @@ class Plus(PoseInvariant):
             networks["discriminator"] = PoseDiscriminator(2 * self.info.num_views)  # flipped views are other views
         if self.settings.lambda_novel_view > 0:
             networks["mask_bank"] = MaskBank(self.settings.bank_size)
-        if self.settings.lambda_view > 0:
-            classifier = ViewClassifier(AZIMUTHS.count, inverted=self.info.inverted)
-            networks["view_classifier"] = classifier.to(memory_format=torch.channels_last)
-        return networks
+        return networks | self.create_view_classifier() if self.settings.lambda_view > 0 else networks
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         trained = {name: network for name, network in self.networks.items() if name != "mask_bank"}
@@ -114,10 +106,6 @@ class Plus(PoseInvariant):
     @property
     def weights(self) -> dict[str, float]:
         return super().weights | {"novel_view": self.settings.lambda_novel_view, "view": self.settings.lambda_view}
-
-    def check_batch(self, batch: Batch) -> None:
-        if self.settings.lambda_view > 0 and not isinstance(batch.poses, LookAtPoses):
-            raise ValueError("--lambda-view needs azimuths, and the poses of these data are rotations; leave it out")
 
     def encode(self, images: Tensor) -> Tensor:
         return self.encode_symmetric(images)
@@ -139,8 +127,7 @@ class Plus(PoseInvariant):
     def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
         losses = super()._silhouette_losses(vertices, batch)
         if self.settings.lambda_view > 0:
-            views = upload(AZIMUTHS.ids(batch.poses), self.device)
-            losses["view"] = pose_classification_loss(self.view_logits(batch.images), views)
+            losses["view"] = self.view_loss(batch.images, batch.poses)
         return losses | self._novel_view_loss(vertices, batch) if self.settings.lambda_novel_view > 0 else losses
 
     def _novel_view_loss(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
@@ -151,9 +138,9 @@ class Plus(PoseInvariant):
         seen_by = int(torch.randint(len(batch), ()))
         if not self.mask_bank.full:
             return {}
-        drawn = _reduced(self.render(vertices, batch.poses[torch.full((len(vertices),), seen_by)]))
-        real = self.mask_bank.of_view(int(batch.view_ids[seen_by])).to(drawn.device)
-        return {"novel_view": silhouette_energy_distance(drawn, real)}
+        silhouettes = _reduced(self.render(vertices, batch.poses[torch.full((len(vertices),), seen_by)]))
+        masks = self.mask_bank.of_view(int(batch.view_ids[seen_by])).to(silhouettes.device)
+        return {"novel_view": silhouette_energy_distance(silhouettes, masks)}
 
 
 def _reduced(silhouettes: Tensor) -> Tensor:

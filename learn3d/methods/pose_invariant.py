@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 from torch import Tensor, nn
@@ -15,8 +16,7 @@ from learn3d.methods.method import MeshMethod, MeshSettings, is_compact
 from learn3d.methods.optimization import frozen
 from learn3d.methods.surfaces import Meshes
 from learn3d.networks import PoseDiscriminator
-from learn3d.networks.resnet import check_pretrained, load_pretrained
-from learn3d.settings import FilePath, Positive, Weight, checked
+from learn3d.settings import Positive, Weight, checked
 
 COMPACT_AREA_WEIGHT = 0.03
 
@@ -28,9 +28,6 @@ class PoseInvariantSettings(MeshSettings):
     clamp_to_cube: bool = False
     """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers find
     no inside in a shape that exceeds their grid."""
-    pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
-    weights)."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
@@ -50,9 +47,6 @@ class PoseInvariantSettings(MeshSettings):
     prior_form: Literal["squared", "norm"] = "squared"
     """Prior: squared length of the codes (squared, published code) or their length (norm, eq. 5)."""
 
-    def __post_init__(self) -> None:
-        check_pretrained(self.pretrained, self.encoder)
-
     @property
     def reads_view_ids(self) -> bool:
         return self.uses_discriminator
@@ -70,12 +64,9 @@ class PoseInvariantSettings(MeshSettings):
         """Whether there is a pose discriminator; Vanilla-AE has none."""
         return self.lambda_classification > 0 or self.lambda_adversarial > 0
 
-
-def area_weight(settings: PoseInvariantSettings, info: DatasetInfo) -> float:
-    """`lambda_area` of the settings, or for "auto" the weight that suits the masks of the data."""
-    if settings.lambda_area != "auto":
-        return settings.lambda_area
-    return COMPACT_AREA_WEIGHT if is_compact(info) else 0.0
+    def for_data(self, info: DatasetInfo) -> PoseInvariantSettings:
+        area = self.lambda_area if self.lambda_area != "auto" else COMPACT_AREA_WEIGHT * is_compact(info)
+        return dataclasses.replace(super().for_data(info), lambda_area=area)
 
 
 class PoseInvariant(MeshMethod):
@@ -95,7 +86,7 @@ class PoseInvariant(MeshMethod):
         return {
             "projection": 1.0,
             "smoothness": settings.lambda_smooth,
-            "area": area_weight(settings, self.info),
+            "area": settings.lambda_area,
             "classification": settings.lambda_classification,
             "confusion": settings.lambda_adversarial,
             "prior": settings.lambda_prior,
@@ -111,10 +102,6 @@ class PoseInvariant(MeshMethod):
     def decode(self, codes: Tensor) -> Meshes:
         shapes = super().decode(codes)
         return self.clamp_to_cube(shapes) if self.settings.clamp_to_cube else shapes
-
-    def start_from_pretrained(self) -> None:
-        if self.settings.pretrained is not None:
-            load_pretrained(self.encoder, self.settings.pretrained)
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Train encoder and generator in every step on projection + lambda_1 smoothness + lambda_area area + lambda_4

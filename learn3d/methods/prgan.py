@@ -142,12 +142,11 @@ class PrGAN(Method):
         with autocast(self.device, "fp32"):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """A step of the GAN before `encoder_from_step`, afterwards one of the encoder.
-
-        Raises ValueError if the batch's cameras are not those of the K views.
-        """
+    def check_batch(self, batch: Batch) -> None:
         check_views(batch.poses, batch.view_ids, self.views)
+
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
+        """A step of the GAN before `encoder_from_step`, afterwards one of the encoder."""
         if step >= self.settings.encoder_from_step:
             return self._encoder_step(len(batch), step)
         return self._gan_step(upload(batch.masks, self.device), self.sample_z(len(batch)), step)

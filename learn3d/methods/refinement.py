@@ -32,8 +32,8 @@ def refine(method: MeshMethod, images: Tensor, masks: Tensor, poses: Poses) -> M
 
     def loss(vertices: Tensor) -> Tensor:
         vertices = vertices.float().cpu()
-        seen = nmr.render_silhouette(vertices, method.faces, poses.cameras(), image_size=masks.shape[-1])
-        fit = nmr.losses.soft_iou_loss(seen, masks)
+        silhouettes = nmr.render_silhouette(vertices, method.faces, poses.cameras(), image_size=masks.shape[-1])
+        fit = nmr.losses.soft_iou_loss(silhouettes, masks)
         return fit + SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
 
     with torch.no_grad():

@@ -21,14 +21,14 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import Poses
 from learn3d.device import upload
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings, generator_name, plane_of
+from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings
 from learn3d.methods.optimization import adam, frozen
 from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.encoders import PreactResNet18
 from learn3d.networks.layers import reverse_gradient
-from learn3d.networks.resnet import FlatResNet18, check_pretrained, load_pretrained
-from learn3d.settings import Channels, FilePath, Pixels, Positive, Weight, checked
+from learn3d.networks.resnet import FlatResNet18
+from learn3d.settings import Channels, Pixels, Positive, Weight, checked
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object if alpha is at least this
 
@@ -43,9 +43,6 @@ class VPLSettings(MeshSettings):
     encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
     """Network from images to codes. conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey.
     resnet18: RGB, may be pretrained. The last two take any multiple of 32 pixels (--image-size)."""
-    pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
-    weights). Batch norms are frozen if it is given."""
     image_size: Pixels = 64
     """Side of the input images in pixels."""
     vertex_scale: Positive = 0.01
@@ -98,7 +95,7 @@ class VPLSettings(MeshSettings):
                 f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size ({size}), got "
                 f"{self.silhouette_size}"
             )
-        check_pretrained(self.pretrained, self.encoder)
+        super().__post_init__()
         if self.class_conditional and self.discriminator != "spectral-patch":
             raise ValueError(f"class_conditional needs discriminator 'spectral-patch', got {self.discriminator!r}")
 
@@ -125,8 +122,7 @@ class VPL(MeshMethod):
         scales = {}
         if settings.generator.startswith("cube"):
             scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
-        kind = GENERATORS[generator_name(settings.generator, info)]
-        generator = kind(symmetry=plane_of(settings.symmetry, info), **scales)
+        generator = GENERATORS[settings.generator](symmetry=settings.symmetry, **scales)
         networks = {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
         if settings.lambda_discriminator > 0:
             networks["discriminator"] = _create_discriminator(settings, info)
@@ -147,10 +143,6 @@ class VPL(MeshMethod):
             "adversarial": settings.lambda_discriminator,
         }
 
-    def start_from_pretrained(self) -> None:
-        if self.settings.pretrained is not None:
-            load_pretrained(self.encoder.resnet, self.settings.pretrained)
-
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Train encoder and generator on projection + smoothness + inflation in every step.
 
@@ -159,18 +151,15 @@ class VPL(MeshMethod):
         generator on lambda_D softplus(-D(other view)); D and its running means do not change. Reversal: every step
         trains D on its loss, and encoder and generator on -lambda_D times its gradient.
         """
-        settings = self.settings
-        if settings.lambda_discriminator == 0:
-            vertices = self.predict(batch.images)[1].cpu()
-            silhouettes = self.render(vertices, batch.poses)
-            losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
-            return self.backward_and_step(losses, step, "encoder", "generator")
-
-        others = other_views(batch, settings.other_views)
+        settings, own = self.settings, torch.arange(len(batch))
+        is_baseline = settings.lambda_discriminator == 0
+        others = own[:0] if is_baseline else other_views(batch, settings.other_views)
         vertices = self.predict(batch.images)[1].cpu()
-        both = batch.poses[torch.cat([torch.arange(len(batch)), others])]  # both views of each shape in one call
-        silhouettes, elsewhere = self.render(torch.cat([vertices, vertices]), both).chunk(2)
+        both = torch.cat([vertices, vertices[: len(others)]])  # both views of each shape in one call
+        silhouettes, elsewhere = self.render(both, batch.poses[torch.cat([own, others])]).tensor_split([len(batch)])
         losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
+        if is_baseline:
+            return self.backward_and_step(losses, step, "encoder", "generator")
         if settings.adversary == "reversal":
             reverse = settings.lambda_discriminator
             real, fake = reverse_gradient(silhouettes, reverse), reverse_gradient(elsewhere, reverse)

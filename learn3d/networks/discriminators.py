@@ -14,10 +14,9 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import spectral_norm
 
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.layers import initialize_he, linear_layers
+from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
 
 SLOPE = 0.2  # slope of the leaky ReLUs
-BATCH_NORM_EPS = 2e-5  # published code
 
 
 class PoseDiscriminator(nn.Module):

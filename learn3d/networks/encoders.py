@@ -10,11 +10,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.device import upload
-from learn3d.networks.layers import initialize_he, linear_layers
+from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
-CENTRED_SHARE = 0.8  # share of the image's side that an object takes after `centre`
+CENTRED_SIZE = 0.8  # object size (`ViewDataset.object_sizes`) after `centre`
 
 
 class ConvEncoder(nn.Module):
@@ -112,10 +112,10 @@ class ViewClassifier(nn.Module):
         return self.layers(self.convolutions(images).flatten(1))
 
 
-def centre(images: Tensor, share: float = CENTRED_SHARE) -> Tensor:
+def centre(images: Tensor, object_size: float = CENTRED_SIZE) -> Tensor:
     """Scale and shift images float [B,C,S,S], the mask last, so that the mask's bounding box is centred and its longer
-    side takes `share` of the image. Beyond the border, colours are repeated and the mask is 0. Images with an empty
-    mask do not change.
+    side takes `object_size` of the image. Beyond the border, colours are repeated and the mask is 0. Images with an
+    empty mask do not change.
     """
     size = images.shape[-1]
     inside = images[:, -1] > 0.5
@@ -125,7 +125,7 @@ def centre(images: Tensor, share: float = CENTRED_SHARE) -> Tensor:
         first, last = touched.int().argmax(1), size - touched.flip(1).int().argmax(1)  # `last` is excluded
         extents.append(last - first)
         middles.append((first + last) / size - 1)
-    scale = torch.maximum(*extents) / (size * share)
+    scale = torch.maximum(*extents) / (size * object_size)
     steps = (torch.arange(size, device=images.device) + 0.5) * (2 / size) - 1
     x, y = (scale[:, None] * steps + middle[:, None] for middle in middles)
     grid = torch.stack(torch.broadcast_tensors(x[:, None, :], y[:, :, None]), dim=-1)
@@ -179,9 +179,6 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
     for channel in range(4):  # one pass converts and copies; torch's own change of layout is slower
         pixels[..., channel].copy_(images[:, channel])
     return pixels.div_(255).permute(0, 3, 1, 2)
-
-
-BATCH_NORM_EPS = 2e-5  # published code
 
 
 class PreactResNet18(nn.Module):

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.layers import initialize_he, linear_layers
+from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
 from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
 
 OBJECT_SCALE = 0.5
@@ -155,7 +155,6 @@ class BoundedGenerator(MeshGenerator):
 GRID_SIZE = 16  # vertices along an edge of the cube
 INITIAL_RADIUS = 0.5
 BOUND = 1.2  # coordinates lie between -BOUND and BOUND
-BATCH_NORM_EPS = 2e-5  # published code
 
 
 def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:

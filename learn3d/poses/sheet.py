@@ -16,18 +16,21 @@ TILE = 64  # side of a picture in pixels
 LEGEND = "columns: azimuths; first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
 
 
-def draw_sheet(views: EstimatedViews) -> np.ndarray:
-    """Uint8 [H, W, 3]: the most frequent prototypes, and below each azimuth images with about that estimate."""
+def draw_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarray:
+    """Uint8 [H, W, 3]: the most frequent prototypes, and below each azimuth images with about that estimate.
+
+    offset_deg: added to the azimuths of images and prototypes, as by `PoseTable.turned`.
+    """
     candidates, result = views.candidates, views.result
     count = min(COLUMNS, len(candidates.azimuth_deg))
     azimuths = candidates.azimuth_deg[torch.linspace(0, len(candidates.azimuth_deg), count + 1)[:-1].long()]
     middle = candidates.elevation_deg[len(candidates.elevation_deg) // 2 : len(candidates.elevation_deg) // 2 + 1]
-    front = LookAtPoses(torch.zeros(1), middle, candidates.distance, candidates.half_fov_deg)
+    front = LookAtPoses(torch.full((1,), -offset_deg), middle, candidates.distance, candidates.half_fov_deg)
     cameras = orbit(front, azimuths.tolist())
     order = result.weights.argsort(descending=True)[:PROTOTYPES]
     rows = [list(draw_surface(Surface(result.prototypes[m], result.faces), cameras, image_size=TILE)) for m in order]
     starts = np.cumsum([0, *map(len, views.datasets)])
-    found = torch.from_numpy(views.table.azimuth_deg[:, 0])[views.shown]
+    found = torch.from_numpy(views.table.azimuth_deg[:, 0])[views.shown] + offset_deg
     columns = []
     for azimuth in azimuths:
         near = torch.nonzero(torch.remainder(found - azimuth + 180 / count, 360) < 360 / count)[:, 0]

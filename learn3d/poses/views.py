@@ -157,8 +157,8 @@ def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[T
     """Elevation, distance and half field of view of every image: the given ones, the data set's, or defaults."""
     given = cameras.elevations() or (DEFAULT_ELEVATION_DEG,) * 2
     half_fov = torch.full((sum(map(len, datasets)),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
-    share = max(float(dataset.object_sides().max()) for dataset in datasets)
-    guess = 0.5 / (max(share, 0.01) * np.tan(np.radians(float(half_fov[0]))))
+    largest = max(float(dataset.object_sizes().max()) for dataset in datasets)
+    guess = 0.5 / (max(largest, 0.01) * np.tan(np.radians(float(half_fov[0]))))
     distance, elevation = torch.full_like(half_fov, guess), torch.full_like(half_fov, sum(given) / 2)
     if any(dataset.poses is not None for dataset in datasets):
         if not all(isinstance(dataset.poses, LookAtPoses) for dataset in datasets):

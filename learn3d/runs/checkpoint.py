@@ -29,7 +29,7 @@ from learn3d.device import resolve_precision
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
 from learn3d.methods import DatasetInfo, Method, create_method
-from learn3d.settings import Count, Share, Weight, checked
+from learn3d.settings import Count, NonNegative, Share, checked
 
 
 @functools.cache
@@ -71,8 +71,8 @@ class Progress:
     step: AnyStep = 0  # last step taken
     best_iou: Annotated[float, Field(ge=-1, le=1)] = -1.0  # best validation IoU so far; -1 before the first validation
     best_step: AnyStep = 0  # step of best_iou
-    seconds: Weight = 0.0  # training time, over all resumptions
-    object_share: Share = 0.0  # mean share of the side of the training images that objects take
+    seconds: NonNegative = 0.0  # training time, over all resumptions
+    object_share: Share = 0.0  # `ViewDataset.mean_object_size` of the training images
     threads: Count | None = None  # CPU threads that the run has chosen; None: fixed, or not chosen yet
     losses: dict[str, float] = dataclasses.field(default_factory=dict)  # losses of the last step
 
@@ -203,6 +203,7 @@ def load_data(
 ) -> ViewDataset:
     """A split of a run's data, or of another folder, category or layout, in the form that its networks take.
 
+    The run's own data have the poses and, in the training split, the views of its training.
     Raises ValueError if the layout inverts colours and the training layout does not, or the other way round.
     """
     layout = layout or config.layout
@@ -212,7 +213,7 @@ def load_data(
     if layout == config.layout:
         form["view_bins"] = config.view_bins
     if data is None and category is None and layout == config.layout:
-        form["poses"] = config.poses
+        form |= {"poses": config.poses, "views_per_object": config.views_per_object if split == "train" else None}
     return load_dataset(layout, data or config.data, category or config.category, split, **form)
 
 

@@ -27,7 +27,7 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
     Raises ValueError for methods other than proposed, Vanilla-AE, Plus and Many views.
     """
     method, config, metadata = checkpoint.load_method(source, which)
-    trained_on, data = config, config.data
+    config = trained_on = dataclasses.replace(config, poses=None)
     if not isinstance(config.settings, (PoseInvariantSettings, ManyViewsSettings)):
         names = "proposed, vanilla, plus and many-views"
         raise ValueError(f"only runs of {names} can be exported, this one is of {config.preset}")
@@ -40,8 +40,8 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         for name, tensor in checkpoint.network_tensors(method).items()
         if name.startswith(("network.encoder.", "network.generator.", "network.view_classifier."))
     }
-    if not data.is_dir():
-        note(f"note: {data} is not there, so the file has no known codes, and reconstruction will not warn")
+    if not trained_on.data.is_dir():
+        note(f"note: {trained_on.data} is not there, so the file has no known codes, and reconstruction will not warn")
     elif isinstance(method, MeshMethod):
         known = known_codes(method, checkpoint.load_data(trained_on, "train"), others)
         tensors |= {name: codes.half() for name, codes in zip(KNOWN_CODES, known, strict=True) if codes is not None}

@@ -33,14 +33,13 @@ class RunLog:
     Shown losses are means over the last steps that computed them. Raises OSError if a file cannot be written.
     """
 
-    def __init__(self, folder: Path, *, start: int, total: int, config: TrainConfig | None = None) -> None:
-        self.start, self.total = start, total
+    def __init__(self, config: TrainConfig, *, start: int) -> None:
+        folder, kind, self.start, self.total = config.output, config.log, start, config.iterations
         self._recent: dict[str, deque[float]] = {}
         _drop_after(folder / METRICS, start)
         self._metrics = open(folder / METRICS, "ab")
-        self._bar = tqdm(total=total, initial=start, unit="step", dynamic_ncols=True) if is_watched() else None
+        self._bar = tqdm(total=self.total, initial=start, unit="step", dynamic_ncols=True) if is_watched() else None
         self._writer: _Csv | _TensorBoard | _Wandb | None = None
-        kind = "tensorboard" if config is None else config.log
         try:
             self._writer = _Wandb(folder, config) if kind == "wandb" else _WRITERS[kind](folder, start)
         except (ImportError, TypeError, AttributeError) as error:  # missing, or in conflict with other packages

@@ -46,7 +46,7 @@ class Run:
         if saved is not None:
             progress = self._restore(*saved)
         else:
-            progress = Progress(object_share=train_set.object_share())
+            progress = Progress(object_share=train_set.mean_object_size())
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
             raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
@@ -88,7 +88,7 @@ class Run:
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog) -> None:
-        """Write last.safetensors: networks, EMA, optimizers, random state and `Metadata`; first the metrics so far.
+        """Flush the metrics, then write last.safetensors: networks, EMA, optimizers, random state and `Metadata`.
 
         The checkpoint before it becomes previous.safetensors. Neither file is ever incomplete.
         """
@@ -125,12 +125,12 @@ def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] |
     run or one with other options; DamagedError if all checkpoints are damaged; OSError if one cannot be read.
     """
     folder, notes = config.output, []
-    candidates = run_folder.checkpoints(folder)
-    if not candidates:
+    paths = run_folder.checkpoints(folder)
+    if not paths:
         if not run_folder.is_run(folder):
             raise ValueError(f"there is no checkpoint and no {CONFIG} in {folder}; start the run without --resume")
         check_resume(config, load_config(folder / CONFIG))
-    for path in candidates:
+    for path in paths:
         try:
             saved = checkpoint.load(path)
         except checkpoint.DamagedError as error:

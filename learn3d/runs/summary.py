@@ -26,9 +26,10 @@ def describe_run(
     name = f"{PRESETS[config.preset].label} ({config.preset})"
     text = f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"
     if config.settings.wants_mirror_plane and run.info.mirror_plane_deg is None:
-        text += "\nno mirror plane: the masks show none (it takes some 150 of them); --symmetry names one"
+        text += "\nno mirror plane found in the masks (about 150 are needed); set it with --symmetry"
     elif config.settings.wants_mirror_plane:
-        text += f"\nmirror plane: a camera of azimuth {run.info.mirror_plane_deg:g} looks along it, as the masks show"
+        azimuth = f"{run.info.mirror_plane_deg:g}"
+        text += f"\nmirror plane: along the viewing direction of azimuth {azimuth}, found from the masks"
     if config.settings.wants_solidity:
         kind = "compact" if is_compact(run.info) else "not compact"
         text += f"\nobjects: {kind}, as masks fill {run.info.solidity:.2f} of their convex hulls"

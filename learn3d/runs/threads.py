@@ -12,7 +12,7 @@ from collections import deque
 
 import torch
 
-WARM_UP, TRIAL = 1, 5  # steps of a trial, and those at its start that are not timed
+WARM_UP, TRIAL = 1, 5  # steps at the start of a trial that are not timed, and all of its steps
 WINDOW = 20  # steps whose median is compared with the smallest median so far
 SLOWER = 3.0  # ratio of the two medians at which both numbers of threads are measured again
 REST = 1000  # steps with one thread after which both are measured again; it doubles each time
@@ -59,9 +59,9 @@ class ThreadTuner:
         if len(self._seconds) == WINDOW:
             median = statistics.median_low(self._seconds)
             self._best = min(self._best, median)
-            tired = self.threads == 1 and self._steps >= self._rest
-            if median > SLOWER * self._best or tired:
-                self._rest = 2 * self._rest if tired else REST
+            is_due = self.threads == 1 and self._steps >= self._rest
+            if median > SLOWER * self._best or is_due:
+                self._rest = 2 * self._rest if is_due else REST
                 self._trying, self._medians = True, {}
                 self._use(self.all)
         return ""

@@ -36,7 +36,7 @@ def check_same(folder: Path, other: Path) -> None:
 def metadata(step: int = 3, **changes: Any) -> Metadata:
     """The metadata of a checkpoint."""
     config = TrainConfig(data="data", category="chair", output="run")
-    about = Metadata(config, DatasetInfo(24), Progress(step=step), "72 images", {"torch": "2"})
+    about = Metadata(config, DatasetInfo(24, inverted=False), Progress(step=step), "72 images", {"torch": "2"})
     return dataclasses.replace(about, **changes)
 
 

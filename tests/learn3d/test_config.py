@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
 import pytest
 
-from learn3d.config import config_from_dict, config_to_dict, load_config
+from learn3d.config import config_from_dict, config_to_dict, differences, load_config
 from learn3d.files import limits
 
 BASE = {"data": "d", "category": "chair", "output": "o"}
@@ -53,6 +54,12 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 
+def test_images_may_be_flipped_if_their_view_classes_are_not_read():
+    settings = {"encoder": "conv-light", "lambda_view": 1.0}
+    config = config_from_dict(BASE | {"preset": "many-views-kato", "settings": settings, "augment": ["flip"]})
+    assert config.augment == ("flip",) and not config.settings.reads_view_ids
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_options_are_named_with_their_file(tmp_path, name):
     values, message = WRONG[name]
@@ -62,10 +69,18 @@ def test_wrong_options_are_named_with_their_file(tmp_path, name):
     assert "config.json" in str(error.value)
 
 
+def test_the_length_of_a_run_whose_poses_are_weighted_anew_is_kept(tiny_config, tmp_path):
+    for updates, found in ((1, ["iterations: 6 in the run, 7 asked for (pose_updates depends on it)"]), (0, [])):
+        options = {"lr_schedule": "constant", "poses": tmp_path / "poses.npz", "pose_updates": updates}
+        config = tiny_config(tmp_path, iterations=6, **options)
+        assert differences(dataclasses.replace(config, iterations=7), config) == found
+
+
 def test_files_that_are_no_json_or_too_large(tmp_path, monkeypatch):
     path = tmp_path / "config.json"
     with pytest.raises(
-        ValueError, match=r"no .*config\.json: is this the folder of a training run\? One begins without --resume"
+        ValueError,
+        match=r"config\.json is missing: is this the folder of a run\? To start a new run, leave out --resume",
     ):
         load_config(path)
     for text in ("[" * 100_000, '{"seed": NaN}', "{", "\xff"):

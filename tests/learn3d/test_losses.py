@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from vectors import load_vector
 
+from learn3d.evaluation import mean_mmd
 from learn3d.losses import (
     domain_confusion_loss,
     gaussian_prior_loss,
@@ -86,19 +87,30 @@ def test_prior_of_zero_codes_has_the_gradient_zero(form: str) -> None:
 def test_low_precision_inputs_give_float32_losses() -> None:
     logits, codes = torch.randn(2, 24).bfloat16(), torch.randn(2, 8).bfloat16()
     losses = [domain_confusion_loss(logits, "log"), pose_classification_loss(logits, torch.tensor([0, 5]))]
-    losses += [gaussian_prior_loss(codes, "norm"), mmd(codes, codes)]
+    losses += [gaussian_prior_loss(codes, "norm")]
     assert all(loss.dtype == torch.float32 for loss in losses)
+
+
+def squared_distances(x: Tensor, y: Tensor) -> Tensor:
+    return (x[:, None] - y).square().sum(2)
+
+
+def mmd_of_views(x: Tensor, y: Tensor, name: str = "mmd") -> float:
+    """The MMD between the codes of two views."""
+    views = torch.cat([torch.zeros(len(x)), torch.ones(len(y))])
+    return mean_mmd(torch.cat([x, y]), views, (name,))[name]
 
 
 def test_mmd_vectors() -> None:
     case = {k: torch.from_numpy(v) for k, v in load_vector("loss_mmd").items() if v.dtype.kind == "f"}
     source, target = case["source"].clone().requires_grad_(), case["target"].clone().requires_grad_()
-    value = mmd(source, target)
+    value = mmd(*(squared_distances(*pair) for pair in ((source, source), (target, target), (source, target))))
     value.backward()
     close(value, case["mmd"])
+    assert mmd_of_views(source.detach(), target.detach()) == pytest.approx(float(case["mmd"]), rel=1e-5)
     close(source.grad, case["grad_source"], 1e-5)
     close(target.grad, case["grad_target"], 1e-5)
-    assert float(mmd(source, source).detach()) == pytest.approx(float(case["mmd_same"]), abs=1e-6)
+    assert mmd_of_views(source.detach(), source.detach()) == pytest.approx(float(case["mmd_same"]), abs=1e-6)
 
 
 def test_mmd_as_printed_equals_its_double_sum() -> None:
@@ -110,9 +122,9 @@ def test_mmd_as_printed_equals_its_double_sum() -> None:
         return sum(torch.exp(-(a - b).square().sum() / bandwidth) for a in p for b in q) / 25
 
     expected = (mean_kernel(x, x) - 2 * mean_kernel(x, y) + mean_kernel(y, y)).sqrt()
-    torch.testing.assert_close(mmd(x, y, "paper"), expected)
-    for form in ("released", "paper"):
-        assert mmd(torch.ones(4, 3), torch.ones(4, 3), form) == 0
+    assert mmd_of_views(x, y, "mmd_paper") == pytest.approx(float(expected), rel=1e-5)
+    for name in ("mmd", "mmd_paper"):
+        assert mmd_of_views(torch.ones(4, 3), torch.ones(4, 3), name) == 0
 
 
 def test_silhouette_pyramid_equals_its_sum() -> None:

@@ -83,7 +83,7 @@ def test_a_large_photograph_is_prepared_like_a_small_one() -> None:
 def test_crop_centres_and_scales_the_object(y: int, x: int, factor: int) -> None:
     mask = np.zeros((300 // factor, 400 // factor), np.uint8)
     mask[y : y + 60 // factor, x : x + 120 // factor] = 255
-    stored = prepare_image(np.zeros((*mask.shape, 3), np.uint8), mask, object_share=0.75)
+    stored = prepare_image(np.zeros((*mask.shape, 3), np.uint8), mask, object_size=0.75)
     rows, columns = np.flatnonzero(stored[3].max(1) > 127), np.flatnonzero(stored[3].max(0) > 127)
     assert (columns[0], columns[-1]) == (8, 55)
     assert (rows[0], rows[-1]) == (20, 43)

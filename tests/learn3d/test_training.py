@@ -33,7 +33,7 @@ def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
 
 def make_step(config: TrainConfig, data: ViewDataset):
     """Networks by name, and a function that takes one step with them."""
-    method = create_method(config.settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(config.settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
     batch = data.batch(torch.tensor([0, 25, 50, 7]))
     return method.networks, lambda iteration: method.take_step(batch, iteration)
 
@@ -184,6 +184,7 @@ def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
         ({"augment": ("crop",)}, "crop needs the original images"),
         ({"preset": "kato2018-kato", "sampling": "views"}, "choose sampling 'pairs'"),
         ({"preset": "peng2020-kato-vpl", "batch_size": 1}, "batches of at least 2, got 1"),
+        ({"preset": "gadelha2017-kato", "encoder_from_step": 1, "elevation_deg": 20.0}, "PrGAN needs images from 24"),
     ],
 )
 def test_what_no_step_can_be_taken_with_leaves_the_older_run(
@@ -222,15 +223,17 @@ def test_empty_masks_are_said_and_nothing_but_empty_ones_refused(
     train(tiny_run(run_folder, iterations=1))
     assert f"warning: 5 of {len(images)} test images have an empty mask" in capsys.readouterr().err
     images[:] = 0
+    before = {path.name for path in run_folder.iterdir()}
     with pytest.raises(ValueError, match=f"all {len(images)} test images of airplane have an empty mask"):
         train(tiny_run(run_folder, iterations=1), overwrite=True)
+    assert {path.name for path in run_folder.iterdir()} == before
 
 
 @pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "kato2018-kato"])
 @pytest.mark.parametrize(("plane", "fixed"), [(37.5, True), (None, False)])
 def test_symmetry_auto_is_the_plane_that_the_data_have(preset: str, plane: float | None, fixed: bool) -> None:
     settings = dataclasses.replace(PRESETS[preset].settings, symmetry="auto", generator="sphere-small")
-    shape = DatasetInfo(24, mirror_plane_deg=plane)
+    shape = DatasetInfo(24, inverted=False, mirror_plane_deg=plane)
     generator = create_method(settings, shape, device="cpu", precision="fp32", seed=0).networks["generator"]
     assert (generator.mirror is not None) == fixed
 

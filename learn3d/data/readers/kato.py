@@ -80,6 +80,7 @@ def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, sp
         object_names=tuple(f"{i:04d}" for i in range(count)),
         voxels=voxels,
         convention=KATO,
+        inverted=PROPERTIES.inverted,
     )
 
 

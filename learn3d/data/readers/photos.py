@@ -117,6 +117,7 @@ def load(
         object_names=tuple(names.tolist()),
         voxels=None,
         convention=KATO,
+        inverted=PROPERTIES.inverted,
     )
 
 
@@ -168,7 +169,7 @@ def _poses(photos: list[Photo]) -> LookAtPoses:
 
 def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Findings) -> None:
     """Compare the objects' sizes in the photographs with those from distances and fields of view."""
-    scales = [2 * f.share * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs]
+    scales = [2 * f.object_size * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs]
     middle = float(np.median(scales)) if scales else 1.0
     message = f"the objects are {middle:.2g} times as large in the photographs as in the table; distance must be in "
     message += "lengths of the object's longest side, fov_deg the full angle across the longer side"

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import nmr
+from learn3d.data.batch import PoseCandidates
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.poses import LookAtPoses, RotationPoses
@@ -35,6 +36,7 @@ def continuous(objects: int = 3, views: int = 4, category: str = "cup", seed: in
         object_names=tuple(f"{category}{i}" for i in range(objects)),
         voxels=rng.random((objects, 32, 32, 32)) < 0.5,
         convention=KATO,
+        inverted=True,
     )
 
 
@@ -70,8 +72,8 @@ def test_separate_masks_replace_the_fourth_channel() -> None:
     [
         ({"images": np.zeros((12, 4, 64, 64))}, r"images must be uint8 \[M, 4, S, S\], got float64"),
         ({"images": np.zeros((12, 4, 32, 32), np.uint8)}, r"masks must be \[M, 64, 64\], got \[12, 32, 32\]"),
-        ({"view_ids": np.zeros(5, np.int64)}, r"12 images of 3 objects do not go with \{'view_ids': 5\}"),
-        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"do not go with \{'voxels': 2\}"),
+        ({"view_ids": np.zeros(5, np.int64)}, r"expected 12 images and 3 objects, got \{'view_ids': 5\}"),
+        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"12 images and 3 objects, got \{'voxels': 2\}"),
         ({"voxels": np.zeros((3, 16, 16, 16), bool)}, r"voxels must be \[N, 32, 32, 32\]"),
         ({"view_ids": np.full(12, 2)}, r"view_ids must lie in 0 .. 1, got 2 .. 2"),
         ({"object_ids": np.full(12, -1)}, r"object_ids must lie in 0 .. 2, got -1 .. -1"),
@@ -166,6 +168,10 @@ def test_rebinning_changes_the_classes_alone() -> None:
     binned = data.with_bins(AngleBins.parse("60x60"))
     assert binned.num_views == 6
     assert np.array_equal(binned.view_ids, AngleBins.parse("60x60").ids(data.poses).numpy())
+    candidates = PoseCandidates(data.poses.mirrored(torch.ones(12, dtype=bool)), data.view_ids, np.ones((12, 1)))
+    drawn = dataclasses.replace(data, candidates=candidates).with_bins(AngleBins.parse("60x60")).candidates
+    assert np.array_equal(drawn.view_ids, AngleBins.parse("60x60").ids(candidates.poses).numpy())
+    assert not np.array_equal(drawn.view_ids, binned.view_ids)
     turned = dataclasses.replace(data, poses=RotationPoses(torch.eye(3).expand(12, 3, 3)))
     with pytest.raises(ValueError, match="need look-at cameras"):
         turned.with_bins(AngleBins.parse("60x60"))
@@ -212,7 +218,7 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
     assert concatenate([unknown, unknown]).poses is None
     assert unknown.select(np.array([0, 1])).poses is None
     indices = torch.tensor([1, 30])
-    batch, known = (augment(dataset.batch(indices), ("flip",), 0, 1) for dataset in (unknown, tiny_set))
+    batch, known = (augment(dataset.batch(indices), ("flip",), 0, 1, inverted=True) for dataset in (unknown, tiny_set))
     assert batch.poses is None
     assert torch.equal(batch.images, known.images)
     with pytest.raises(ValueError, match="no poses"):
@@ -224,7 +230,13 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
 @pytest.mark.parametrize("preset", ["peng2020-kato", "kato2018-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
 def test_methods_that_need_poses_say_so(preset: str) -> None:
     with pytest.raises(ValueError, match="has no poses"):
-        create_method(PRESETS[preset].settings, DatasetInfo(1, pose_features=0), device="cpu", precision="fp32", seed=0)
+        create_method(
+            PRESETS[preset].settings,
+            DatasetInfo(1, inverted=False, pose_features=0),
+            device="cpu",
+            precision="fp32",
+            seed=0,
+        )
 
 
 def test_few_views_of_every_object(tiny_set) -> None:
@@ -246,10 +258,10 @@ def test_few_views_of_every_object(tiny_set) -> None:
 
 def test_colours_are_permuted_scaled_or_left_out(tiny_set) -> None:
     batch = tiny_set.batch(torch.arange(72))
-    changed = augment(batch, ("colors",), 0, 1)
+    changed = augment(batch, ("colors",), 0, 1, inverted=True)
     assert torch.equal(changed.images[:, 3], batch.images[:, 3])
     assert torch.equal(changed.masks, batch.masks)
-    assert torch.equal(augment(batch, ("colors",), 0, 1).images, changed.images)
+    assert torch.equal(augment(batch, ("colors",), 0, 1, inverted=True).images, changed.images)
     means, before = (b.images[:, :3].double().mean((2, 3)).sort(dim=1).values for b in (changed, batch))
     without = (means == 0).all(1)
     assert 8 < without.sum() < 36  # 30 % of 72
@@ -267,6 +279,6 @@ def test_batches_are_sampled_and_augmented_from_any_step_on(tiny_set) -> None:
     assert len(found) == 4
     for step, batch in enumerate(found, 3):
         samples = sample_indices(tiny_set, "views", 4, 5, step)
-        wanted = augment(tiny_set.batch(samples, voxels=False), ("flip", "channels"), 5, step)
+        wanted = augment(tiny_set.batch(samples, voxels=False), ("flip", "channels"), 5, step, inverted=True)
         assert batch.voxels is None and torch.equal(batch.images, wanted.images)
         assert torch.equal(batch.poses.azimuth_deg, wanted.poses.azimuth_deg)

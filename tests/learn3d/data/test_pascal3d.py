@@ -181,7 +181,9 @@ def test_rotation_cells_are_45_degrees_of_scipys_yzx_angles() -> None:
 def test_crop_jitter_is_a_function_of_seed_and_step(folder: Path, contents: dict[str, dict]) -> None:
     dataset = pascal3d.load(folder, "aeroplane", "train")
     batch = dataset.batch(torch.tensor([1, 4, 1, 0]))
-    one, same, other, seed = (augment(batch, ["crop"], s, k).images for s, k in ((0, 7), (0, 7), (0, 8), (1, 7)))
+    one, same, other, seed = (
+        augment(batch, ["crop"], s, k, inverted=True).images for s, k in ((0, 7), (0, 7), (0, 8), (1, 7))
+    )
     assert torch.equal(one, same)
     assert all((one != x).any() for x in (other, seed, batch.images))
     assert (one[0] != one[2]).any()  # the same photograph twice: cropped in two ways
@@ -199,8 +201,8 @@ def test_crop_jitter_is_a_function_of_seed_and_step(folder: Path, contents: dict
 
 def test_flip_image_leaves_mask_and_pose(folder: Path) -> None:
     batch = pascal3d.load(folder, "aeroplane", "train").batch(torch.arange(6))
-    changed = augment(batch, ["crop", "flip-image"], 0, 1)
-    cropped = augment(batch, ["crop"], 0, 1)
+    changed = augment(batch, ["crop", "flip-image"], 0, 1, inverted=True)
+    cropped = augment(batch, ["crop"], 0, 1, inverted=True)
     flipped = (changed.images[:, :3] == cropped.images[:, :3].flip(3)).flatten(1).all(1)
     same = (changed.images[:, :3] == cropped.images[:, :3]).flatten(1).all(1)
     assert (flipped ^ same).all() and flipped.any() and same.any()
@@ -211,9 +213,9 @@ def test_flip_image_leaves_mask_and_pose(folder: Path) -> None:
 def test_impossible_crops_are_refused(folder: Path) -> None:
     batch = pascal3d.load(folder, "aeroplane", "train").batch(torch.arange(2))
     with pytest.raises(ValueError, match=r"crop must be the first augmentation, got flip, crop"):
-        augment(batch, ["flip", "crop"], 0, 1)
+        augment(batch, ["flip", "crop"], 0, 1, inverted=True)
     with pytest.raises(ValueError, match="only the layout pascal3d without shards"):
-        augment(dataclasses.replace(batch, crops=None), ["crop"], 0, 1)
+        augment(dataclasses.replace(batch, crops=None), ["crop"], 0, 1, inverted=True)
 
 
 def test_crops_follow_selection_and_joining(folder: Path) -> None:

@@ -123,7 +123,7 @@ def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
         a, b = getattr(one, name), getattr(other, name)
         assert (a is None and b is None) or torch.equal(a, b), name
     assert torch.equal(one.poses.features(), other.poses.features())
-    assert after.object_share() == pytest.approx(before.object_share())
+    assert after.mean_object_size() == pytest.approx(before.mean_object_size())
     assert after.check_masks() == before.check_masks()
     if LAYOUTS[made.layout].angles:
         assert find_mirror_plane(after) == find_mirror_plane(before)

@@ -17,11 +17,12 @@ from torch import Tensor
 import nmr
 from learn3d.figures import grids
 from learn3d.figures.grids import comparison_grid, interpolate, picture_grid
-from learn3d.figures.runs import Run, name_runs
+from learn3d.figures.runs import Run, name_runs, open_runs
 from learn3d.files import limits
 from learn3d.methods import Grids, Meshes
 from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_colors
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
+from learn3d.runs import checkpoint
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
@@ -301,6 +302,16 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
         assert (code, out) == (1, ""), arguments
         assert err.splitlines()[-1].startswith("error: ") and message in err, (arguments, err)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_other_data_are_shown_without_the_poses_of_the_training(tiny_config, tiny_set, tmp_path, monkeypatch) -> None:
+    configs, loaded = {name: tiny_config(tmp_path, poses=tmp_path / name) for name in ("a", "b")}, []
+    monkeypatch.setattr(checkpoint, "load_method", lambda path, which: (Ellipsoids(), configs[path.name], None))
+    monkeypatch.setattr(checkpoint, "load_data", lambda config, split: loaded.append(config.poses) or tiny_set)
+    paths = [tmp_path / "a", tmp_path / "b"]
+    open_runs(paths)
+    open_runs(paths, category="chair")
+    assert loaded == [*paths, None]
 
 
 def test_runs_are_called_by_what_tells_them_apart(tiny_config, tmp_path) -> None:

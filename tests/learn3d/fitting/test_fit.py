@@ -15,7 +15,7 @@ from learn3d.data.dataset import DatasetInfo
 from learn3d.data.layouts import load_dataset
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.familiarity import KnownCodes, known_codes, learn_others
-from learn3d.fitting.fit import AZIMUTHS, SHARE, View, find_view, fit, frame_view
+from learn3d.fitting.fit import AZIMUTHS, CENTRED_SIZE, View, find_view, fit, frame_view
 from learn3d.fitting.smoothing import smooth
 from learn3d.methods import create_method
 from learn3d.methods.method import MeshMethod
@@ -63,7 +63,7 @@ def test_views_are_framed() -> None:
     seen = view.cameras().transform(view.place(many))[..., :2]
     low, high = seen.amin(1), seen.amax(1)
     assert torch.allclose((low + high) / 2, torch.zeros(3, 2), atol=1e-3)
-    assert torch.allclose((high - low).amax(1), torch.full((3,), 2 * SHARE), atol=2e-3)
+    assert torch.allclose((high - low).amax(1), torch.full((3,), 2 * CENTRED_SIZE), atol=2e-3)
     axes = view.axes()
     assert torch.allclose(axes @ axes.transpose(1, 2), torch.eye(3).expand(3, 3, 3), atol=1e-6)
     eyes = torch.nn.functional.normalize(view.cameras().eye.float(), dim=1)

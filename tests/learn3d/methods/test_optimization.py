@@ -123,11 +123,13 @@ def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) 
     ends = []
     for average in (0.0, 0.9):
         schedule = TrainingSchedule(4, "linear", ema_decay=average)
-        method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, schedule=schedule)
+        method = create_method(
+            settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0, schedule=schedule
+        )
         for step in (1, 2, 3):
             method.take_step(tiny_set.batch(torch.arange(4)), step)
             assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3
-            with method.ema_weights():
+            with method.in_use():
                 method.encode(tiny_set.batch(torch.arange(2)).images)
         ends.append({name: network.state_dict() for name, network in method.networks.items()})
     assert all(torch.equal(ends[0][n][key], value) for n in ends[0] for key, value in ends[1][n].items())

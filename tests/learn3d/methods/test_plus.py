@@ -21,7 +21,7 @@ SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", bank_size=4
 
 
 def make(plane: float | None = None, **settings: object) -> Plus:
-    shape = DatasetInfo(24, mirror_plane_deg=plane)
+    shape = DatasetInfo(24, inverted=False, mirror_plane_deg=plane)
     return create_method(dataclasses.replace(SMALL, **settings), shape, device="cpu", precision="fp32", seed=0)
 
 
@@ -50,7 +50,9 @@ def test_shapes_end_at_the_box_where_it_is_known(preset: str) -> None:
     codes = 100 * torch.randn(8, 512, generator=torch.Generator().manual_seed(0))
     shapes = {}
     for box in (None, 1.0):
-        method = create_method(settings, DatasetInfo(24, cube_side=box), device="cpu", precision="fp32", seed=0)
+        method = create_method(
+            settings, DatasetInfo(24, inverted=False, cube_side=box), device="cpu", precision="fp32", seed=0
+        )
         with torch.no_grad():
             shapes[box] = method.decode(codes).vertices
     free = shapes[None]
@@ -84,7 +86,12 @@ def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
 def test_the_weight_of_the_smoothness_falls_over_the_run() -> None:
     settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
     method = create_method(
-        settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0, schedule=TrainingSchedule(iterations=5)
+        settings,
+        DatasetInfo(24, inverted=False),
+        device="cpu",
+        precision="fp32",
+        seed=0,
+        schedule=TrainingSchedule(iterations=5),
     )
     weights = [method.weights_at(step)["smoothness"] for step in (1, 3, 5, 6)]
     assert weights == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
@@ -153,9 +160,11 @@ def test_compact_objects_get_the_smooth_sphere_and_a_small_area(tiny_set) -> Non
     settings = dataclasses.replace(SMALL, generator="auto")
     cases = ((0.9, SmoothSphereGenerator, 0.03), (0.6, SphereGenerator, 0.0), (None, SphereGenerator, 0.0))
     for solidity, kind, weight in cases:
-        method = create_method(settings, DatasetInfo(24, solidity=solidity), device="cpu", precision="fp32", seed=0)
+        method = create_method(
+            settings, DatasetInfo(24, inverted=False, solidity=solidity), device="cpu", precision="fp32", seed=0
+        )
         assert type(method.generator) is kind and method.weights["area"] == weight
     settings = dataclasses.replace(settings, lambda_area=0.5)
-    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
     vertices = method.generator(torch.zeros(2, 512))
     torch.testing.assert_close(method.surface_losses(vertices)["area"], nmr.losses.area_loss(vertices, method.faces))

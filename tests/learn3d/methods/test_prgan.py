@@ -23,7 +23,7 @@ SMALL = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 4, 4,
 
 def small_prgan(**settings: object) -> PrGAN:
     torch.manual_seed(0)
-    return PrGAN(PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS), "cpu", "fp32")
+    return PrGAN(PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS, inverted=False), "cpu", "fp32")
 
 
 def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None) -> Batch:
@@ -162,4 +162,4 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
 )
 def test_other_cameras_are_refused(poses: LookAtPoses | RotationPoses, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        small_prgan().take_step(make_batch(poses=poses), 1)
+        small_prgan().check_batch(make_batch(poses=poses))

@@ -44,7 +44,11 @@ def make_batch(objects: list[int]) -> Batch:
 def method() -> MultiView:
     torch.manual_seed(0)
     return MultiView(
-        MultiViewSettings(encoder="conv-small"), DatasetInfo(24), "cpu", "fp32", TrainingSchedule(200, "step")
+        MultiViewSettings(encoder="conv-small"),
+        DatasetInfo(24, inverted=False),
+        "cpu",
+        "fp32",
+        TrainingSchedule(200, "step"),
     )
 
 
@@ -186,7 +190,7 @@ def test_depth_is_that_of_the_renderer(dataset: ViewDataset) -> None:
 
 def test_flipped_batches_have_flipped_depth(dataset: ViewDataset) -> None:
     batch = dataset.batch(torch.arange(10))
-    changed = augment(batch, ["flip"], 0, 1)
+    changed = augment(batch, ["flip"], 0, 1, inverted=True)
     turned = (changed.masks != batch.masks).flatten(1).any(1)
     assert 0 < turned.sum() < 10
     assert torch.equal(changed.depth[turned], batch.depth[turned].flip(2))
@@ -222,6 +226,15 @@ def test_losses_are_those_written_out(dataset: ViewDataset) -> None:
     assert losses["depth"] == pytest.approx(float(torch.cat(distances).mean()), rel=0.02)
     assert losses["prior"] == pytest.approx(float(codes.square().sum(1).mean()), rel=1e-4)
     assert "depth" not in method.take_step(dataclasses.replace(batch, depth=None), 1)
+
+
+def test_the_azimuth_is_learnt_from_the_pose(dataset: ViewDataset) -> None:
+    """So a flipped image, whose pose is mirrored, teaches the right one."""
+    batch = dataset.batch(sample_indices(dataset, "groups", 10, seed=0, step=1))
+    unknown = dataclasses.replace(batch, view_ids=torch.zeros_like(batch.view_ids))
+    mirrored = dataclasses.replace(batch, poses=batch.poses.mirrored(torch.ones(10, dtype=torch.bool)))
+    first, same, other = (create(dataset).take_step(b, 1)["view"] for b in (batch, unknown, mirrored))
+    assert first == same != other
 
 
 def test_it_learns_the_shapes(dataset: ViewDataset) -> None:

@@ -40,7 +40,9 @@ def test_full_and_empty_grids() -> None:
 
 def make(plane: float | None):
     settings = dataclasses.replace(PRESETS["plus-kato"].settings, encoder="conv-small", lambda_novel_view=0.0)
-    return create_method(settings, DatasetInfo(24, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0)
+    return create_method(
+        settings, DatasetInfo(24, inverted=False, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0
+    )
 
 
 def take_steps(monkeypatch: pytest.MonkeyPatch, code: int, vertices: int) -> None:
@@ -65,7 +67,9 @@ def test_the_silhouette_comes_closer(tiny_set, monkeypatch, steps: tuple[int, in
 
 def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set, monkeypatch) -> None:
     take_steps(monkeypatch, 1, 1)
-    method = create_method(PRESETS["kato2019-kar"].settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(
+        PRESETS["kato2019-kar"].settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0
+    )
     batch = tiny_set.batch(torch.tensor([0]))
     images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
     shapes = refine(method, images, batch.masks, batch.poses)
@@ -91,7 +95,7 @@ def test_voxels_cannot_be_fitted(tiny_set) -> None:
     settings = dataclasses.replace(
         PRESETS["gadelha2017-kato"].settings, generator_channels=(4, 4, 2, 1), discriminator_channels=(4, 8, 8, 8)
     )
-    method = create_method(settings, DatasetInfo(24), device="cpu", precision="fp32", seed=0)
+    method = create_method(settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
     batch = tiny_set.batch(torch.tensor([0]))
     with pytest.raises(ValueError, match="leave out --refine"):
         reconstruct(method, batch.images.numpy(), batch.masks, batch.poses)

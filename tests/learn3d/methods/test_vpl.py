@@ -30,7 +30,7 @@ SHAPENET = replace(PRESETS["kato2019-kar"].settings, **SMALL)
 SHAPENET_CLASS = replace(SHAPENET, class_conditional=True, lambda_discriminator=0.2)
 PASCAL = replace(PRESETS["kato2019-pascal"].settings, **SMALL, encoder="preact-resnet18", object_scale=0.6)
 FORMS = {"reimplemented": REIMPLEMENTED, "shapenet": SHAPENET, "class": SHAPENET_CLASS, "pascal": PASCAL}
-SHAPE = DatasetInfo(num_views=3, num_classes=2)
+SHAPE = DatasetInfo(num_views=3, inverted=False, num_classes=2)
 
 
 @pytest.fixture(autouse=True)
@@ -65,6 +65,7 @@ def make_batch(image_size: int, count: int = 2, rotations: bool = False) -> Batc
         object_names=tuple("abcd"[:count]),
         voxels=None,
         convention=KATO,
+        inverted=True,
         masks=masks.byte().numpy(),
         class_ids=np.array([0, 1, 0, 0])[:count],
         class_names=("a", "b"),

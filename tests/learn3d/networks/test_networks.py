@@ -16,7 +16,7 @@ from learn3d.device import autocast, resolve_precision
 from learn3d.methods import DatasetInfo, Method, create_method
 from learn3d.networks import ENCODERS, GENERATORS, PoseDiscriminator, create_encoder, network_input
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
-from learn3d.networks.encoders import CENTRED_SHARE, EncoderName, PreactResNet18, centre, grey_background
+from learn3d.networks.encoders import CENTRED_SIZE, EncoderName, PreactResNet18, centre, grey_background
 from learn3d.networks.generators import ConvCubeGenerator, LinearCubeGenerator, deform_sphere
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.resnet import FlatResNet18
@@ -234,7 +234,7 @@ def wedge(size: int, top: int, left: int) -> Tensor:
 
 def test_centred_objects_take_the_same_part_of_the_image() -> None:
     centred = centre(torch.cat([wedge(20, 3, 40), wedge(40, 23, 1), wedge(60, 2, 2)]))
-    extent = round(64 * CENTRED_SHARE)
+    extent = round(64 * CENTRED_SIZE)
     first = (64 - extent) // 2
     for image in centred:
         assert np.abs(np.subtract(box(image), (first, first, first + extent, first + extent))).max() <= 1
@@ -252,7 +252,7 @@ def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> Non
     image[:, :3, :, :40] = 0.25
     centred = centre(image)[0]
     top, left, bottom, right = box(centred)
-    assert abs(bottom - top - 64 * CENTRED_SHARE) <= 1
+    assert abs(bottom - top - 64 * CENTRED_SIZE) <= 1
     assert abs((left + right) / 2 - 32) <= 1
     assert torch.equal(centred[:3, 30, -1], torch.ones(3))
     assert not centred[3, 0].any()
@@ -264,7 +264,9 @@ def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> Non
 
 
 def create(preset: str, seed: int = 0, device: str = "cpu") -> Method:
-    return create_method(PRESETS[preset].settings, DatasetInfo(24), device=device, precision="fp32", seed=seed)
+    return create_method(
+        PRESETS[preset].settings, DatasetInfo(24, inverted=False), device=device, precision="fp32", seed=seed
+    )
 
 
 def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:

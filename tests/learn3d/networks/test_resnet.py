@@ -127,7 +127,7 @@ def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     torch.save(weights, tmp_path / "weights.pth")
     settings = PoseInvariantSettings(encoder="resnet18", symmetry="z", pretrained=str(tmp_path / "weights.pth"))
     assert settings.pretrained == tmp_path / "weights.pth"
-    method = PoseInvariant(settings, DatasetInfo(3, pose_features=9), "cpu", "fp32")
+    method = PoseInvariant(settings, DatasetInfo(3, inverted=False, pose_features=9), "cpu", "fp32")
     method.start_from_pretrained()
     assert torch.equal(method.encoder.conv1.weight, weights["conv1.weight"])
     with pytest.raises(ValueError, match=r"for the encoder 'resnet18', got encoder 'conv-small'; choose that encoder"):

@@ -170,6 +170,12 @@ def stopped(tiny_run, tmp_path_factory) -> Path:
     return folder
 
 
+def test_a_run_reads_its_training_views_again(tiny_config, tmp_path) -> None:
+    config = tiny_config(tmp_path, views_per_object=2)
+    assert [len(checkpoint.load_data(config, split)) for split in ("train", "val")] == [3 * 2, 24]
+    assert len(checkpoint.load_data(config, "train", data=config.data)) == 3 * 24
+
+
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
 

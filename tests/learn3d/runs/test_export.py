@@ -35,6 +35,7 @@ def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch
     def with_weights(*arguments, **options):
         method, config, metadata = load(*arguments, **options)
         object.__setattr__(config.settings, "pretrained", tmp_path / "resnet18.pth")
+        object.__setattr__(config, "poses", tmp_path / "poses.npz")
         return method, config, metadata
 
     monkeypatch.setattr(checkpoint, "load_method", with_weights)
