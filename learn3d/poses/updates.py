@@ -16,6 +16,7 @@ from learn3d.methods.method import MeshMethod
 from learn3d.poses.estimate import SIZE, TEMPERATURE
 
 _IMAGES = 128  # at a time
+_CELL_DEG = 15
 _ROUNDS = 20  # of scaling to the wanted marginal
 
 
@@ -29,23 +30,21 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
     """Reweight the candidates of all images of `dataset`; returns the share of images whose best pose changed.
 
     The weights are softmax(IoU / TEMPERATURE + b) over the candidates, with masks and renderings of SIZE pixels. b is a
-    number for each azimuth, such that all azimuths together stay as probable as they were.
+    number for each 15 degrees of azimuth, which stay as frequent as they were.
     """
-    candidates, was_training = dataset.candidates, method.training
-    count, logits = candidates.weights.shape[1], []
-    method.set_training(False)
-    with method.ema_weights():
+    candidates, logits = dataset.candidates, []
+    count = candidates.weights.shape[1]
+    with method.in_use():
         for rows in torch.arange(len(dataset)).split(_IMAGES):
             batch = dataset.batch(rows, voxels=False)
             shapes = method.decode(method.encode(batch.images))
             poses = candidates.poses[(rows[:, None] * count + torch.arange(count)).flatten()]
             vertices = shapes.vertices.repeat_interleave(count, 0)
-            drawn = nmr.render_silhouette(vertices, shapes.faces, poses.cameras(), image_size=SIZE).cpu()
+            silhouettes = nmr.render_silhouette(vertices, shapes.faces, poses.cameras(), image_size=SIZE)
             masks = F.avg_pool2d(batch.masks[:, None], MASK_SIZE // SIZE).expand(-1, count, -1, -1)
-            drawn = drawn.view(masks.shape)
-            common = (drawn * masks).sum((2, 3))
-            logits.append(common / ((drawn + masks).sum((2, 3)) - common).clamp_min(1e-6) / TEMPERATURE)
-    method.set_training(was_training)
+            silhouettes = silhouettes.view(masks.shape)
+            common = (silhouettes * masks).sum((2, 3))
+            logits.append(common / ((silhouettes + masks).sum((2, 3)) - common).clamp_min(1e-6) / TEMPERATURE)
     before = torch.from_numpy(candidates.weights)
     weights = _with_marginal(torch.cat(logits), candidates.poses.azimuth_deg.view(before.shape), before)
     changed = float((weights.argmax(1) != before.argmax(1)).double().mean())
@@ -54,12 +53,14 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
 
 
 def _with_marginal(logits: Tensor, azimuth_deg: Tensor, before: Tensor) -> Tensor:
-    """Softmax of logits [M, C], shifted by a number for each azimuth so that its mean weight is that of `before`."""
-    _, azimuth = (azimuth_deg % 360).round(decimals=1).unique(return_inverse=True)
-    azimuth = azimuth.flatten()
-    wanted = torch.bincount(azimuth, before.flatten())
-    weights, shift = logits.softmax(1), torch.zeros(len(wanted), dtype=torch.float64)
+    """Softmax of logits [M, C], shifted by a number for each cell of azimuths, whose mean weight stays as in `before`."""
+    cells = 360 // _CELL_DEG
+    azimuth = ((azimuth_deg / _CELL_DEG).round().long() % cells).flatten()
+    wanted = torch.bincount(azimuth, before.flatten(), minlength=cells)
+    weights, shift = logits.softmax(1), torch.zeros(cells, dtype=torch.float64)
     for _ in range(_ROUNDS):
-        shift += (wanted.clamp_min(1e-6) / torch.bincount(azimuth, weights.flatten()).clamp_min(1e-6)).log()
+        shift += (
+            wanted.clamp_min(1e-6) / torch.bincount(azimuth, weights.flatten(), minlength=cells).clamp_min(1e-6)
+        ).log()
         weights = (logits + shift[azimuth].float().view(logits.shape)).softmax(1)
     return weights

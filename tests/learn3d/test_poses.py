@@ -213,15 +213,11 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
 class Prophet:
     """A method that knows the shape of each image."""
 
-    training, device = False, "cpu"
-
     def __init__(self, vertices: torch.Tensor, faces: torch.Tensor) -> None:
         self.vertices, self.faces, self.done = vertices, faces, 0
 
-    def ema_weights(self) -> contextlib.AbstractContextManager[None]:
+    def in_use(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
-
-    def set_training(self, training: bool) -> None: ...
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
         return images
