@@ -53,14 +53,12 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
 
 
 def _with_marginal(logits: Tensor, azimuth_deg: Tensor, before: Tensor) -> Tensor:
-    """Softmax of logits [M, C], shifted by a number for each cell of azimuths, whose mean weight stays as in `before`."""
+    """Softmax of logits [M, C], shifted by a number for each cell of azimuths, whose share stays as in `before`."""
     cells = 360 // _CELL_DEG
-    azimuth = ((azimuth_deg / _CELL_DEG).round().long() % cells).flatten()
-    wanted = torch.bincount(azimuth, before.flatten(), minlength=cells)
+    cell = ((azimuth_deg / _CELL_DEG).round().long() % cells).flatten()
+    wanted = torch.bincount(cell, before.flatten(), minlength=cells).clamp_min(1e-6)
     weights, shift = logits.softmax(1), torch.zeros(cells, dtype=torch.float64)
     for _ in range(_ROUNDS):
-        shift += (
-            wanted.clamp_min(1e-6) / torch.bincount(azimuth, weights.flatten(), minlength=cells).clamp_min(1e-6)
-        ).log()
-        weights = (logits + shift[azimuth].float().view(logits.shape)).softmax(1)
+        shift += (wanted / torch.bincount(cell, weights.flatten(), minlength=cells).clamp_min(1e-6)).log()
+        weights = (logits + shift[cell].float().view(logits.shape)).softmax(1)
     return weights
