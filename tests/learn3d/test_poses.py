@@ -7,6 +7,7 @@ import dataclasses
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,8 +27,9 @@ from learn3d.experiments import measurement
 from learn3d.files.reading import DamagedFile
 from learn3d.methods.plus import Plus
 from learn3d.methods.surfaces import Meshes
-from learn3d.poses.estimate import SIZE, Masks, PoseOptions, _peak_votes, _turns
-from learn3d.poses.sheet import draw_sheet
+from learn3d.pictures.sheets import HEADER, MARGIN
+from learn3d.poses.estimate import SIZE, Candidates, Estimate, Masks, PoseOptions, _peak_votes, _turns
+from learn3d.poses.sheet import COLUMNS, TILE, draw_sheet
 from learn3d.poses.updates import update_poses, update_steps
 from learn3d.poses.views import CameraOptions, EstimatedViews, compare, estimate_views
 from learn3d.runs import checkpoint
@@ -147,6 +149,21 @@ def test_ambiguous_poses_get_low_confidence() -> None:
         estimated(few)
 
 
+def test_the_sheet_turns_images_and_prototypes_alike(tiny_set: ViewDataset) -> None:
+    count, step = len(tiny_set), TILE + MARGIN
+    azimuth, *others = (np.full((count, 1), value, np.float32) for value in (0, 30, 1))
+    azimuth[:, 0] = 30 * (np.arange(count) % 12) - 180
+    table = PoseTable(fingerprints(tiny_set), azimuth, *others, *np.float32([[2.7], [15], [1]]).repeat(count, 1))
+    vertices, faces = nmr.icosphere(1)
+    shape = vertices * torch.tensor([0.1, 0.2, 0.4]) * (1 - 0.8 * vertices[:, 2:])
+    estimate = Estimate(torch.ones(count, 24, 1), torch.ones(count), shape[None], faces, torch.ones(1), 1.0)
+    candidates = Candidates(torch.arange(24) * 15.0, torch.tensor([30.0]), 2.7, 15.0)
+    views = EstimatedViews((tiny_set,), torch.arange(count), candidates, estimate, table)
+    before, after = (draw_sheet(views, offset)[HEADER:, -COLUMNS * step :] for offset in (0.0, 90.0))
+    assert np.array_equal(after, np.roll(before, 3 * step, axis=1))
+    assert not np.array_equal(after[:TILE], before[:TILE])
+
+
 def random_table(dataset: ViewDataset, candidates: int = 3) -> PoseTable:
     count, rng = len(dataset), np.random.default_rng(0)
     angles = (rng.uniform(low, high, (count, candidates)).astype(np.float32) for low, high in ((-180, 180), (0, 40)))
@@ -210,38 +227,20 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
     assert all((b.poses.azimuth_deg % 2).sum() < 8 for b in batches(dataset, options))
 
 
-class Prophet:
-    """A method that knows the shape of each image."""
-
-    def __init__(self, vertices: torch.Tensor, faces: torch.Tensor) -> None:
-        self.vertices, self.faces, self.done = vertices, faces, 0
-
-    def in_use(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext()
-
-    def encode(self, images: torch.Tensor) -> torch.Tensor:
-        return images
-
-    def decode(self, codes: torch.Tensor) -> Meshes:
-        self.done += len(codes)
-        return Meshes(self.vertices[self.done - len(codes) : self.done], self.faces)
-
-
 def test_poses_are_found_again_from_the_models_shapes() -> None:
     vertices, faces = dart_shapes(6)
     dataset = darts(6)
     poses = LookAtPoses(torch.arange(24.0).repeat(144) * 15, 30.0, 2.732, 15.0)
     weights = np.full((144, 24), 1 / 24, np.float32)
     dataset = dataclasses.replace(dataset, candidates=PoseCandidates(poses, np.zeros(24 * 144, int), weights))
-    changed = update_poses(Prophet(vertices.repeat_interleave(24, 0), faces), dataset)
+    batches_of_shapes = iter(vertices.repeat_interleave(24, 0).split(128))
+    decode = lambda codes: Meshes(next(batches_of_shapes), faces)  # noqa: E731
+    method = SimpleNamespace(in_use=contextlib.nullcontext, encode=torch.Tensor.float, decode=decode)
+    changed = update_poses(method, dataset)
     found = torch.from_numpy(weights.argmax(1)) * 15.0
     assert ((found - dataset.poses.azimuth_deg + 180) % 360 - 180).abs().max() == 0
     assert np.allclose(weights.sum(1), 1) and changed == pytest.approx(1 - 1 / 24)
-
-
-def test_poses_are_weighted_in_halves_of_a_run() -> None:
-    assert update_steps(1600, 3) == (200, 400, 800)
-    assert update_steps(2, 3) == (1,) and update_steps(100, 0) == ()
+    assert update_steps(1600, 3) == (200, 400, 800) and update_steps(2, 3) == (1,) and update_steps(9, 0) == ()
 
 
 @pytest.fixture
