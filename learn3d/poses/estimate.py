@@ -44,9 +44,8 @@ TEMPERATURE = 0.02  # of a softmax over 1 - IoU
 _NEIGHBOURS, _VOTERS = 8, 5  # nearest masks for smoothing, and for votes on turns
 _NEIGHBOUR_SCALE = 0.1  # distance at which the weight of a neighbour has fallen to 1 / e
 _FAR = 9.0  # distance of masks that must not be neighbours
-_ADDED_VIEWS = 4.0  # of each shape at each azimuth, relative to the mean, so that few images do not count too much
-_PEAK_WIDTH = 11  # peaks of upper outlines are narrower, in pixels
-_PEAK_WEIGHT = 0.001  # weight of their votes; that of nearly equal masks is 1
+_PEAK_WIDTH = 5  # peaks of upper outlines are narrower, in pixels
+_PEAK_WEIGHT = 0.002  # weight of their votes; that of nearly equal masks is 1
 
 
 @checked
@@ -268,20 +267,15 @@ def _train(
 
 
 def _posteriors(logits: Tensor, prior: str) -> Tensor:
-    """Posterior [B, M, A, E] over shapes and poses.
-
-    With the prior "uniform", each shape is seen from all azimuths about equally often. Otherwise some shapes would take
-    the front views of all objects, and others the side views.
-    """
-    bias = torch.zeros(logits.shape[1:3])
+    """Posterior [B, M, A, E] over shapes and poses. With the prior "uniform", all azimuths get about the same mass."""
+    bias = torch.zeros(logits.shape[2], dtype=torch.float64)
     if prior == "uniform":
-        azimuth_logits = logits.logsumexp(3)
-        added = _ADDED_VIEWS * len(logits) / bias.numel()
+        azimuth_logits = logits.logsumexp((1, 3)).double()
         for _ in range(20):
-            posterior = torch.softmax((azimuth_logits + bias).flatten(1), 1).view(azimuth_logits.shape)
-            views = posterior.sum(0) + added
-            bias += (views.mean(1, keepdim=True) / views).log()
-    return torch.softmax((logits + bias[:, :, None]).flatten(1), 1).view(logits.shape)
+            marginal = torch.softmax(azimuth_logits + bias, 1).mean(0)
+            bias = bias - (marginal.clamp_min(1e-12) * len(bias)).log()
+    biased = logits + bias.float()[:, None]
+    return torch.softmax(biased.flatten(1), 1).reshape(logits.shape)
 
 
 def _mean_shape(
