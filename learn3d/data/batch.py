@@ -43,6 +43,7 @@ class PoseCandidates:
     poses: LookAtPoses  # M * C poses
     view_ids: np.ndarray  # int64 [M * C]: their view classes
     weights: np.ndarray  # float32 [M, C]: probabilities of the candidates; each row sums to 1
+    prior: np.ndarray  # float32 [M, C]: the same before any reweighting
 
     def __len__(self) -> int:
         return len(self.weights)

@@ -104,7 +104,7 @@ class PoseTable:
         poses, training = self.poses(rows, best=True), self.poses(np.arange(len(order)), best=True)
         view_ids, view_names = view_classes(poses, training)
         every = self.poses(rows)
-        candidates = PoseCandidates(every, view_classes(every, training)[0], self.weights[rows])
+        candidates = PoseCandidates(every, view_classes(every, training)[0], self.weights[rows], self.weights[rows])
         parts = {"view_ids": view_ids, "view_names": view_names, "candidates": candidates}
         return dataclasses.replace(dataset, poses=poses, **parts)
 

@@ -1,7 +1,8 @@
 """Reweights the candidate poses of training images during training, by the model's own shapes.
 
-The shape that the model predicts from an image is rendered at all candidate poses of the image; the IoU with the mask
-gives the weights. All images share the networks, so a shape whose pose was wrong is drawn into the frame of the others.
+The shape that the model predicts from an image is rendered at all candidate poses of the image. The IoU with the mask
+and the table's probability give the weights. All images share the networks, so a shape whose pose was wrong is drawn
+into the frame of the others.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from learn3d.poses.estimate import SIZE, TEMPERATURE
 
 _IMAGES = 128  # at a time
 _CELL_DEG = 15
+_LEAST_PRIOR = 0.01
 _ROUNDS = 20  # of scaling to the wanted marginal
 
 
@@ -29,8 +31,9 @@ def update_steps(iterations: int, count: int) -> tuple[int, ...]:
 def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
     """Reweight the candidates of all images of `dataset`; returns the share of images whose best pose changed.
 
-    The weights are softmax(IoU / TEMPERATURE + b) over the candidates, with masks and renderings of SIZE pixels. b is a
-    number for each 15 degrees of azimuth, which stay as frequent as they were.
+    The weights are softmax(IoU / TEMPERATURE + log p + b) over the candidates, with masks and renderings of SIZE
+    pixels. p is the candidate's probability in the table, at least _LEAST_PRIOR. b is a number for each 15 degrees of
+    azimuth, which stay as frequent as in the table.
     """
     candidates, logits = dataset.candidates, []
     count = candidates.weights.shape[1]
@@ -45,18 +48,19 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
             silhouettes = silhouettes.view(masks.shape)
             common = (silhouettes * masks).sum((2, 3))
             logits.append(common / ((silhouettes + masks).sum((2, 3)) - common).clamp_min(1e-6) / TEMPERATURE)
-    before = torch.from_numpy(candidates.weights)
-    weights = _with_marginal(torch.cat(logits), candidates.poses.azimuth_deg.view(before.shape), before)
-    changed = float((weights.argmax(1) != before.argmax(1)).double().mean())
-    candidates.weights[:] = weights.numpy()
+    prior = torch.from_numpy(candidates.prior)
+    logits = torch.cat(logits) + prior.clamp_min(_LEAST_PRIOR).log()
+    weights = _with_marginal(logits, candidates.poses.azimuth_deg.view(prior.shape), prior).numpy()
+    changed = float((weights.argmax(1) != candidates.weights.argmax(1)).mean())
+    candidates.weights[:] = weights
     return changed
 
 
-def _with_marginal(logits: Tensor, azimuth_deg: Tensor, before: Tensor) -> Tensor:
-    """Softmax of logits [M, C], shifted by a number for each cell of azimuths, whose share stays as in `before`."""
+def _with_marginal(logits: Tensor, azimuth_deg: Tensor, prior: Tensor) -> Tensor:
+    """Softmax of logits [M, C], shifted by a number for each cell of azimuths, whose share is that in `prior`."""
     cells = 360 // _CELL_DEG
     cell = ((azimuth_deg / _CELL_DEG).round().long() % cells).flatten()
-    wanted = torch.bincount(cell, before.flatten(), minlength=cells).clamp_min(1e-6)
+    wanted = torch.bincount(cell, prior.flatten(), minlength=cells).clamp_min(1e-6)
     weights, shift = logits.softmax(1), torch.zeros(cells, dtype=torch.float64)
     for _ in range(_ROUNDS):
         shift += (wanted / torch.bincount(cell, weights.flatten(), minlength=cells).clamp_min(1e-6)).log()

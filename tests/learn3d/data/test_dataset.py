@@ -168,7 +168,7 @@ def test_rebinning_changes_the_classes_alone() -> None:
     binned = data.with_bins(AngleBins.parse("60x60"))
     assert binned.num_views == 6
     assert np.array_equal(binned.view_ids, AngleBins.parse("60x60").ids(data.poses).numpy())
-    candidates = PoseCandidates(data.poses.mirrored(torch.ones(12, dtype=bool)), data.view_ids, np.ones((12, 1)))
+    candidates = PoseCandidates(data.poses.mirrored(torch.ones(12, dtype=bool)), data.view_ids, *2 * [np.ones((12, 1))])
     drawn = dataclasses.replace(data, candidates=candidates).with_bins(AngleBins.parse("60x60")).candidates
     assert np.array_equal(drawn.view_ids, AngleBins.parse("60x60").ids(candidates.poses).numpy())
     assert not np.array_equal(drawn.view_ids, binned.view_ids)
