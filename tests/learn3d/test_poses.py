@@ -216,9 +216,8 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
     count = len(tiny_set)
     poses = LookAtPoses(torch.arange(2.0 * count), 30.0, 2.7, 15.0)
     weights = np.tile(np.float32([0.75, 0.25]), (count, 1))
-    dataset = dataclasses.replace(
-        tiny_set, candidates=PoseCandidates(poses, np.arange(2 * count) % 24, weights, weights)
-    )
+    candidates = PoseCandidates(poses, np.arange(2 * count) % 24, weights, weights)
+    dataset = dataclasses.replace(tiny_set, candidates=candidates)
     indices, second = torch.arange(count), []
     for step in range(200):
         batch = dataset.candidates.draw(dataset.batch(indices), indices, 0, step)
@@ -230,13 +229,11 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
 
 
 def test_poses_are_found_again_from_the_models_shapes() -> None:
-    vertices, faces = dart_shapes(6)
-    dataset = darts(6)
+    (vertices, faces), dataset = dart_shapes(6), darts(6)
     poses = LookAtPoses(torch.arange(24.0).repeat(144) * 15, 30.0, 2.732, 15.0)
     weights = np.full((144, 24), 1 / 24, np.float32)
-    dataset = dataclasses.replace(
-        dataset, candidates=PoseCandidates(poses, np.zeros(24 * 144, int), weights, weights.copy())
-    )
+    candidates = PoseCandidates(poses, np.zeros(24 * 144, int), weights, weights.copy())
+    dataset = dataclasses.replace(dataset, candidates=candidates)
     batches_of_shapes = iter(vertices.repeat_interleave(24, 0).split(128))
     decode = lambda codes: Meshes(next(batches_of_shapes), faces)  # noqa: E731
     method = SimpleNamespace(in_use=contextlib.nullcontext, encode=torch.Tensor.float, decode=decode)
