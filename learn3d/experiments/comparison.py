@@ -178,7 +178,7 @@ _POSES_HEADER = ["category", "seed", *_POSE_ERRORS.values(), "IoU, known poses",
 def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Cells:
     """Errors of the estimated poses of each run, and its IoU beside that of the run on known poses; [] without any."""
     known = {(r.config.category, r.config.seed): r.folder for r in runs if r.config.poses is None}
-    rows, by_category = [], {}
+    by_category: dict[str, list[tuple[str, Sequence[float]]]] = {}
     for run in (run for run in runs if run.config.poses is not None):
         folders = known.get((run.config.category, run.config.seed)), run.folder
         if not all(folder in results for folder in folders):
@@ -187,10 +187,11 @@ def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Ce
         errors = parse_json(read_bytes(errors_file, limits.JSON_BYTES, "the errors of a table of poses as JSON"))
         ious = [results[folder].voxel_iou for folder in folders]
         values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
-        rows.append([run.config.category, str(run.config.seed), *_format_poses(values)])
-        by_category.setdefault(run.config.category, []).append(values)
-    several = {category: values for category, values in by_category.items() if len(values) > 1}
-    rows += [[category, "mean", *_format_poses(np.mean(values, axis=0))] for category, values in several.items()]
+        by_category.setdefault(run.config.category, []).append((str(run.config.seed), values))
+    rows = []
+    for category, of_seeds in by_category.items():
+        mean = [("mean", np.mean([values for _, values in of_seeds], axis=0))] if len(of_seeds) > 1 else []
+        rows += [[category, name, *_format_poses(values)] for name, values in of_seeds + mean]
     return [_POSES_HEADER, *rows] if rows else []
 
 

@@ -109,8 +109,7 @@ def measure(
     method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
     label, category = PRESETS[config.preset].label, category or config.category
     report_progress(f"{file}: {label} ({config.preset}) on {category}, {split}")
-    other = None if category == config.category else category
-    dataset = checkpoint.load_data(config, split, data=data, category=other, layout=layout)
+    dataset = checkpoint.load_data(config, split, data=data, category=category, layout=layout)
     evaluation = evaluate(method, dataset, detailed=True)
     means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
     if means["hollow"]:

@@ -120,7 +120,7 @@ class Estimate:
     prototypes: Tensor  # float32 [M, V, 3], y up, z towards azimuth 0
     faces: Tensor  # int64 [F, 3]
     weights: Tensor  # float32 [M]: mean posterior of each prototype
-    front_votes: float  # share of equal among equal and opposite azimuths of similar masks
+    front_votes: float  # similar masks with equal azimuths, over those with equal or opposite ones; 1 if there are none
 
 
 def estimate(
@@ -143,9 +143,10 @@ def estimate(
     for stage in range(STAGES):
         start = 0.03 if stage else 0.05
         _train(shapes, subset, options, rng, start=start, smoothness_weight=3e-4, log_prior=log_prior, tick=tick)
-        turns, front_votes = _turns(shapes.all_distances(subset), subset, rng)
+        values = shapes.all_distances(subset)
+        turns, front_votes = _turns(values, subset, rng)
         shapes.turns = (shapes.turns + turns) % TURNS
-        own = _posteriors(-shapes.all_distances(subset) / TEMPERATURE, options.prior)
+        own = _posteriors(-_turned(values, turns) / TEMPERATURE, options.prior)
         smoothed = neighbours.smooth(own.sum(1), options.prior)
         log_prior = (smoothed + 1e-3).log()
     posterior, confidence = torch.empty(len(data), *smoothed.shape[1:]), torch.empty(len(data))
@@ -203,8 +204,7 @@ class Shapes:
         repeated = vertices.repeat_interleave(len(cameras.eye) // count, 0)
         rendered = nmr.render_silhouette(repeated, self.network.faces, cameras, image_size=SIZE).flatten(1)
         values = distances(masks, rendered).reshape(len(masks), count, azimuths, -1)
-        shifted = (torch.arange(azimuths) - self.turns[:, None] * (azimuths // TURNS)) % azimuths
-        return values.gather(2, shifted[None, :, :, None].expand_as(values))
+        return _turned(values, self.turns)
 
     @torch.no_grad()
     def align(self) -> tuple[Tensor, Tensor]:
@@ -220,6 +220,13 @@ class Shapes:
         vertices = self.vertices()
         values = torch.cat([self.distances(part, vertices) for part in data.masks.split(1024)])
         return values.masked_fill(~data.allowed[:, None, None], float("inf"))
+
+
+def _turned(values: Tensor, turns: Tensor) -> Tensor:
+    """Values [B, M, A, E] of M shapes at A azimuths, for the shapes after `turns` quarter turns, int64 [M]."""
+    azimuths = values.shape[2]
+    before = (torch.arange(azimuths) - turns[:, None] * (azimuths // TURNS)) % azimuths
+    return values.gather(2, before[None, :, :, None].expand_as(values))
 
 
 def distances(masks: Tensor, others: Tensor) -> Tensor:
@@ -345,7 +352,10 @@ def _normalize(posterior: Tensor) -> Tensor:
 
 
 def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, float]:
-    """Quarter turns of the prototypes after which similar masks have nearly equal azimuths: int64 [M]; front_votes."""
+    """The quarter turns of the prototypes that give similar masks nearly equal azimuths, int64 [M].
+
+    Also `Estimate.front_votes`.
+    """
     posterior = torch.softmax(-values.flatten(1) / TEMPERATURE, 1).reshape(values.shape)
     count, azimuths = values.shape[1:3]
     prototype = posterior.sum((2, 3)).argmax(1)

@@ -1,4 +1,4 @@
-"""Reweights the candidate poses of training images during training, by the model's own shapes.
+"""Corrects estimated poses during a training: the candidate poses of the training images get new probabilities.
 
 The shape that the model predicts from an image is rendered at all candidate poses of the image. The IoU with the mask
 and the table's probability give the weights. All images share the networks, so a shape whose pose was wrong is drawn
@@ -17,9 +17,9 @@ from learn3d.methods.method import MeshMethod
 from learn3d.poses.estimate import SIZE, TEMPERATURE
 
 _IMAGES = 128  # at a time
-_CELL_DEG = 15
-_LEAST_PRIOR = 0.01
-_ROUNDS = 20  # of scaling to the wanted marginal
+_CELL_DEG = 15  # width of the cells of azimuth whose frequency is kept
+_LEAST_PRIOR = 0.01  # probability of candidates that the table leaves out
+_ROUNDS = 20  # of scaling to these frequencies
 
 
 def update_steps(iterations: int, count: int) -> tuple[int, ...]:

@@ -29,7 +29,7 @@ from learn3d.device import resolve_precision
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
 from learn3d.methods import DatasetInfo, Method, create_method
-from learn3d.settings import Count, NonNegative, Share, checked
+from learn3d.settings import Count, NonNegative, Share, checked, split_names
 
 
 @functools.cache
@@ -212,7 +212,8 @@ def load_data(
     form = {"image_size": config.settings.image_size}
     if layout == config.layout:
         form["view_bins"] = config.view_bins
-    if data is None and category is None and layout == config.layout:
+    own = data is None and (category is None or category in split_names(config.category))
+    if own and layout == config.layout:
         form |= {"poses": config.poses, "views_per_object": config.views_per_object if split == "train" else None}
     return load_dataset(layout, data or config.data, category or config.category, split, **form)
 

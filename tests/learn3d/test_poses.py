@@ -71,6 +71,8 @@ def test_azimuths_of_distinct_shapes_are_found(found: EstimatedViews) -> None:
     assert result.accuracy > 0.9 and result.flips < 0.1 and not found.warnings
     assert found.table.weights.shape == (192, 24) and (found.table.weights[:, 2:] == 0).all()
     assert draw_sheet(found).ndim == 3
+    alike = dataclasses.replace(found, result=dataclasses.replace(found.result, front_votes=0.5))
+    assert "the same from front and back" in alike.warnings[0]
 
 
 def test_the_frame_is_free_and_turned_for_the_comparison(found: EstimatedViews) -> None:
