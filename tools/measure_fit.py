@@ -15,7 +15,7 @@ from learn3d.data.poses import wrap_deg
 from learn3d.fitting.fit import fit
 from learn3d.networks.encoders import centre
 from learn3d.pictures.surfaces import azimuths_deg
-from learn3d.reconstruction import load_model, recognize, view_probabilities
+from learn3d.reconstruction import load_model, recognize
 
 COLUMNS = ("predicted", "code fitted", "vertices fitted", "voxels predicted", "voxels fitted", "azimuth", "warned")
 
@@ -34,7 +34,8 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
         for index in np.linspace(0, len(dataset) - 1, images).round().astype(int):
             batch = dataset.batch(torch.tensor([index]))
             (image,), mask = batch.images, centre(batch.masks[:, None])[0, 0]
-            fitted = fit(model.method, image, mask, view_probabilities=view_probabilities(model, image))
+            (probabilities,) = model.method.view_probabilities(batch.images)
+            fitted = fit(model.method, image, mask, view_probabilities=probabilities)
             code = model.method.encode(batch.images)
             ious = [
                 float(nmr.metrics.voxel_iou(dataset.voxelize(shape, model.method.faces), batch.voxels))

@@ -10,6 +10,8 @@
    couplings of a Potts model whose states are the four turns of each prototype.
 4. The posteriors over poses are smoothed over the nearest masks and the nearest mirrored masks. Then steps 2 to 4 are
    repeated with the smoothed posteriors as a prior.
+5. All of it is repeated from other random shapes, and the posteriors are added: a kind of object that came out turned
+   in one estimate is outvoted by the others.
 
 Objects are assumed to be symmetric about x = 0: the view from azimuth -a is the mirror image of the view from a.
 """
@@ -56,6 +58,8 @@ class PoseOptions:
     """Number of fitted shapes, each for one kind of object."""
     restarts: Annotated[int, Field(ge=1, le=100)] = 4
     """Number of initialisations of the mean shape; the best one is kept."""
+    repeats: Annotated[int, Field(ge=1, le=100)] = 3
+    """Number of independent estimates, whose probabilities are averaged."""
     prior: Literal["uniform", "free"] = "uniform"
     """Prior over azimuths. uniform: all azimuths are about equally frequent in the data. free: no assumption."""
     steps: Rare[Annotated[int, Field(ge=1, le=100_000)]] = 300
@@ -66,7 +70,7 @@ class PoseOptions:
     @property
     def all_steps(self) -> int:
         """Number of optimisation steps of the whole estimate."""
-        return self.steps * (self.restarts + STAGES)
+        return self.steps * (self.restarts + STAGES) * self.repeats
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +82,10 @@ class Candidates:
     distance: float
     half_fov_deg: float
 
-    def cameras(self, copies: int, elevations: slice = slice(None)) -> nmr.LookAt:
-        """Cameras at all azimuths and the given elevations, repeated `copies` times."""
-        azimuth, elevation = torch.meshgrid(self.azimuth_deg, self.elevation_deg[elevations], indexing="ij")
+    def half_circle(self, copies: int, elevations: slice = slice(None)) -> nmr.LookAt:
+        """Cameras at the azimuths from 0 to 180 and the given elevations, repeated `copies` times."""
+        azimuth_deg = self.azimuth_deg[: len(self.azimuth_deg) // 2 + 1]
+        azimuth, elevation = torch.meshgrid(azimuth_deg, self.elevation_deg[elevations], indexing="ij")
         angles = (elevation.flatten().repeat(copies), azimuth.flatten().repeat(copies))
         return nmr.LookAt.from_angles(self.distance, *angles, half_fov_deg=self.half_fov_deg)
 
@@ -134,12 +139,56 @@ def estimate(
     rng = torch.Generator().manual_seed(options.seed)
     fitted = fitted[torch.randperm(len(fitted), generator=rng)[:MAX_FITTED].sort().values]
     subset = data[fitted]
+    chunks = [data[rows] for rows in torch.arange(len(data)).split(2048)]
+    near = [(chunk, Neighbours.of(chunk, subset)) for chunk in chunks]
+    neighbours = Neighbours.of(subset, subset)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        shapes = _mean_shape(subset, candidates, options, rng, tick)
+        parts = [_part(subset, neighbours, near, candidates, options, rng, tick) for _ in range(options.repeats)]
+    shifts = _common_frame([part.posterior.sum(2) for part in parts], rng)
+    posterior = sum(part.posterior.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True)) / len(parts)
+    votes = sum(part.votes.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True))
+    best = posterior.sum(2).argmax(1)
+    confidence = MAX_CONFIDENCE * near_mass(votes, best)
+    if len(fitted) < MIN_IMAGES or _views_coincide(best, data.objects, options.azimuths):
+        confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
+    front_votes = sum(part.front_votes for part in parts) / len(parts)
+    return Estimate(posterior, confidence, *parts[0].shapes.align(), parts[0].weights, front_votes)
+
+
+def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
+    """The shifts by quarters, 0 for the first, that make posteriors [N, A] overlap most."""
+    quarter = posteriors[0].shape[1] // TURNS
+    stacked = torch.stack([torch.stack([p.roll(t * quarter, 1) for p in posteriors]) for t in range(TURNS)])
+    turns = _solve_turns(torch.einsum("smna,tkna->stmk", stacked, stacked), rng)
+    return ((turns - turns[0]) % TURNS * quarter).tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One of several estimates, in a frame of its own."""
+
+    posterior: Tensor  # float32 [N, A, E]
+    votes: Tensor  # float32 [N, A]: the nearest masks' probabilities, added up
+    shapes: Shapes
+    weights: Tensor  # float32 [M]: mean posterior of each prototype
+    front_votes: float
+
+
+def _part(
+    subset: Masks,
+    neighbours: Neighbours,
+    chunks: list[tuple[Masks, Neighbours]],
+    candidates: Candidates,
+    options: PoseOptions,
+    rng: torch.Generator,
+    tick: Callable[[], object],
+) -> _Part:
+    """Steps 1 to 4 on the masks `subset`; then the posteriors of all masks, in parts with their neighbours in it."""
+    shapes = _mean_shape(subset, candidates, options, rng, tick)
     shapes.codes = 0.3 * torch.randn(options.prototypes, CODE_SIZE, generator=rng)
     shapes.turns = torch.zeros(options.prototypes, dtype=torch.int64)
-    neighbours, log_prior = Neighbours.of(subset, subset), None
+    log_prior = None
     for stage in range(STAGES):
         start = 0.03 if stage else 0.05
         _train(shapes, subset, options, rng, start=start, smoothness_weight=3e-4, log_prior=log_prior, tick=tick)
@@ -149,17 +198,12 @@ def estimate(
         own = _posteriors(-_turned(values, turns) / TEMPERATURE, options.prior)
         smoothed = neighbours.smooth(own.sum(1), options.prior)
         log_prior = (smoothed + 1e-3).log()
-    posterior, confidence = torch.empty(len(data), *smoothed.shape[1:]), torch.empty(len(data))
-    for rows in torch.arange(len(data)).split(2048):
-        part = data[rows]
-        near = Neighbours.of(part, subset)
-        alone = _posteriors(-shapes.all_distances(part) / TEMPERATURE, "free").sum(1)
-        posterior[rows] = _normalize(alone**0.3 * (near.message(smoothed) + 1e-3))
-        best = posterior[rows].sum(2).argmax(1)
-        confidence[rows] = MAX_CONFIDENCE * near_mass(near.message(own.sum(1)).sum(2), best)
-    if len(subset) < MIN_IMAGES or _views_coincide(posterior.sum(2).argmax(1), data.objects, options.azimuths):
-        confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
-    return Estimate(posterior, confidence, *shapes.align(), own.sum((2, 3)).mean(0), front_votes)
+    posterior, votes = [], []
+    for chunk, near in chunks:
+        alone = _posteriors(-shapes.all_distances(chunk) / TEMPERATURE, "free").sum(1)
+        posterior.append(_normalize(alone**0.3 * (near.message(smoothed) + 1e-3)))
+        votes.append(near.message(own.sum(1)).sum(2))
+    return _Part(torch.cat(posterior), torch.cat(votes), shapes, own.sum((2, 3)).mean(0), front_votes)
 
 
 def near_mass(mass: Tensor, azimuth: Tensor) -> Tensor:
@@ -198,12 +242,17 @@ class Shapes:
         return self.network(self.codes) + self.base
 
     def distances(self, masks: Tensor, vertices: Tensor, elevations: slice = slice(None)) -> Tensor:
-        """1 - soft IoU of masks [B, SIZE^2] with all shapes at all azimuths and the given elevations: [B, M, A, E]."""
+        """1 - soft IoU of masks [B, SIZE^2] with all shapes at all azimuths and the given elevations: [B, M, A, E].
+
+        Views from azimuths above 180 degrees are mirror images.
+        """
         count, azimuths = len(vertices), len(self.candidates.azimuth_deg)
-        cameras = self.candidates.cameras(count, elevations)
+        cameras = self.candidates.half_circle(count, elevations)
         repeated = vertices.repeat_interleave(len(cameras.eye) // count, 0)
-        rendered = nmr.render_silhouette(repeated, self.network.faces, cameras, image_size=SIZE).flatten(1)
-        values = distances(masks, rendered).reshape(len(masks), count, azimuths, -1)
+        right = nmr.render_silhouette(repeated, self.network.faces, cameras, image_size=SIZE)
+        right = right.reshape(count, azimuths // 2 + 1, -1, SIZE, SIZE)
+        rendered = torch.cat([right, right[:, 1:-1].flip(1, 4)], 1)
+        values = distances(masks, rendered.flatten(3).flatten(0, 2)).reshape(len(masks), count, azimuths, -1)
         return _turned(values, self.turns)
 
     @torch.no_grad()
@@ -362,6 +411,17 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, f
     azimuth = posterior[torch.arange(len(values)), prototype].sum(2).argmax(1)
     of_masks = _mask_votes(data, prototype, azimuth, count, azimuths)
     votes = of_masks + _PEAK_WEIGHT * _peak_votes(data, prototype, azimuth, count, azimuths)
+    best, every = _solve_turns(votes, rng), np.arange(count)
+    same, opposite = (
+        float(of_masks[best[:, None], turned, every[:, None], every].sum()) for turned in (best, (best + 2) % TURNS)
+    )
+    best = (best + 2 * (best[0] >= 2)) % TURNS  # half a turn of all prototypes changes no vote
+    return torch.from_numpy(best), 1 - opposite / max(same + opposite, 1e-9)
+
+
+def _solve_turns(votes: Tensor, rng: torch.Generator) -> np.ndarray:
+    """The turns int64 [M] with the largest sum of votes [TURNS, TURNS, M, M] over all pairs."""
+    count = votes.shape[-1]
     coupling = ((votes + votes.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
     best, best_score, every = np.zeros(count, np.int64), -np.inf, np.arange(count)
@@ -375,11 +435,7 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, f
                 break
         if (score := coupling[turns[:, None], turns, every[:, None], every].sum()) > best_score:
             best, best_score = turns, score
-    same, opposite = (
-        float(of_masks[best[:, None], turned, every[:, None], every].sum()) for turned in (best, (best + 2) % TURNS)
-    )
-    best = (best + 2 * (best[0] >= 2)) % TURNS  # half a turn of all prototypes changes no vote
-    return torch.from_numpy(best), 1 - opposite / max(same + opposite, 1e-9)
+    return best
 
 
 def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:

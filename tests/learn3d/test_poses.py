@@ -35,7 +35,7 @@ from learn3d.poses.views import CameraOptions, EstimatedViews, compare, estimate
 from learn3d.runs import checkpoint
 from learn3d.training import train
 
-QUICK = PoseOptions(steps=25, restarts=1, prototypes=3)
+QUICK = PoseOptions(steps=25, restarts=1, repeats=1, prototypes=3)
 
 
 def dart_shapes(count: int) -> tuple[torch.Tensor, torch.Tensor]:
