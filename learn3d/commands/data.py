@@ -47,7 +47,7 @@ class MakeDataset(Command):
 
         if self.config.shards:
             return make_shards(self.config)
-        say(make_dataset(self.config).text())
+        say(make_dataset(self.config, progress=is_watched()).text())
         return 0
 
 
@@ -62,7 +62,7 @@ class FetchDebianModels(Command):
     config: FetchConfig
 
     def run(self) -> None:
-        say(fetch_debian_models(self.config).summary())
+        say(fetch_debian_models(self.config, progress=is_watched()).summary())
         say(f"written to {self.config.output}")
 
 

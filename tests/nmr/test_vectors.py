@@ -18,15 +18,16 @@ SMALL = [
 
 
 def settings_of(v):
-    return dict(
-        image_size=int(v["image_size"]),
-        anti_aliasing=bool(v["anti_aliasing"]),
-        fill_back=bool(v["fill_back"]),
-        near=float(v["near"]),
-        far=float(v["far"]),
-        clip=False,  # the published renderer does not
-        eps=float(v["eps"]),
-    )
+    settings = {name: v[name].item() for name in ("image_size", "anti_aliasing", "fill_back", "near", "far", "eps")}
+    return settings | {"clip": False}  # the published renderer does not clip
+
+
+def draw(name):
+    v = load_vector(name)
+    vertices = torch.from_numpy(v["vertices"]).requires_grad_()
+    alpha = nmr.render_silhouette(vertices, torch.from_numpy(v["faces"]), **settings_of(v))
+    alpha.backward(torch.from_numpy(v["grad_alpha"]))
+    return v, alpha.detach().numpy(), vertices.grad.numpy()
 
 
 def test_the_vectors_are_there():
@@ -40,14 +41,11 @@ def relative_difference(value, expected):
 @pytest.mark.parametrize("name", SILHOUETTES)
 def test_silhouette_bit_for_bit_and_gradient(name):
     """Pulls are summed in another order than published, and two share a division: far within the stated latitude."""
-    v = load_vector(name)
-    vertices = torch.from_numpy(v["vertices"]).requires_grad_()
-    alpha = nmr.render_silhouette(vertices, torch.from_numpy(v["faces"]), **settings_of(v))
-    alpha.backward(torch.from_numpy(v["grad_alpha"]))
-    assert np.array_equal(alpha.detach().numpy(), v["alpha"])
+    v, alpha, grad = draw(name)
+    assert np.array_equal(alpha, v["alpha"])
     assert gradient_tolerance(name) >= 1e-4
-    assert relative_difference(vertices.grad.numpy(), v["grad_vertices"]) <= 2e-6
-    assert np.array_equal(vertices.grad.numpy() == 0, v["grad_vertices"] == 0)
+    assert relative_difference(grad, v["grad_vertices"]) <= 2e-6
+    assert np.array_equal(grad == 0, v["grad_vertices"] == 0)
 
 
 @pytest.mark.parametrize("name", [n for n in SILHOUETTES if "face_index_map" in load_vector(n)])
@@ -65,28 +63,20 @@ def test_index_map(name):
 @pytest.mark.parametrize("name", QUIRKS)
 def test_no_stray_pixels_of_collinear_faces(name):
     """The published kernels paint pixels all along the line through the face; a clean renderer paints none."""
-    v = load_vector(name)
-    vertices = torch.from_numpy(v["vertices"]).requires_grad_()
-    alpha = nmr.render_silhouette(vertices, torch.from_numpy(v["faces"]), **settings_of(v))
-    alpha.backward(torch.from_numpy(v["grad_alpha"]))
-    assert v["alpha"].any() and not alpha.any() and not vertices.grad.any()
+    v, alpha, grad = draw(name)
+    assert v["alpha"].any() and not alpha.any() and not grad.any()
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_reference_agrees_with_vectors(name):
     """The slow pure-torch definition, so that other tests may lean on it."""
     v = load_vector(name)
-    settings = settings_of(v)
-    faces, aa = torch.from_numpy(v["faces"]).long(), settings["anti_aliasing"]
+    aa, back, near, far, eps = (settings_of(v)[name] for name in ("anti_aliasing", "fill_back", "near", "far", "eps"))
+    faces, size = torch.from_numpy(v["faces"]).long(), v["image_size"].item() * (2 if aa else 1)
     for b in range(len(v["vertices"])):
-        vertices = torch.from_numpy(v["vertices"][b])
-        raster_size = settings["image_size"] * (2 if aa else 1)
-        index = reference.face_index(
-            vertices, faces, raster_size, settings["fill_back"], settings["near"], settings["far"]
-        )
+        vertices, grad_alpha = torch.from_numpy(v["vertices"][b]), torch.from_numpy(v["grad_alpha"][b])
+        index = reference.face_index(vertices, faces, size, back, near, far)
         assert np.array_equal(reference.silhouette(index, aa).numpy(), v["alpha"][b])
-        grad = reference.silhouette_gradient(
-            vertices, faces, index, torch.from_numpy(v["grad_alpha"][b]), aa, settings["fill_back"], settings["eps"]
-        )
+        grad = reference.silhouette_gradient(vertices, faces, index, grad_alpha, aa, back, eps)
         scale = np.abs(v["grad_vertices"][b]).max()
         np.testing.assert_allclose(grad.numpy(), v["grad_vertices"][b], rtol=1e-4, atol=1e-5 * scale)

@@ -6,6 +6,7 @@ the backs of some chairs. These readers return positions and triangles only.
 
 from __future__ import annotations
 
+import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -40,7 +41,7 @@ def get_package(name: str, folder: Path) -> Path:
                 f"apt-get could not download {name} ({result.stderr.strip()}); run `apt-get update` as root, enable "
                 "the component non-free if the package is in it, or put the .deb file into the folder --packages-dir"
             )
-    return max(folder.glob(f"{name}_*.deb"))
+    return max(folder.glob(f"{name}_*.deb"), key=lambda path: [*map(int, re.findall(r"\d+", path.name))])
 
 
 def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:

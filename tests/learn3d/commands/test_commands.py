@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -215,6 +216,11 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
 
     monkeypatch.setattr("learn3d.commands.models.write_json", refuse)
     assert command(*words)[:2] == (1, out), "the table is not lost"
+
+
+def test_the_fit_of_pictures_is_measured(tiny_folder, capsys) -> None:
+    runpy.run_path(str(TOOLS / "measure_fit.py"))["main"](tiny_folder, "airplane", images=2)
+    assert len(capsys.readouterr().out.splitlines()[1].split()) == 8
 
 
 def test_interrupting_the_command_saves_and_says_so(tiny_folder, run_folder) -> None:
