@@ -122,7 +122,7 @@ class Estimate:
 
     posterior: Tensor  # float32 [N, A, E]
     confidence: Tensor  # float32 [N]: probability that the best azimuth is right to NEAR_DEG
-    prototypes: Tensor  # float32 [M, V, 3], y up, z towards azimuth 0
+    prototypes: Tensor  # float32 [M, V, 3], y up, z away from the camera at azimuth 0
     faces: Tensor  # int64 [F, 3]
     weights: Tensor  # float32 [M]: mean posterior of each prototype
     front_votes: float  # similar masks with equal azimuths, over those with equal or opposite ones; 1 if there are none
@@ -207,7 +207,7 @@ def _part(
 
 
 def near_mass(mass: Tensor, azimuth: Tensor) -> Tensor:
-    """The share of the probability mass [N, A] that lies within NEAR_DEG of each azimuth, int64 [N]: float [N]."""
+    """The share of the probability mass [N, A] within NEAR_DEG of an azimuth, whose number is int64 [N]: float [N]."""
     reach = math.floor(NEAR_DEG * mass.shape[1] / 360)
     near = (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]
     return mass.gather(1, near).sum(1) / mass.sum(1).clamp_min(1e-9)
@@ -221,9 +221,8 @@ def _views_coincide(azimuth: Tensor, objects: Tensor, count: int) -> bool:
     )
     number = views.sum(1, keepdim=True)
     pairs = views * (number - 1)
-    close = views * (
-        near_mass(views.repeat_interleave(count, 0), torch.arange(count).repeat(len(views))).view_as(views) * number - 1
-    )
+    reach = math.floor(NEAR_DEG * count / 360)
+    close = views * (sum(views.roll(shift, 1) for shift in range(-reach, reach + 1)) - 1)
     return bool(pairs.sum() > 0 and close.sum() > 0.5 * pairs.sum())
 
 
@@ -257,7 +256,7 @@ class Shapes:
 
     @torch.no_grad()
     def align(self) -> tuple[Tensor, Tensor]:
-        """Vertices [M, V, 3], all turned with azimuth 0 to the front, and faces [F, 3]."""
+        """Vertices [M, V, 3] in the common frame, each shape turned by its `turns`, and faces [F, 3]."""
         angle = self.turns * (2 * math.pi / TURNS)
         cos, sin = angle.cos().round()[:, None], angle.sin().round()[:, None]
         x, y, z = self.vertices().unbind(2)

@@ -1,8 +1,8 @@
 """Corrects estimated poses during a training: the candidate poses of the training images get new probabilities.
 
 The shape that the model predicts from an image is rendered at all candidate poses of the image. The IoU with the mask
-and the table's probability give the weights. All images share the networks, so a shape whose pose was wrong is drawn
-into the frame of the others.
+and the table's probability give the weights. As all images share the networks, the shape of an image with a wrong pose
+comes out in the frame of the others all the same, so its IoU is best at the right pose.
 """
 
 from __future__ import annotations

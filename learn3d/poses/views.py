@@ -128,17 +128,18 @@ def estimate_views(
     data = Masks(masks, allowed, objects.long())[shown]
     result = estimate(data, torch.searchsorted(shown, training), candidates, options, tick)
 
-    posterior = torch.full((len(masks), len(azimuths) * len(grid)), 1 / (len(azimuths) * len(grid)))
-    posterior[shown] = result.posterior.flatten(1)
-    confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
-    weights, chosen = posterior.topk(min(MAX_CANDIDATES, posterior.shape[1]), 1)
-    weights[:, kept:] = 0
-    heights = grid[chosen % len(grid)]
+    posterior = torch.full((len(masks), len(azimuths), len(grid)), 1 / (len(azimuths) * len(grid)))
+    posterior[shown] = result.posterior
     if cameras.elevation is None:
-        heights = elevation[:, None].expand_as(heights)
+        posterior = posterior.sum(2, keepdim=True)  # the elevation of each image is known
+    heights_per_azimuth = posterior.shape[2]
+    confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
+    weights, chosen = posterior.flatten(1).topk(min(MAX_CANDIDATES, posterior[0].numel()), 1)
+    weights[:, kept:] = 0
+    heights = elevation[:, None].expand_as(weights) if cameras.elevation is None else grid[chosen % heights_per_azimuth]
     table = PoseTable(
         np.concatenate([fingerprints(dataset) for dataset in datasets]),
-        *(part.numpy().astype(np.float32) for part in (wrap_deg(azimuths[chosen // len(grid)]), heights)),
+        *(part.numpy().astype(np.float32) for part in (wrap_deg(azimuths[chosen // heights_per_azimuth]), heights)),
         *(part.numpy() for part in (weights / weights.sum(1, keepdim=True), distance, half_fov, confidence)),
     )
     return EstimatedViews(tuple(datasets), shown, candidates, result, table)

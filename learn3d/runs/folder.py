@@ -73,8 +73,8 @@ def check_can_start(folder: Path, overwrite: bool) -> None:
     """
     if is_run(folder):
         if not overwrite:
-            advice = "continue it (--resume), replace it (--overwrite) or choose another folder"
-            raise ValueError(f"{folder} has a run; {advice}")
+            resume = "continue it (--resume), " if any(folder.glob("*.safetensors")) else ""
+            raise ValueError(f"{folder} has a run; {resume}replace it (--overwrite) or choose another folder")
         return
     if clashing := [path for pattern in WRITTEN for path in folder.glob(pattern)]:
         name = clashing[0].relative_to(folder)
