@@ -122,7 +122,7 @@ class Estimate:
 
     posterior: Tensor  # float32 [N, A, E]
     confidence: Tensor  # float32 [N]: probability that the best azimuth is right to NEAR_DEG
-    prototypes: Tensor  # float32 [M, V, 3], y up, z away from the camera at azimuth 0
+    prototypes: Tensor  # float32 [M, V, 3] of the most typical estimate, y up, z away from the camera at azimuth 0
     faces: Tensor  # int64 [F, 3]
     weights: Tensor  # float32 [M]: mean posterior of each prototype
     front_votes: float  # similar masks with equal azimuths, over those with equal or opposite ones; 1 if there are none
@@ -139,21 +139,23 @@ def estimate(
     rng = torch.Generator().manual_seed(options.seed)
     fitted = fitted[torch.randperm(len(fitted), generator=rng)[:MAX_FITTED].sort().values]
     subset = data[fitted]
-    chunks = [data[rows] for rows in torch.arange(len(data)).split(2048)]
-    near = [(chunk, Neighbours.of(chunk, subset)) for chunk in chunks]
-    neighbours = Neighbours.of(subset, subset)
+    neighbours = (Neighbours.of(subset, subset), Neighbours.of(data, subset))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        parts = [_part(subset, neighbours, near, candidates, options, rng, tick) for _ in range(options.repeats)]
+        parts = [_part(subset, data, neighbours, candidates, options, rng, tick) for _ in range(options.repeats)]
     shifts = _common_frame([part.posterior.sum(2) for part in parts], rng)
-    posterior = sum(part.posterior.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True)) / len(parts)
-    votes = sum(part.votes.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True))
+    posteriors = [part.posterior.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True)]
+    posterior = sum(posteriors) / len(parts)
+    agreement = sum(part.agreement.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True))
     best = posterior.sum(2).argmax(1)
-    confidence = MAX_CONFIDENCE * near_mass(votes, best)
+    confidence = MAX_CONFIDENCE * near_mass(agreement, best)
     if len(fitted) < MIN_IMAGES or _views_coincide(best, data.objects, options.azimuths):
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
     front_votes = sum(part.front_votes for part in parts) / len(parts)
-    return Estimate(posterior, confidence, *parts[0].shapes.align(), parts[0].weights, front_votes)
+    typical = max(range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum()))
+    shapes, weights = parts[typical].shapes, parts[typical].weights
+    shapes.turns = (shapes.turns + shifts[typical] * TURNS // options.azimuths) % TURNS
+    return Estimate(posterior, confidence, *shapes.align(), weights, front_votes)
 
 
 def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
@@ -169,7 +171,7 @@ class _Part:
     """One of several estimates, in a frame of its own."""
 
     posterior: Tensor  # float32 [N, A, E]
-    votes: Tensor  # float32 [N, A]: the nearest masks' probabilities, added up
+    agreement: Tensor  # float32 [N, A]: the nearest masks' probabilities, added up
     shapes: Shapes
     weights: Tensor  # float32 [M]: mean posterior of each prototype
     front_votes: float
@@ -177,14 +179,17 @@ class _Part:
 
 def _part(
     subset: Masks,
-    neighbours: Neighbours,
-    chunks: list[tuple[Masks, Neighbours]],
+    data: Masks,
+    neighbours: tuple[Neighbours, Neighbours],
     candidates: Candidates,
     options: PoseOptions,
     rng: torch.Generator,
     tick: Callable[[], object],
 ) -> _Part:
-    """Steps 1 to 4 on the masks `subset`; then the posteriors of all masks, in parts with their neighbours in it."""
+    """Steps 1 to 4 on the masks `subset`, then the posteriors of all masks `data`.
+
+    neighbours: of `subset` and of `data`, both in `subset`.
+    """
     shapes = _mean_shape(subset, candidates, options, rng, tick)
     shapes.codes = 0.3 * torch.randn(options.prototypes, CODE_SIZE, generator=rng)
     shapes.turns = torch.zeros(options.prototypes, dtype=torch.int64)
@@ -196,14 +201,13 @@ def _part(
         turns, front_votes = _turns(values, subset, rng)
         shapes.turns = (shapes.turns + turns) % TURNS
         own = _posteriors(-_turned(values, turns) / TEMPERATURE, options.prior)
-        smoothed = neighbours.smooth(own.sum(1), options.prior)
+        smoothed = neighbours[0].smooth(own.sum(1), options.prior)
         log_prior = (smoothed + 1e-3).log()
-    posterior, votes = [], []
-    for chunk, near in chunks:
-        alone = _posteriors(-shapes.all_distances(chunk) / TEMPERATURE, "free").sum(1)
-        posterior.append(_normalize(alone**0.3 * (near.message(smoothed) + 1e-3)))
-        votes.append(near.message(own.sum(1)).sum(2))
-    return _Part(torch.cat(posterior), torch.cat(votes), shapes, own.sum((2, 3)).mean(0), front_votes)
+    chunks = (shapes.all_distances(data[rows]) for rows in torch.arange(len(data)).split(2048))
+    alone = torch.cat([_posteriors(-values / TEMPERATURE, "free").sum(1) for values in chunks])
+    posterior = _normalize(alone**0.3 * (neighbours[1].message(smoothed) + 1e-3))
+    agreement = neighbours[1].message(own.sum(1)).sum(2)
+    return _Part(posterior, agreement, shapes, own.sum((2, 3)).mean(0), front_votes)
 
 
 def near_mass(mass: Tensor, azimuth: Tensor) -> Tensor:
@@ -418,10 +422,10 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, f
     return torch.from_numpy(best), 1 - opposite / max(same + opposite, 1e-9)
 
 
-def _solve_turns(votes: Tensor, rng: torch.Generator) -> np.ndarray:
-    """The turns int64 [M] with the largest sum of votes [TURNS, TURNS, M, M] over all pairs."""
-    count = votes.shape[-1]
-    coupling = ((votes + votes.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
+def _solve_turns(couplings: Tensor, rng: torch.Generator) -> np.ndarray:
+    """The turns int64 [M] with the largest sum of couplings [TURNS, TURNS, M, M] over all pairs."""
+    count = couplings.shape[-1]
+    coupling = ((couplings + couplings.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
     best, best_score, every = np.zeros(count, np.int64), -np.inf, np.arange(count)
     for _ in range(200):  # coordinate ascent from random turns
