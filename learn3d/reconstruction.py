@@ -243,11 +243,10 @@ def reconstruct_picture(
     """
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
-    found = method.view_probabilities(image[None])
-    probabilities = None if found is None else found[0]
     if not refined or not isinstance(method, MeshMethod):
         (surface,) = reconstruct(method, stored[None])
-        azimuth_deg = input_azimuth_deg(surface, stored[3], probabilities)
+        found = method.view_probabilities(image[None])
+        azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
         return Reconstruction(surface, stored, azimuth_deg, None, None, None)
     fine = prepare_image(
         colors, mask, object_size=CENTRED_SIZE, size=_COLORED, layout="kar"
@@ -255,7 +254,7 @@ def reconstruct_picture(
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
     )
-    fitted = fit(method, image, small[0, 0], view_probabilities=probabilities, progress=progress)
+    fitted = fit(method, image, small[0, 0], progress=progress)
     surface = color_mesh(
         fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
     )

@@ -34,8 +34,7 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
         for index in np.linspace(0, len(dataset) - 1, images).round().astype(int):
             batch = dataset.batch(torch.tensor([index]))
             (image,), mask = batch.images, centre(batch.masks[:, None])[0, 0]
-            (probabilities,) = model.method.view_probabilities(batch.images)
-            fitted = fit(model.method, image, mask, view_probabilities=probabilities)
+            fitted = fit(model.method, image, mask)
             code = model.method.encode(batch.images)
             ious = [
                 float(nmr.metrics.voxel_iou(dataset.voxelize(shape, model.method.faces), batch.voxels))

@@ -99,13 +99,12 @@ def fit(
     image: Tensor,
     mask: Tensor,
     *,
-    view_probabilities: Tensor | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit the shape of a stored image uint8 [4, S, S] to its framed mask float32 [64, 64].
 
-    view_probabilities: see `find_view`. progress: called with the name of each stage and the share (0 .. 1) that is
-    done.
+    If the method predicts azimuths, they decide between views with similar outlines. progress: called with the name of
+    each stage and the share (0 .. 1) that is done.
     """
     report = progress or (lambda text, part: None)
     code = method.encode(image[None]).float().cpu()
@@ -116,7 +115,8 @@ def fit(
 
     report("camera", 0.0)
     vertices = decode(code)
-    view, predicted_iou = find_view(vertices[0], method.faces, mask, view_probabilities)
+    found = method.view_probabilities(image[None])
+    view, predicted_iou = find_view(vertices[0], method.faces, mask, None if found is None else found[0])
     report("shape", 0.3)
     view, code = _fit_code(view, code, decode, method, mask)
     vertices = decode(code)

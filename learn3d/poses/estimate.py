@@ -10,7 +10,7 @@
    couplings of a Potts model whose states are the four turns of each prototype.
 4. The posteriors over poses are smoothed over the nearest masks and the nearest mirrored masks. Then steps 2 to 4 are
    repeated with the smoothed posteriors as a prior.
-5. All of it is repeated from other random shapes, and the posteriors are added: a kind of object that came out turned
+5. Steps 1 to 4 are repeated from other random shapes, and the posteriors are averaged: a kind of object that is turned
    in one estimate is outvoted by the others.
 
 Objects are assumed to be symmetric about x = 0: the view from azimuth -a is the mirror image of the view from a.
@@ -59,7 +59,7 @@ class PoseOptions:
     restarts: Annotated[int, Field(ge=1, le=100)] = 4
     """Number of initialisations of the mean shape; the best one is kept."""
     repeats: Annotated[int, Field(ge=1, le=100)] = 3
-    """Number of independent estimates, whose probabilities are averaged."""
+    """Number of independent estimates that are averaged: more are more reliable and take longer."""
     prior: Literal["uniform", "free"] = "uniform"
     """Prior over azimuths. uniform: all azimuths are about equally frequent in the data. free: no assumption."""
     steps: Rare[Annotated[int, Field(ge=1, le=100_000)]] = 300
@@ -275,7 +275,7 @@ class Shapes:
 
 
 def _turned(values: Tensor, turns: Tensor) -> Tensor:
-    """Values [B, M, A, E] of M shapes at A azimuths, for the shapes after `turns` quarter turns, int64 [M]."""
+    """Values [B, M, A, E] of M shapes at A azimuths, after shape m was turned by `turns[m]` quarters, int64 [M]."""
     azimuths = values.shape[2]
     before = (torch.arange(azimuths) - turns[:, None] * (azimuths // TURNS)) % azimuths
     return values.gather(2, before[None, :, :, None].expand_as(values))
@@ -423,7 +423,7 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, f
 
 
 def _solve_turns(couplings: Tensor, rng: torch.Generator) -> np.ndarray:
-    """The turns int64 [M] with the largest sum of couplings [TURNS, TURNS, M, M] over all pairs."""
+    """The turns t, int64 [M], that maximize the sum of couplings[t_i, t_j, i, j] over all pairs i, j."""
     count = couplings.shape[-1]
     coupling = ((couplings + couplings.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))

@@ -57,7 +57,7 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
 
 
 def _with_marginal(logits: Tensor, azimuth_deg: Tensor, prior: Tensor) -> Tensor:
-    """Softmax of logits [M, C], shifted by a number for each cell of azimuths, whose share is that in `prior`."""
+    """Softmax of logits [M, C] plus a number for each cell of azimuths, which gives the cell its share in `prior`."""
     cells = 360 // _CELL_DEG
     cell = ((azimuth_deg / _CELL_DEG).round().long() % cells).flatten()
     wanted = torch.bincount(cell, prior.flatten(), minlength=cells).clamp_min(1e-6)

@@ -73,7 +73,7 @@ def check_can_start(folder: Path, overwrite: bool) -> None:
     """
     if is_run(folder):
         if not overwrite:
-            resume = "continue it (--resume), " if any(folder.glob("*.safetensors")) else ""
+            resume = "continue it (--resume), " if checkpoints(folder) else ""
             raise ValueError(f"{folder} has a run; {resume}replace it (--overwrite) or choose another folder")
         return
     if clashing := [path for pattern in WRITTEN for path in folder.glob(pattern)]:

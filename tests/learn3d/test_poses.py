@@ -63,7 +63,7 @@ def estimated(dataset: ViewDataset, **options: object) -> EstimatedViews:
 
 @pytest.fixture(scope="module")
 def found() -> EstimatedViews:
-    return estimated(darts(8), steps=40, restarts=2)
+    return estimated(darts(8), steps=40, restarts=2, repeats=2)
 
 
 def test_azimuths_of_distinct_shapes_are_found(found: EstimatedViews) -> None:
@@ -90,8 +90,12 @@ def test_a_seed_gives_the_same_bits() -> None:
     assert not np.array_equal(first.weights, other.weights)
 
 
-def test_a_range_of_elevations_and_unknown_cameras() -> None:
-    quick = dataclasses.replace(QUICK, steps=3)
+def test_ranges_of_elevations_and_unknown_cameras() -> None:
+    quick, dataset = dataclasses.replace(QUICK, steps=3), darts(5)
+    known = dataclasses.replace(dataset.poses, elevation_deg=20.0 * (torch.arange(120) % 3))
+    table = estimate_views([dataclasses.replace(dataset, poses=known)], CameraOptions(), quick, 3).table
+    assert all(len(set(azimuths)) == 24 for azimuths in table.azimuth_deg)  # each azimuth once, at the known elevation
+    assert np.array_equal(table.elevation_deg[:, 0], known.elevation_deg)
     views = estimate_views([dataclasses.replace(darts(5), poses=None)], CameraOptions("0:30", 2.5, 31.0), quick, 3)
     assert set(np.unique(views.table.elevation_deg)) <= {0.0, 15.0, 30.0}
     assert (views.table.distance == 2.5).all() and (views.table.half_fov_deg == 15.5).all()

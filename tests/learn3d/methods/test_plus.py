@@ -85,14 +85,8 @@ def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
 
 def test_the_weight_of_the_smoothness_falls_over_the_run() -> None:
     settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
-    method = create_method(
-        settings,
-        DatasetInfo(24, inverted=False),
-        device="cpu",
-        precision="fp32",
-        seed=0,
-        schedule=TrainingSchedule(iterations=5),
-    )
+    options = {"device": "cpu", "precision": "fp32", "seed": 0, "schedule": TrainingSchedule(iterations=5)}
+    method = create_method(settings, DatasetInfo(24, inverted=False), **options)
     weights = [method.weights_at(step)["smoothness"] for step in (1, 3, 5, 6)]
     assert weights == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
     assert make(lambda_smooth_end=None).weights_at(5) == make().weights

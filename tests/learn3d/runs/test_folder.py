@@ -80,6 +80,9 @@ def test_a_run_is_replaced_only_when_asked_and_other_files_stay(tmp_path) -> Non
     make_run(tmp_path)
     with pytest.raises(ValueError, match=r"has a run; continue it \(--resume\), replace it"):
         run_folder.remove_old_run(tmp_path, overwrite=False)
+    (tmp_path / "last.safetensors").unlink()
+    with pytest.raises(ValueError, match=r"has a run; replace it"):
+        run_folder.remove_old_run(tmp_path, overwrite=False)
     run_folder.remove_old_run(tmp_path, overwrite=True)
     assert files(tmp_path) == ["pictures/holiday.jpg"]
     with pytest.raises(ValueError, match="is not empty; choose another folder, or put the run beside"):
