@@ -31,10 +31,13 @@ from learn3d.data.framing import (
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.poses import Poses
 from learn3d.files import limits, writing
+from learn3d.fitting.camera import belief
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.fitting.fit import Progress, belief, fit
+from learn3d.fitting.fit import Progress, fit, predict
+from learn3d.fitting.smoothing import divide, outer_surface, sharpen
+from learn3d.fitting.templates import TEMPLATES, Templates, fit_template
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.refinement import refine
 from learn3d.networks.encoders import CENTRED_SIZE, centre
@@ -50,6 +53,7 @@ STRIP_SIZE = 192  # side of each picture in a strip, in pixels
 _OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
 _PLAIN_SIDE = 1024  # side in pixels to which a photograph with a plain background is reduced
 _COLORED = 256  # side in pixels of the picture that gives the colours
+_LONGEST_EDGE = 0.04  # of a coloured template; vertices have the colours
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
@@ -60,6 +64,12 @@ class Model(NamedTuple):
     config: TrainConfig
     object_size: float  # `ViewDataset.mean_object_size` of its training images
     known_codes: KnownCodes | None = None  # None if its file has none
+    templates: Templates | None = None  # None if its file has none
+
+    @property
+    def categories(self) -> list[str]:
+        """The categories that it was trained on."""
+        return [name.strip() for name in self.config.category.split(",")]
 
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
         """Call `prepare_image` with the image size, object size and layout of these networks."""
@@ -71,9 +81,15 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     """The model of a run folder or checkpoint file, or the model in the package if `run` is None."""
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
-    known = list(map(checkpoint.load(path)[0].get, KNOWN_CODES))
-    known_codes = None if known[0] is None else KnownCodes(*known)
-    return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, known_codes)
+    tensors = checkpoint.load(path)[0]
+    known, templates = (list(map(tensors.get, names)) for names in (KNOWN_CODES, TEMPLATES))
+    return Model(
+        method,
+        config,
+        metadata.progress.object_share or MEAN_OBJECT_SIZE,
+        None if known[0] is None else KnownCodes(*known),
+        None if templates[0] is None else Templates(*templates),
+    )
 
 
 def cut_out_pictures(model: Model, folder: Path) -> Tensor:
@@ -254,11 +270,19 @@ def reconstruct_picture(
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
     )
-    fitted = fit(method, image, small[0, 0], progress=progress)
-    surface = color_mesh(
-        fitted.vertices, method.faces, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection
-    )
-    return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, *recognize(model, image))
+    mask, report = small[0, 0], progress or (lambda text, part: None)
+    report("camera", 0.0)
+    kind, warning = recognize(model, image)
+    predicted = predict(method, image, mask)
+    if model.templates is not None and warning is None:
+        fitted, kind = fit_template(method, model.templates, model.categories, predicted, mask, report)
+        mesh = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE)
+    else:
+        fitted = fit(method, predicted, mask, report)
+        mesh = outer_surface(fitted.vertices, fitted.faces)
+    surface = color_mesh(*mesh, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection)
+    report("done", 1.0)
+    return Reconstruction(sharpen(surface), stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
 
 
 def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
@@ -269,7 +293,7 @@ def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
     if model.known_codes is None:
         return None, None
     (code,) = model.method.encode(image[None]).float().cpu()
-    kinds = [kind.strip() for kind in model.config.category.split(",")]
+    kinds = model.categories
     kind = kinds[model.known_codes.nearest_kind(code)] if len(kinds) > 1 else None
     if not model.known_codes.is_strange(code):
         return kind, None
@@ -299,7 +323,7 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor 
     """Azimuth from which the shape's silhouette fits the mask uint8 [S,S] of its image best; a multiple of 15.
 
     A guess for pictures: elevation and distance are unknown, so four elevations are tried, and all outlines are scaled
-    to one size. probabilities: see `fitting.fit.find_view`.
+    to one size. probabilities: see `fitting.camera.find_view`.
     """
     small = nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, (64, 64), mode="area")
     target, azimuths, losses = centre(small)[0], [15.0 * k for k in range(24)], []

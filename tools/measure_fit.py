@@ -12,39 +12,61 @@ import tyro
 import nmr
 from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.poses import wrap_deg
-from learn3d.fitting.fit import fit
+from learn3d.fitting.fit import Fit, fit, predict
+from learn3d.fitting.templates import fit_template
+from learn3d.make_data.meshes import fit_to_box
 from learn3d.networks.encoders import centre
 from learn3d.pictures.surfaces import azimuths_deg
 from learn3d.reconstruction import load_model, recognize
 
-COLUMNS = ("predicted", "code fitted", "vertices fitted", "voxels predicted", "voxels fitted", "azimuth", "warned")
+COLUMNS = (
+    "outline predicted",
+    "fitted",
+    "template",
+    "voxels predicted",
+    "fitted",
+    "template",
+    "azimuth",
+    "kind",
+    "warned",
+)
 
 
 def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = None, images: int = 20) -> None:
     """Print a line for each category: means over `images` test images, spread evenly over objects and views.
 
-    Columns: three IoUs of mask and silhouette, two voxel IoUs (kato18), the share of images whose azimuth is right
-    within 20 degrees, the share with a warning.
+    Columns: IoU of mask and silhouette of the predicted shape, the fitted one and the template (zeros without
+    templates), their voxel IoUs (kato18), the share of images whose azimuth is right within 20 degrees, whose template
+    has the right category, and with a warning.
     """
     model = load_model(run)
-    print(f"{'':12}", *(f"{column:>16}" for column in COLUMNS))
+    print(f"{'':12}", *(f"{column:>20}" for column in COLUMNS))
     for name in category.split(","):
         dataset = load_dataset(layout, data, name, "test")
         rows = []
         for index in np.linspace(0, len(dataset) - 1, images).round().astype(int):
             batch = dataset.batch(torch.tensor([index]))
             (image,), mask = batch.images, centre(batch.masks[:, None])[0, 0]
-            fitted = fit(model.method, image, mask)
-            code = model.method.encode(batch.images)
-            ious = [
-                float(nmr.metrics.voxel_iou(dataset.voxelize(shape, model.method.faces), batch.voxels))
-                for shape in (model.method.decode(code).vertices, fitted.vertices[None].clamp(-0.499, 0.499))
-            ]
-            error_deg = wrap_deg(fitted.view.azimuth_deg - azimuths_deg(batch.poses))
-            warned = recognize(model, image)[1] is not None
-            row = (fitted.predicted_iou, fitted.code_iou, fitted.iou, *ious, float(error_deg.abs()) < 20, warned)
-            rows.append(row)
-        print(f"{name:12}", *(f"{value:16.3f}" for value in np.mean(rows, axis=0)), flush=True)
+            predicted = predict(model.method, image, mask)
+            shapes = [Fit(predicted.vertices[0], model.method.faces, predicted.view, predicted.iou)]
+            shapes.append(fit(model.method, predicted, mask, _quiet))
+            kind, warning = recognize(model, image)
+            if model.templates is not None:
+                found = fit_template(model.method, model.templates, model.categories, predicted, mask, _quiet)
+                shapes.append(found[0])
+                kind = found[1]
+            outlines, voxels = np.zeros(3), np.zeros(3)
+            for column, shape in enumerate(shapes):
+                grid = dataset.voxelize(torch.from_numpy(fit_to_box(shape.vertices.numpy()))[None] * 0.998, shape.faces)
+                outlines[column], voxels[column] = shape.iou, float(nmr.metrics.voxel_iou(grid, batch.voxels))
+            error_deg = wrap_deg(shapes[-1].view.azimuth_deg - azimuths_deg(batch.poses))
+            right = float(error_deg.abs()) < 20, kind == name, warning is not None
+            rows.append((*outlines, *voxels, *right))
+        print(f"{name:12}", *(f"{value:20.3f}" for value in np.mean(rows, axis=0)), flush=True)
+
+
+def _quiet(text: str, part: float) -> None:
+    """Reports no progress."""
 
 
 if __name__ == "__main__":

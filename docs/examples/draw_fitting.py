@@ -10,9 +10,9 @@ import torch
 import tyro
 
 import nmr
-from learn3d.make_data.shapes import make_shape
 from learn3d.pictures.sheets import save_gif, tile
 from learn3d.pictures.surfaces import Surface, draw_surface
+from learn3d.shapes import make_shape
 
 CATEGORIES = ("airplane", "car", "chair", "lamp", "sofa", "table")
 

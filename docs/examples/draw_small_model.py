@@ -11,12 +11,11 @@ import tyro
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.make_data.shapes import CATEGORIES, make_shape
-from learn3d.make_data.writers.around import natural_look
 from learn3d.pictures.sheets import save_png, tile
-from learn3d.pictures.studio import photograph
+from learn3d.pictures.studio import natural_look, photograph
 from learn3d.pictures.surfaces import Surface, draw_around
 from learn3d.reconstruction import export_mesh, load_model, reconstruct_picture
+from learn3d.shapes import CATEGORIES, make_shape
 
 SIDE = 140  # of each small picture, in pixels
 TURNS = (0, 60, 120)  # degrees from the camera's side

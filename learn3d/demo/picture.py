@@ -14,10 +14,9 @@ import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.framing import check_mask, largest_region, mask_box
 from learn3d.fitting.cutting import Box, correct, cut_out, find_mask
-from learn3d.make_data.shapes import make_shape
-from learn3d.make_data.writers.around import natural_look
-from learn3d.pictures.studio import photograph
+from learn3d.pictures.studio import natural_look, photograph
 from learn3d.reconstruction import Model, mesh_bytes, reconstruct_picture
+from learn3d.shapes import make_shape
 
 SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
 EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # category: seed

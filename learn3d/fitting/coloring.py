@@ -7,11 +7,12 @@ import torch
 import torch.nn.functional as F
 from scipy.sparse import diags_array
 from scipy.sparse.linalg import spsolve
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 import nmr
-from learn3d.fitting.fit import View
-from learn3d.fitting.smoothing import joined, outer_surface
+from learn3d.fitting.camera import View
+from learn3d.fitting.smoothing import joined
 from learn3d.pictures.surfaces import Surface
 
 DEPTH_SIZE = 256  # side of the depth map that decides which vertices are visible
@@ -23,24 +24,23 @@ BORDER = 2  # width in pixels of the border inside the outline that may have the
 def color_mesh(
     vertices: Tensor, faces: Tensor, view: View, colors: np.ndarray, mask: np.ndarray, mirror: Tensor | None = None
 ) -> Surface:
-    """A smooth surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if
-    these are hidden, too, blurred colours of their neighbours.
+    """A surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if these are
+    hidden, too, blurred colours of their neighbours.
 
     vertices float32 [V, 3] in the object frame, faces int64 [F, 3]; view: the picture's camera; colors uint8
-    [S, S, 3] and mask uint8 [S, S]: the picture, framed as in `fitting.fit`; mirror: float32 [3, 3], the reflection
+    [S, S, 3] and mask uint8 [S, S]: the picture, framed as in `fitting.camera`; mirror: float32 [3, 3], the reflection
     that maps the shape to itself, None without symmetry.
     """
-    points, triangles = outer_surface(vertices, faces)
-    normals = nmr.vertex_normals(points, triangles)
-    picture = _Picture(points, triangles, view, colors, mask)
-    seen, weight = picture.look_up(points, normals)
+    normals = nmr.vertex_normals(vertices, faces)
+    picture = _Picture(vertices, faces, view, colors, mask)
+    seen, weight = picture.look_up(vertices, normals)
     if mirror is not None:
-        other, its_weight = picture.look_up(points @ mirror.T, normals @ mirror.T)
+        other, its_weight = picture.look_up(vertices @ mirror.T, normals @ mirror.T)
         its_weight = (1 - weight) * its_weight  # a vertex's own colour comes first
         seen = weight[:, None] * seen + its_weight[:, None] * other
         weight = weight + its_weight
         seen = seen / weight.clamp(min=1e-6)[:, None]
-    return Surface(points, triangles, _spread(seen, weight, triangles))
+    return Surface(vertices, faces, _spread(seen, weight, vertices, faces))
 
 
 class _Picture:
@@ -70,17 +70,18 @@ def _sample(image: Tensor, grid: Tensor) -> Tensor:
     return F.grid_sample(image, grid, padding_mode="border", align_corners=False)
 
 
-def _spread(colors: Tensor, weight: Tensor, faces: Tensor) -> Tensor:
-    """Spread colours [V, 3] from vertices with a high weight [V] to the others as smoothly as possible.
+def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
+    """Spread colours [V, 3] from vertices [V, 3] with a high weight [V] to the others as smoothly as possible.
 
-    The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2.
+    The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2 + 1e-5 sum_v |c_v - near_v|^2;
+    near_v is the colour of the nearest vertex that is clearly seen, for parts of which nothing is.
     """
-    count = len(colors)
-    neighbours = joined(faces.numpy(), count)
+    clear = weight > min(0.5, float(weight.max()))
+    clear = clear if clear.any() else torch.ones_like(clear)
+    nearest = cKDTree(vertices[clear].numpy()).query(vertices.numpy())[1]
+    given, near = weight.double().numpy()[:, None] ** 2, colors[clear].double().numpy()[nearest]
+    neighbours = joined(faces.numpy(), len(colors))
     laplacian = diags_array(neighbours.sum(1)) - neighbours
-    given = weight.double().numpy() ** 2
-    if not given.any():  # no vertex is clearly visible, so all colours count alike
-        given = np.full(count, 1e-3)
-    system = (diags_array(given + 1e-9) + 0.01 * laplacian).tocsc()
-    right = given[:, None] * colors.double().numpy()
+    system = (diags_array(given[:, 0] + 1e-5) + 0.01 * laplacian).tocsc()
+    right = given * colors.double().numpy() + 1e-5 * near
     return torch.from_numpy(np.asarray(spsolve(system, right))).float().clamp(0, 1)

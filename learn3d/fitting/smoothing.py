@@ -1,4 +1,4 @@
-"""Finer, smoother meshes: subdivision with rounded edges, and the outer surface of meshes that cross themselves."""
+"""Finer, smoother meshes: divided edges, sharp edges, and the outer surface of meshes that cross themselves."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import torch.nn.functional as F
 import trimesh
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 from torch import Tensor
 
 import nmr
+from learn3d.pictures.surfaces import Surface
 
 ROUNDS = 4  # rounds of Taubin's smoothing
 CELLS = 112  # cells of the grid of `outer_surface` along the longest side
@@ -23,20 +25,15 @@ _GROWTH = 1.0  # cells by which the shape is thickened at first, to keep thin pa
 _SHRINK, _GROW = 0.5, -0.53  # weights of Taubin 1995: smoothing without loss of volume
 
 
-def smooth(vertices: Tensor, faces: Tensor, levels: int = 2) -> tuple[Tensor, Tensor]:
-    """Vertices float32 [W, 3] and faces int64 [4^levels F, 3] of a finer mesh of [V, 3], [F, 3].
-
-    Every face is divided into 4^levels; then Taubin's smoothing rounds edges over about the width of a new face.
-    """
-    points, triangles = vertices.double().numpy(), faces.numpy()
-    for _ in range(levels):
-        points, triangles = trimesh.remesh.subdivide(points, triangles)
-    neighbours = joined(triangles, len(points))
+def smooth(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Vertices [V, 3] of a mesh with rounded edges: a few rounds of Taubin's smoothing."""
+    points = vertices.double().numpy()
+    neighbours = joined(faces.numpy(), len(points))
     mean = diags_array(1 / np.maximum(neighbours.sum(1), 1)) @ neighbours
     for _ in range(ROUNDS):
         for share in (_SHRINK, _GROW):
             points = points + share * (mean @ points - points)
-    return torch.from_numpy(points.astype(np.float32)), torch.from_numpy(np.asarray(triangles, np.int64))
+    return torch.from_numpy(points.astype(np.float32))
 
 
 @torch.no_grad()
@@ -76,8 +73,48 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     field = gaussian_filter(outside.numpy(), 0.7)
     points, triangles, _, _ = marching_cubes(field, _GROWTH * cell, spacing=(cell,) * 3)
     points = torch.from_numpy(points.astype(np.float32)) + centre - cell * torch.tensor(counts)
-    points, triangles = smooth(points, torch.from_numpy(triangles.astype(np.int64)), levels=0)
+    triangles = torch.from_numpy(triangles.astype(np.int64))
+    points = smooth(points, triangles)
     return points - 0.7 * _GROWTH * cell * nmr.vertex_normals(points, triangles), triangles
+
+
+def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Tensor]:
+    """Divide a mesh [V, 3], [F, 3] until no edge is longer than `longest`. The surface stays, and closed meshes closed.
+
+    An edge is halved, and with it all its faces, if it is the longest of each of them (Rivara 1984).
+    """
+    points, triangles = vertices.double().numpy(), faces.numpy()
+    while True:
+        low, high = (f(triangles, np.roll(triangles, -1, 1)) for f in (np.minimum, np.maximum))
+        keys, edge = np.unique(low * len(points) + high, return_inverse=True)
+        edges, edge = np.stack(np.divmod(keys, len(points)), 1), edge.reshape(-1, 3)
+        length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+        rank = np.argsort(np.argsort(length, kind="stable"), kind="stable")  # no two are equal
+        side = rank[edge].argmax(1)
+        chosen = np.take_along_axis(edge, side[:, None], 1)[:, 0]
+        halved = (length > longest) & (np.bincount(chosen, minlength=len(edges)) == np.bincount(edge.ravel()))
+        if not halved.any():
+            return torch.from_numpy(points.astype(np.float32)), torch.from_numpy(triangles)
+        middle = len(points) + np.cumsum(halved) - 1
+        points = np.concatenate([points, points[edges[halved]].mean(1)])
+        rows = np.flatnonzero(halved[chosen])
+        a, b, c = (triangles[rows, (side[rows] + k) % 3] for k in range(3))
+        m = middle[chosen[rows]]
+        triangles = np.delete(triangles, rows, 0)
+        triangles = np.concatenate([triangles, np.stack([a, m, c], 1), np.stack([m, b, c], 1)])
+
+
+def sharpen(surface: Surface, angle_deg: float = 40.0) -> Surface:
+    """The surface with vertices doubled along edges of larger angles, so that normals there are not averaged."""
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    smooth = mesh.face_adjacency[mesh.face_adjacency_angles < math.radians(angle_deg)]
+    links = coo_array((np.ones(len(smooth)), smooth.T), 2 * [len(mesh.faces)])
+    patch = connected_components(links, directed=False)[1]
+    corners = np.stack([mesh.faces.ravel(), np.repeat(patch, 3)], 1)
+    kept, faces = np.unique(corners, axis=0, return_inverse=True)
+    rows = torch.from_numpy(kept[:, 0].astype(np.int64))
+    colors = None if surface.colors is None else surface.colors[rows]
+    return Surface(surface.vertices[rows], torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)), colors)
 
 
 def joined(faces: np.ndarray, count: int) -> coo_array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from learn3d.files import npz, sandbox
 from learn3d.files.geometry import EXTENSIONS, RawMesh, read_mesh
-from learn3d.make_data.shapes import CATEGORIES, make_shape
+from learn3d.shapes import CATEGORIES, numbered_shape
 
 MAX_FACES = 1_000_000
 Source = Callable[[], RawMesh]  # reads one mesh, or raises ValueError if its file is damaged; can be pickled
@@ -50,7 +50,7 @@ def procedural_sources(category: str, count: int, seed: int) -> dict[str, Source
 
 
 def _procedural(category: str, seed: int, number: int) -> RawMesh:
-    shape = make_shape(category, np.random.default_rng([seed, 0, number]))
+    shape = numbered_shape(category, seed, number)
     return RawMesh(shape.vertices, shape.faces)
 
 

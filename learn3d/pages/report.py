@@ -50,7 +50,7 @@ def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, A
     if batch.voxels is not None:
         grids = dataset.convention.to_object(batch.voxels).float()
         surfaces = [grid_surface(grid, box=dataset.convention.cube_side) for grid in grids]
-        shapes.append([Surface(*smooth(s.vertices, s.faces, levels=0)) if len(s.faces) else s for s in surfaces])
+        shapes.append([Surface(smooth(s.vertices, s.faces), s.faces) if len(s.faces) else s for s in surfaces])
     pictures = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     oblique = LookAtPoses(torch.full((len(samples),), -30.0), 20.0, 1.0, 15.0)
     cameras = eyes(batch.poses or oblique).numpy() @ _TO_PAGE

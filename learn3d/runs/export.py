@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from learn3d.fitting.familiarity import KNOWN_CODES, known_codes
+from learn3d.fitting.templates import TEMPLATES, learn_templates
 from learn3d.methods import MeshMethod
 from learn3d.methods.many_views import ManyViewsSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
@@ -23,7 +24,8 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
 
     The file is a checkpoint for `evaluate` and `reconstruct`, without the paths of the run. If the training data are
     still there, it also holds known codes (`learn3d.fitting.familiarity`), with which reconstruction warns of unknown
-    kinds of objects. others: stored images uint8 [M, 4, S, S] of other objects, which improve these warnings.
+    kinds of objects, and templates (`learn3d.fitting.templates`) if they have generated shapes. others: stored images
+    uint8 [M, 4, S, S] of other objects, which improve these warnings.
     Raises ValueError for methods other than proposed, Vanilla-AE, Plus and Many views.
     """
     method, config, metadata = checkpoint.load_method(source, which)
@@ -43,7 +45,9 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
     if not trained_on.data.is_dir():
         note(f"note: {trained_on.data} is not there, so the file has no known codes, and reconstruction will not warn")
     elif isinstance(method, MeshMethod):
-        known = known_codes(method, checkpoint.load_data(trained_on, "train"), others)
-        tensors |= {name: codes.half() for name, codes in zip(KNOWN_CODES, known, strict=True) if codes is not None}
+        dataset = checkpoint.load_data(trained_on, "train")
+        known, templates = known_codes(method, dataset, others), learn_templates(method, dataset) or ()
+        found = dict(zip(KNOWN_CODES, known, strict=True)) | dict(zip(TEMPLATES, templates, strict=False))
+        tensors |= {k: v.half() if v.is_floating_point() else v for k, v in found.items() if v is not None}
     checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config))
     return target.stat().st_size

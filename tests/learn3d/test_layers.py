@@ -27,7 +27,7 @@ FLOORS = (
     {"networks", "losses"},
     {"pictures"},
     {"data"},
-    {"device", "settings"},
+    {"device", "settings", "shapes"},
     {"files"},
     {"terminal"},
 )

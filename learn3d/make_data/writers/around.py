@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 import nmr
 from learn3d.data.dataset import ViewDataset, depth_levels
@@ -16,7 +13,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers.around import BINS, PROPERTIES
 from learn3d.make_data.writers.kato import KatoWriter
 from learn3d.make_data.writers.writer import RenderedObject, Writer, distances, uniform
-from learn3d.pictures.studio import studio_lights
+from learn3d.pictures.studio import natural_look
 
 ELEVATIONS_DEG = (-10.0, 60.0)
 HALF_FOVS_DEG = (7.0, 20.0)
@@ -70,30 +67,6 @@ class AroundWriter(Writer):
             convention=PROPERTIES.convention,
             inverted=PROPERTIES.inverted,
         )
-
-
-def natural_look(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, nmr.Lights]:
-    """Random colours [F, 3] and lights for a mesh [V, 3], [F, 3].
-
-    Connected parts with the same number of faces get the same colour out of three. The light comes from any side.
-    """
-    joined = coo_array((np.ones(len(faces) * 2), (faces[:, :2].ravel(), faces[:, 1:].ravel())), 2 * [len(vertices)])
-    part = connected_components(joined, directed=False)[1][faces[:, 0]]
-    kinds = np.unique(np.bincount(part)[part], return_inverse=True)[1]
-    palette = np.array([_material(rng) for _ in range(3)])
-    colors = palette[rng.choice(3, size=kinds.max() + 1, p=(0.6, 0.25, 0.15))][kinds]
-    side, height = rng.normal(size=2), rng.uniform(0.3, 1.5)
-    return colors, studio_lights((side[0], height, side[1]), rng.uniform(0.35, 0.7))
-
-
-def _material(rng: np.random.Generator) -> tuple[float, float, float]:
-    """A random colour of wood, of paint or cloth, or a grey."""
-    kind = rng.choice(3, p=(0.25, 0.4, 0.35))
-    if kind == 0:
-        return colorsys.hsv_to_rgb(rng.uniform(0.05, 0.11), rng.uniform(0.3, 0.75), rng.uniform(0.2, 0.85))
-    if kind == 1:
-        return colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.2, 0.9), rng.uniform(0.2, 0.95))
-    return colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.0, 0.08), rng.uniform(0.05, 0.98))
 
 
 def _depth(item: RenderedObject) -> np.ndarray:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from vectors import load_vector
 
 from learn3d import device as precision_module
-from learn3d.device import autocast, resolve_precision
+from learn3d.device import resolve_precision
 from learn3d.methods import DatasetInfo, Method, create_method
 from learn3d.networks import ENCODERS, GENERATORS, PoseDiscriminator, create_encoder, network_input
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
@@ -288,17 +288,6 @@ def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, flags: str, wante
     assert resolve_precision("fp32", "cpu") == "fp32"
     monkeypatch.setattr(precision_module, "CPUINFO", str(tmp_path / "missing"))
     assert resolve_precision("auto", "cpu") == "fp32"
-
-
-def test_bf16_changes_results_little() -> None:
-    networks = create("peng2020-kato-vanilla").networks
-    images = torch.rand(1, 4, 64, 64)
-    with torch.no_grad():
-        exact = networks["generator"](networks["encoder"](images))
-        with autocast("cpu", "bf16"):
-            rough = networks["generator"](networks["encoder"](images))
-    assert rough.dtype == torch.float32
-    assert 0 < (rough - exact).abs().max() < 0.005
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

@@ -11,8 +11,8 @@ import trimesh
 from scipy import ndimage
 
 import nmr
-from learn3d.make_data.shapes import CATEGORIES, make_shape, parts
-from learn3d.make_data.shapes.parts import Part, assemble, bar, box, rectangle
+from learn3d.shapes import CATEGORIES, make_shape, parts
+from learn3d.shapes.parts import Part, assemble, bar, box, rectangle
 
 every_category = pytest.mark.parametrize("category", CATEGORIES)
 

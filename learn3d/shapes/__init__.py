@@ -33,3 +33,8 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
         raise ValueError(f"category must be one of {', '.join(CATEGORIES)}; got {category!r}")
     draw = Draw(rng)
     return assemble(draw.pick(_RECIPES[category])(draw))
+
+
+def numbered_shape(category: str, seed: int, number: int) -> trimesh.Trimesh:
+    """Shape `number` of a data set of generated shapes with this seed; see `make_shape`."""
+    return make_shape(category, np.random.default_rng([seed, 0, number]))

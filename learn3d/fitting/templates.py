@@ -1,0 +1,185 @@
+"""Templates: generated shapes, of which the one that explains a picture best is bent until it has its outline.
+
+A template has the thin legs, gaps and straight edges that a deformed sphere cannot have. A model knows the codes of its
+templates; the shapes themselves are made again from their numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+import nmr
+from learn3d.data.conventions import mesh_to_object
+from learn3d.data.dataset import ViewDataset
+from learn3d.fitting.camera import View, belief, minimize
+from learn3d.fitting.fit import Fit, Prediction, Progress
+from learn3d.methods import MeshMethod
+from learn3d.shapes import CATEGORIES, numbered_shape
+
+SEED = 0  # of the data set that the templates are from
+COUNT = 1000  # templates of each category
+AXES = 24  # principal axes of the codes that are kept
+CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
+KEPT = 16  # best of them, which are stretched
+VOXELS, NEARNESS = 0.5, 0.5  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
+STRETCHING, STRETCH_STEPS = 1.0, 30
+LATTICE, BENDING, BENDING_STEPS = 4, 1.5, 40
+TEMPLATES = "template_numbers", "template_codes", "template_axes"  # names of the tensors in a checkpoint
+
+
+class Templates(NamedTuple):
+    """Codes of generated shapes, reduced to their principal axes."""
+
+    numbers: Tensor  # int32 [N, M]: numbers of M shapes of each of N categories
+    codes: Tensor  # float [N, M, K]
+    axes: Tensor  # float [K + 1, C]: the mean of all codes, and K axes
+
+    def nearest(self, code: Tensor, categories: Sequence[str]) -> tuple[list[tuple[str, int]], Tensor]:
+        """Category and number of the `CANDIDATES` shapes with codes nearest to a code [C], and their cosines to it."""
+        mean, *axes = self.axes.float()
+        place = torch.stack(axes) @ (F.normalize(code, dim=0) - mean)
+        cosines = 1 - (self.codes.float().flatten(0, 1) - place).square().sum(1) / 2
+        best = cosines.topk(min(CANDIDATES, len(cosines)))
+        count = self.numbers.shape[1]
+        names = [(categories[row // count], int(self.numbers.flatten()[row])) for row in best.indices.tolist()]
+        return names, best.values
+
+
+def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | None:
+    """The templates of a training set. None if it has a category without generated shapes.
+
+    A generated shape is recognised by its name and by its voxels.
+    """
+    categories = [name.strip() for name in dataset.category.split(",")]
+    first = np.unique(np.asarray(dataset.object_ids), return_index=True)[1]  # an image of each object
+    found: list[list[tuple[int, int]]] = [[] for _ in categories]  # number and object of each shape
+    for thing, name in enumerate(dataset.object_names):
+        kind = 0 if dataset.class_ids is None else int(dataset.class_ids[thing])
+        match = re.fullmatch(rf"{categories[kind]}_(\d+)", name)
+        if match and dataset.voxels is not None and categories[kind] in CATEGORIES and len(found[kind]) < COUNT:
+            number = int(match[1])
+            vertices, faces = template(categories[kind], number)
+            voxels = dataset.batch(torch.from_numpy(first[thing : thing + 1])).voxels
+            if nmr.metrics.voxel_iou(dataset.voxelize(vertices[None], faces), voxels) > 0.98:
+                found[kind].append((number, thing))
+    count = min(map(len, found))
+    if not count:
+        return None
+    rows = torch.tensor([shapes[:count] for shapes in found])  # [N, M, 2]
+    codes = torch.stack([_mean_code(method, dataset, int(thing)) for thing in rows[..., 1].flatten()])
+    mean = codes.mean(0)
+    axes = torch.linalg.svd(codes - mean, full_matrices=False).Vh[:AXES]
+    return Templates(
+        rows[..., 0].int(), ((codes - mean) @ axes.T).view(*rows.shape[:2], -1), torch.cat([mean[None], axes])
+    )
+
+
+@torch.no_grad()
+def _mean_code(method: MeshMethod, dataset: ViewDataset, thing: int) -> Tensor:
+    views = torch.from_numpy(np.flatnonzero(np.asarray(dataset.object_ids) == thing))
+    codes = method.encode(dataset.batch(views, voxels=False).images).float().cpu()
+    return F.normalize(F.normalize(codes, dim=1).mean(0), dim=0)
+
+
+def template(category: str, number: int) -> tuple[Tensor, Tensor]:
+    """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame."""
+    shape = numbered_shape(category, SEED, number)
+    vertices = np.asarray(shape.vertices) @ mesh_to_object("y", "z").T
+    return torch.tensor(vertices, dtype=torch.float32), torch.tensor(np.asarray(shape.faces), dtype=torch.int64)
+
+
+@torch.no_grad()
+def fit_template(
+    method: MeshMethod,
+    templates: Templates,
+    categories: Sequence[str],
+    predicted: Prediction,
+    mask: Tensor,
+    progress: Progress,
+) -> tuple[Fit, str]:
+    """Fit a template to a framed mask float32 [64, 64]; also returns its category.
+
+    Candidates are ranked by their outline in the predicted view, their voxel IoU with the predicted shape and the
+    cosine of the codes. The best are stretched along the three axes, and the best of these is bent.
+    """
+    progress("shape", 0.3)
+    names, nearness = templates.nearest(predicted.code[0], categories)
+    shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
+    voxels = torch.cat([_voxels(shape, face) for shape, face in zip(shapes, faces, strict=True)])
+    alike = nmr.metrics.voxel_iou(voxels, _voxels(predicted.vertices[0], method.faces).expand_as(voxels))
+    prior = VOXELS * alike.float() + NEARNESS * nearness
+    views = predicted.view.select(torch.zeros(len(shapes), dtype=torch.int64))
+    best = (views.ious(shapes, faces, mask) + prior).topk(min(KEPT, len(shapes))).indices
+    shapes, faces, prior = [shapes[i] for i in best], [faces[i] for i in best], prior[best]
+    progress("stretch", 0.5)
+    views, shapes, cost = _stretch(views.select(best), shapes, faces, mask)
+    scores = views.ious(shapes, faces, mask) + belief(views.azimuth_deg, predicted.azimuths) + prior - cost
+    one = int(scores.argmax())
+    progress("surface", 0.8)
+    view, vertices = _bend(
+        views.select(torch.tensor([one])), shapes[one], faces[one], mask, method.generator.reflection
+    )
+    size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
+    view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * view.shift)
+    vertices = size * vertices
+    iou = float(view.ious(vertices[None], faces[one], mask))
+    return Fit(vertices, faces[one], view, iou), names[int(best[one])][0]
+
+
+def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
+    return nmr.voxelize(0.998 * vertices[None].clamp(-0.5, 0.5) + 0.5, faces)
+
+
+def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> tuple[View, list[Tensor], Tensor]:
+    """Views and shapes with fitted factors along the three axes, and the cost [N] of factors that are not equal."""
+    parameters = views.parameters()
+    logs = torch.zeros(len(shapes), 3).requires_grad_()
+
+    def stretched() -> list[Tensor]:
+        return [shape * factor for shape, factor in zip(shapes, logs.exp(), strict=True)]
+
+    def costs() -> Tensor:
+        return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
+
+    def loss() -> Tensor:
+        ious = View.from_parameters(parameters).ious(stretched(), faces, mask)
+        return (costs() + 0.1 * logs.square().sum(1) - ious).sum()
+
+    minimize(loss, [{"params": [*parameters, logs], "lr": 0.02}], STRETCH_STEPS)
+    return View.from_parameters(parameters), stretched(), costs()
+
+
+def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor, reflection: Tensor | None) -> tuple[View, Tensor]:
+    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them."""
+    low, high = vertices.amin(0), vertices.amax(0)
+    place = (vertices - low) / (high - low).clamp(min=1e-3)
+    x, y, z = (
+        torch.stack([math.comb(LATTICE - 1, k) * t**k * (1 - t) ** (LATTICE - 1 - k) for k in range(LATTICE)], 1)
+        for t in place.unbind(1)
+    )
+    weights = torch.einsum("va,vb,vc->vabc", x, y, z)
+    lattice, parameters = torch.zeros(LATTICE, LATTICE, LATTICE, 3).requires_grad_(), view.parameters()
+
+    def moves() -> Tensor:
+        if reflection is None:
+            return lattice
+        axis = int(reflection.diagonal().argmin())
+        return (lattice + lattice.flip(axis) @ reflection.T) / 2
+
+    def bent() -> Tensor:
+        return vertices + torch.einsum("vabc,abcd->vd", weights, moves())
+
+    def loss() -> Tensor:
+        rough = sum(moves().diff(dim=axis).square().sum() for axis in range(3)) + 0.1 * moves().square().sum()
+        return BENDING * rough - View.from_parameters(parameters).ious(bent()[None], faces, mask).sum()
+
+    minimize(loss, [{"params": [lattice], "lr": 0.01}, {"params": parameters, "lr": 0.005}], BENDING_STEPS)
+    return View.from_parameters(parameters), bent()
