@@ -239,7 +239,7 @@ class Reconstruction(NamedTuple):
     stored: np.ndarray  # uint8 [4, S, S]: the input of the network
     azimuth_deg: float  # estimated azimuth of the picture's camera
     silhouette_iou: float | None  # IoU of the fitted shape's silhouette and the mask; None without a fit
-    kind: str | None  # predicted category; None without a fit, or if the model has one category
+    kind: str | None  # predicted category; None without a fit, or without templates if the model has one category
     warning: str | None  # a reason to doubt the shape; None without a fit
 
 

@@ -57,7 +57,8 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
                 kind = found[1]
             outlines, voxels = np.zeros(3), np.zeros(3)
             for column, shape in enumerate(shapes):
-                grid = dataset.voxelize(torch.from_numpy(fit_to_box(shape.vertices.numpy()))[None] * 0.998, shape.faces)
+                vertices = fit_to_box(shape.vertices.numpy()) if column == 2 else shape.vertices.numpy()
+                grid = dataset.voxelize(torch.from_numpy(vertices)[None].clamp(-0.499, 0.499), shape.faces)
                 outlines[column], voxels[column] = shape.iou, float(nmr.metrics.voxel_iou(grid, batch.voxels))
             error_deg = wrap_deg(shapes[-1].view.azimuth_deg - azimuths_deg(batch.poses))
             right = float(error_deg.abs()) < 20, kind == name, warning is not None

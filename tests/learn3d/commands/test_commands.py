@@ -220,7 +220,7 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
 
 def test_the_fit_of_pictures_is_measured(tiny_folder, capsys) -> None:
     runpy.run_path(str(TOOLS / "measure_fit.py"))["main"](tiny_folder, "airplane", images=2)
-    assert len(capsys.readouterr().out.splitlines()[1].split()) == 8
+    assert len(capsys.readouterr().out.splitlines()[1].split()) == 10
 
 
 def test_interrupting_the_command_saves_and_says_so(tiny_folder, run_folder) -> None:
