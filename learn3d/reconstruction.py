@@ -37,7 +37,7 @@ from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.fitting.fit import Progress, fit, predict
 from learn3d.fitting.smoothing import divide, outer_surface, sharpen
-from learn3d.fitting.templates import TEMPLATES, Templates, fit_template
+from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.refinement import refine
 from learn3d.networks.encoders import CENTRED_SIZE, centre
@@ -276,12 +276,12 @@ def reconstruct_picture(
     predicted = predict(method, image, mask)
     if model.templates is not None and warning is None:
         fitted, kind = fit_template(method, model.templates, model.categories, predicted, mask, report)
-        mesh = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE)
+        mesh, mirror = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), MIRROR
     else:
         fitted = fit(method, predicted, mask, report)
-        mesh = outer_surface(fitted.vertices, fitted.faces)
-    surface = color_mesh(*mesh, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], method.generator.reflection)
-    report("done", 1.0)
+        mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
+    report("colours", 0.9)
+    surface = color_mesh(*mesh, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], mirror)
     return Reconstruction(sharpen(surface), stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
 
 

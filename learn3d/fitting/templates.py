@@ -32,6 +32,7 @@ KEPT = 16  # best of them, which are stretched
 VOXELS, NEARNESS = 0.5, 0.5  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
 STRETCHING, STRETCH_STEPS = 1.0, 30
 LATTICE, BENDING, BENDING_STEPS = 4, 1.5, 40
+MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))  # maps most generated shapes to themselves, in the object frame
 TEMPLATES = "template_numbers", "template_codes", "template_axes"  # names of the tensors in a checkpoint
 
 
@@ -124,9 +125,7 @@ def fit_template(
     scores = views.ious(shapes, faces, mask) + belief(views.azimuth_deg, predicted.azimuths) + prior - cost
     one = int(scores.argmax())
     progress("surface", 0.8)
-    view, vertices = _bend(
-        views.select(torch.tensor([one])), shapes[one], faces[one], mask, method.generator.reflection
-    )
+    view, vertices = _bend(views.select(torch.tensor([one])), shapes[one], faces[one], mask)
     size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
     view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * view.shift)
     vertices = size * vertices
@@ -157,7 +156,7 @@ def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tenso
     return View.from_parameters(parameters), stretched(), costs()
 
 
-def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor, reflection: Tensor | None) -> tuple[View, Tensor]:
+def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[View, Tensor]:
     """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them."""
     low, high = vertices.amin(0), vertices.amax(0)
     place = (vertices - low) / (high - low).clamp(min=1e-3)
@@ -169,10 +168,7 @@ def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor, reflection:
     lattice, parameters = torch.zeros(LATTICE, LATTICE, LATTICE, 3).requires_grad_(), view.parameters()
 
     def moves() -> Tensor:
-        if reflection is None:
-            return lattice
-        axis = int(reflection.diagonal().argmin())
-        return (lattice + lattice.flip(axis) @ reflection.T) / 2
+        return (lattice + lattice.flip(0) @ MIRROR) / 2
 
     def bent() -> Tensor:
         return vertices + torch.einsum("vabc,abcd->vd", weights, moves())

@@ -3,7 +3,10 @@
 
 const $ = (id) => document.getElementById(id);
 const picture = $("picture");
-const WORDS = { camera: "Finding the camera …", shape: "Fitting the shape …", surface: "Fitting the surface …", done: "Adding the colours …" };
+const WORDS = {
+  camera: "Finding the camera …", shape: "Finding the shape …", stretch: "Stretching the shape …",
+  surface: "Bending the shape to the outline …", colours: "Adding the colours …",
+};
 const HINT = "Outline wrong? Correct it on the picture:";
 const HINTS = {
   box: "Drag a box around the object.",
