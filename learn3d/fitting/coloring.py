@@ -18,7 +18,8 @@ from learn3d.pictures.surfaces import Surface
 DEPTH_SIZE = 256  # side of the depth map that decides which vertices are visible
 BEHIND = 0.02  # distance behind the depth map from which a vertex is hidden, in units of the object frame
 GRAZING = 0.25  # cosine between normal and line of sight below which a colour is not used
-BORDER = 2  # width in pixels of the border inside the outline that may have the background's colours
+BORDER = 2  # width in pixels of the border inside the outline that may have the background's colours; its inner
+# pixels count half, as thin legs have no others
 
 
 def color_mesh(
@@ -52,7 +53,7 @@ class _Picture:
         self.depth = nmr.render_depth(placed, faces, self.camera, image_size=DEPTH_SIZE, anti_aliasing=False)[None]
         self.pixels = torch.from_numpy(colors.astype(np.float32) / 255).permute(2, 0, 1)[None]
         inside = torch.from_numpy((mask > 127).astype(np.float32))[None, None]
-        self.trusted = 1 - F.max_pool2d(1 - inside, 2 * BORDER + 1, 1, BORDER)
+        self.trusted = sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in (1, BORDER)) / 2
 
     def look_up(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Colours [N, 3] in [0, 1] at points of the surface, and their reliability [N] in [0, 1]."""
