@@ -274,15 +274,17 @@ def reconstruct_picture(
     report("camera", 0.0)
     kind, warning = recognize(model, image)
     predicted = predict(method, image, mask)
-    if model.templates is not None and warning is None:
-        fitted, kind = fit_template(method, model.templates, model.categories, predicted, mask, report)
+    templates = model.templates if warning is None else None
+    if templates is not None:
+        fitted, kind = fit_template(method, templates, model.categories, predicted, mask, report)
         mesh, mirror = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), MIRROR
     else:
         fitted = fit(method, predicted, mask, report)
         mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
     report("colours", 0.9)
     surface = color_mesh(*mesh, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], mirror)
-    return Reconstruction(sharpen(surface), stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
+    surface = surface if templates is None else sharpen(surface)
+    return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
 
 
 def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
