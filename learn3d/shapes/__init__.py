@@ -36,5 +36,9 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def numbered_shape(category: str, seed: int, number: int) -> trimesh.Trimesh:
-    """Shape `number` of a data set of generated shapes with this seed; see `make_shape`."""
+    """Shape `number` of a data set of generated shapes with this seed; see `make_shape`.
+
+    Exported models know shapes by their numbers (`learn3d.fitting.templates`): after a change of recipes, train and
+    export the package's model again.
+    """
     return make_shape(category, np.random.default_rng([seed, 0, number]))
