@@ -94,7 +94,8 @@ def template(category: str, number: int) -> tuple[Tensor, Tensor]:
     """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame."""
     shape = numbered_shape(category, SEED, number)
     vertices = np.asarray(shape.vertices) @ mesh_to_object("y", "z").T
-    return torch.tensor(vertices, dtype=torch.float32), torch.tensor(np.asarray(shape.faces), dtype=torch.int64)
+    faces = np.asarray(shape.faces)[:, ::-1].copy()  # the reflection of the frame turns them inside out
+    return torch.tensor(vertices, dtype=torch.float32), torch.from_numpy(faces.astype(np.int64))
 
 
 @torch.no_grad()

@@ -33,7 +33,8 @@ def picture(category: str, number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bodies(surface: Surface) -> int:
-    return trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy()).body_count  # it merges equal vertices
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())  # it merges equal vertices
+    return mesh.body_count if mesh.volume > 0 else 0  # below 0: it is inside out
 
 
 def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model) -> None:
