@@ -35,7 +35,7 @@ from learn3d.fitting.camera import belief
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.fitting.fit import Progress, fit, predict
+from learn3d.fitting.fit import Progress, fit, predict, silent
 from learn3d.fitting.smoothing import divide, outer_surface, sharpen
 from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.methods import MeshMethod, Method
@@ -136,6 +136,8 @@ def reconstruct_files(
         made.append(reconstruct_picture(model, *photo, crop=crop, refined=refined))
         if made[-1].warning:
             note(f"warning: {name}: {made[-1].warning}")
+        elif made[-1].kind:
+            note(f"{name}: taken for: {made[-1].kind}")
     stored, azimuths = np.stack([each.stored for each in made]), [each.azimuth_deg for each in made]
     return save(folder, names, model, stored, [each.surface for each in made], azimuths, mesh_format=mesh_format)
 
@@ -250,7 +252,7 @@ def reconstruct_picture(
     *,
     crop: bool = True,
     refined: bool = True,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Reconstruction:
     """Reconstruct a picture uint8 [H, W, 3] with its mask uint8 [H, W]; its camera is unknown.
 
@@ -270,18 +272,18 @@ def reconstruct_picture(
     small = nn.functional.interpolate(
         torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
     )
-    mask, report = small[0, 0], progress or (lambda text, part: None)
-    report("camera", 0.0)
+    mask = small[0, 0]
+    progress("camera", 0.0)
     kind, warning = recognize(model, image)
     predicted = predict(method, image, mask)
     templates = model.templates if warning is None else None
     if templates is not None:
-        fitted, kind = fit_template(method, templates, model.categories, predicted, mask, report)
+        fitted, kind = fit_template(method, templates, model.categories, predicted, mask, progress)
         mesh, mirror = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), MIRROR
     else:
-        fitted = fit(method, predicted, mask, report)
+        fitted = fit(method, predicted, mask, progress)
         mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
-    report("colours", 0.9)
+    progress("colours", 0.9)
     surface = color_mesh(*mesh, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], mirror)
     surface = surface if templates is None else sharpen(surface)
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)

@@ -19,17 +19,7 @@ from learn3d.networks.encoders import centre
 from learn3d.pictures.surfaces import azimuths_deg
 from learn3d.reconstruction import load_model, recognize
 
-COLUMNS = (
-    "outline predicted",
-    "fitted",
-    "template",
-    "voxels predicted",
-    "fitted",
-    "template",
-    "azimuth",
-    "kind",
-    "warned",
-)
+COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,azimuth,kind,warned".split(",")
 
 
 def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = None, images: int = 20) -> None:
@@ -49,10 +39,10 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
             (image,), mask = batch.images, centre(batch.masks[:, None])[0, 0]
             predicted = predict(model.method, image, mask)
             shapes = [Fit(predicted.vertices[0], model.method.faces, predicted.view, predicted.iou)]
-            shapes.append(fit(model.method, predicted, mask, _quiet))
+            shapes.append(fit(model.method, predicted, mask))
             kind, warning = recognize(model, image)
             if model.templates is not None:
-                found = fit_template(model.method, model.templates, model.categories, predicted, mask, _quiet)
+                found = fit_template(model.method, model.templates, model.categories, predicted, mask)
                 shapes.append(found[0])
                 kind = found[1]
             outlines, voxels = np.zeros(3), np.zeros(3)
@@ -64,10 +54,6 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
             right = float(error_deg.abs()) < 20, kind == name, warning is not None
             rows.append((*outlines, *voxels, *right))
         print(f"{name:12}", *(f"{value:20.3f}" for value in np.mean(rows, axis=0)), flush=True)
-
-
-def _quiet(text: str, part: float) -> None:
-    """Reports no progress."""
 
 
 if __name__ == "__main__":

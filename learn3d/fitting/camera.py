@@ -1,4 +1,4 @@
-"""The camera of a framed picture: the view from which the silhouette of a shape fits its mask best.
+"""Finds the camera of a framed picture: the view in which the silhouette of a shape fits the mask best.
 
 A picture is framed if the bounding box of its mask is centred and its object size is `CENTRED_SIZE`.
 """
@@ -107,7 +107,7 @@ def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> 
 def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None) -> tuple[View, float]:
     """The view at which the silhouette of a shape [V, 3], [F, 3] fits a framed mask [64, 64] best, and their IoU.
 
-    probabilities: float32 [AZIMUTHS], the probability of each azimuth cell from -180 degrees on; None: uniform.
+    probabilities: float32 [AZIMUTHS], the probability of each azimuth cell from -180 degrees on, if it is known.
     """
     view = _fit_camera(_search(vertices[None], faces, mask, probabilities), vertices, faces, mask)
     ious = view.ious(vertices[None], faces, mask)
@@ -141,7 +141,7 @@ def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
 
 @torch.enable_grad()
 def minimize(loss: Callable[[], Tensor], groups: list[dict], steps: int) -> None:
-    """Minimise a loss by Adam in variables (groups of `torch.optim.Adam`); the rates fall to a tenth."""
+    """Minimise a loss with Adam. groups: variables and their learning rates, which fall to a tenth in the end."""
     optimizer = torch.optim.Adam(groups)
     full = [group["lr"] for group in groups]
     for step in range(steps):

@@ -74,11 +74,11 @@ def _sample(image: Tensor, grid: Tensor) -> Tensor:
 def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
     """Spread colours [V, 3] from vertices [V, 3] with a high weight [V] to the others as smoothly as possible.
 
-    The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2 + 1e-5 sum_v |c_v - near_v|^2;
-    near_v is the colour of the nearest vertex that is clearly seen, for parts of which nothing is.
+    The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2 + 1e-5 sum_v |c_v - near_v|^2.
+    near_v is the colour of the nearest vertex that is clearly seen. It matters for hidden parts that no edge joins to a
+    seen one.
     """
-    clear = weight > min(0.5, float(weight.max()))
-    clear = clear if clear.any() else torch.ones_like(clear)
+    clear = weight >= min(0.5, float(weight.max()))
     nearest = cKDTree(vertices[clear].numpy()).query(vertices.numpy())[1]
     given, near = weight.double().numpy()[:, None] ** 2, colors[clear].double().numpy()[nearest]
     neighbours = joined(faces.numpy(), len(colors))

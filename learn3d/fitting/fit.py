@@ -21,6 +21,10 @@ STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
 Progress = Callable[[str, float], None]  # called with the name of each stage and the share (0 .. 1) that is done
 
 
+def silent(stage: str, done: float) -> None:
+    """A `Progress` that reports nothing."""
+
+
 class Prediction(NamedTuple):
     """What a method predicts for a picture, and the view at which the shape fits its mask best."""
 
@@ -54,7 +58,7 @@ def predict(method: MeshMethod, image: Tensor, mask: Tensor) -> Prediction:
 
 
 @torch.no_grad()
-def fit(method: MeshMethod, predicted: Prediction, mask: Tensor, progress: Progress) -> Fit:
+def fit(method: MeshMethod, predicted: Prediction, mask: Tensor, progress: Progress = silent) -> Fit:
     """Fit a predicted shape to its framed mask float32 [64, 64]."""
     progress("shape", 0.3)
     view, vertices = _fit_code(predicted, method, mask)

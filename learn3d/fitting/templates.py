@@ -20,18 +20,18 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import ViewDataset
 from learn3d.fitting.camera import View, belief, minimize
-from learn3d.fitting.fit import Fit, Prediction, Progress
+from learn3d.fitting.fit import Fit, Prediction, Progress, silent
 from learn3d.methods import MeshMethod
 from learn3d.shapes import CATEGORIES, numbered_shape
 
-SEED = 0  # of the data set that the templates are from
+SEED = 0  # of the data set with the templates; shapes of other seeds are no templates
 COUNT = 1000  # templates of each category
 AXES = 24  # principal axes of the codes that are kept
 CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
 KEPT = 16  # best of them, which are stretched
 VOXELS, NEARNESS = 0.5, 0.5  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
-STRETCHING, STRETCH_STEPS = 1.0, 30
-LATTICE, BENDING, BENDING_STEPS = 4, 1.5, 40
+STRETCHING, STRETCH_STEPS = 1.0, 30  # weight of unequal factors along the axes, steps
+LATTICE, BENDING, BENDING_STEPS = 4, 1.5, 40  # points of the lattice along each axis, weight of their moves, steps
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))  # maps most generated shapes to themselves, in the object frame
 TEMPLATES = "template_numbers", "template_codes", "template_axes"  # names of the tensors in a checkpoint
 
@@ -44,7 +44,7 @@ class Templates(NamedTuple):
     axes: Tensor  # float [K + 1, C]: the mean of all codes, and K axes
 
     def nearest(self, code: Tensor, categories: Sequence[str]) -> tuple[list[tuple[str, int]], Tensor]:
-        """Category and number of the `CANDIDATES` shapes with codes nearest to a code [C], and their cosines to it."""
+        """The `CANDIDATES` shapes with codes nearest to a code [C]: category and number, and the cosine of the codes."""
         mean, *axes = self.axes.float()
         place = torch.stack(axes) @ (F.normalize(code, dim=0) - mean)
         cosines = 1 - (self.codes.float().flatten(0, 1) - place).square().sum(1) / 2
@@ -55,27 +55,27 @@ class Templates(NamedTuple):
 
 
 def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | None:
-    """The templates of a training set. None if it has a category without generated shapes.
+    """The templates of a training set; None if one of its categories has none.
 
-    A generated shape is recognised by its name and by its voxels.
+    They are the generated shapes (`make-dataset --procedural`) of seed `SEED`, known by their names and voxels.
     """
     categories = [name.strip() for name in dataset.category.split(",")]
     first = np.unique(np.asarray(dataset.object_ids), return_index=True)[1]  # an image of each object
     found: list[list[tuple[int, int]]] = [[] for _ in categories]  # number and object of each shape
-    for thing, name in enumerate(dataset.object_names):
-        kind = 0 if dataset.class_ids is None else int(dataset.class_ids[thing])
+    for item, name in enumerate(dataset.object_names):
+        kind = 0 if dataset.class_ids is None else int(dataset.class_ids[item])
         match = re.fullmatch(rf"{categories[kind]}_(\d+)", name)
         if match and dataset.voxels is not None and categories[kind] in CATEGORIES and len(found[kind]) < COUNT:
             number = int(match[1])
             vertices, faces = template(categories[kind], number)
-            voxels = dataset.batch(torch.from_numpy(first[thing : thing + 1])).voxels
+            voxels = dataset.batch(torch.from_numpy(first[item : item + 1])).voxels
             if nmr.metrics.voxel_iou(dataset.voxelize(vertices[None], faces), voxels) > 0.98:
-                found[kind].append((number, thing))
+                found[kind].append((number, item))
     count = min(map(len, found))
     if not count:
         return None
     rows = torch.tensor([shapes[:count] for shapes in found])  # [N, M, 2]
-    codes = torch.stack([_mean_code(method, dataset, int(thing)) for thing in rows[..., 1].flatten()])
+    codes = torch.stack([_mean_code(method, dataset, int(item)) for item in rows[..., 1].flatten()])
     mean = codes.mean(0)
     axes = torch.linalg.svd(codes - mean, full_matrices=False).Vh[:AXES]
     return Templates(
@@ -84,8 +84,8 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
 
 
 @torch.no_grad()
-def _mean_code(method: MeshMethod, dataset: ViewDataset, thing: int) -> Tensor:
-    views = torch.from_numpy(np.flatnonzero(np.asarray(dataset.object_ids) == thing))
+def _mean_code(method: MeshMethod, dataset: ViewDataset, item: int) -> Tensor:
+    views = torch.from_numpy(np.flatnonzero(np.asarray(dataset.object_ids) == item))
     codes = method.encode(dataset.batch(views, voxels=False).images).float().cpu()
     return F.normalize(F.normalize(codes, dim=1).mean(0), dim=0)
 
@@ -105,12 +105,12 @@ def fit_template(
     categories: Sequence[str],
     predicted: Prediction,
     mask: Tensor,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> tuple[Fit, str]:
     """Fit a template to a framed mask float32 [64, 64]; also returns its category.
 
-    Candidates are ranked by their outline in the predicted view, their voxel IoU with the predicted shape and the
-    cosine of the codes. The best are stretched along the three axes, and the best of these is bent.
+    Three numbers rank a candidate: the IoU of its outline in the predicted view, its voxel IoU with the predicted
+    shape, and the cosine of the two codes. The best are stretched along the axes, and the best of these is bent.
     """
     progress("shape", 0.3)
     names, nearness = templates.nearest(predicted.code[0], categories)
@@ -139,7 +139,7 @@ def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> tuple[View, list[Tensor], Tensor]:
-    """Views and shapes with fitted factors along the three axes, and the cost [N] of factors that are not equal."""
+    """Stretch each shape along the three axes: fitted views and shapes, and how unequal the factors are, [N]."""
     parameters = views.parameters()
     logs = torch.zeros(len(shapes), 3).requires_grad_()
 

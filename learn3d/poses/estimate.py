@@ -275,7 +275,7 @@ class Shapes:
 
 
 def _turned(values: Tensor, turns: Tensor) -> Tensor:
-    """Values [B, M, A, E] of M shapes at A azimuths, after shape m was turned by `turns[m]` quarters, int64 [M]."""
+    """Values [B, M, A, E] of M shapes at A azimuths when shape m is turned by `turns[m]` quarter turns, int64 [M]."""
     azimuths = values.shape[2]
     before = (torch.arange(azimuths) - turns[:, None] * (azimuths // TURNS)) % azimuths
     return values.gather(2, before[None, :, :, None].expand_as(values))

@@ -46,8 +46,9 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         note(f"note: {trained_on.data} is not there, so the file has no known codes, and reconstruction will not warn")
     elif isinstance(method, MeshMethod):
         dataset = checkpoint.load_data(trained_on, "train")
-        known, templates = known_codes(method, dataset, others), learn_templates(method, dataset) or ()
-        found = dict(zip(KNOWN_CODES, known, strict=True)) | dict(zip(TEMPLATES, templates, strict=False))
-        tensors |= {k: v.half() if v.is_floating_point() else v for k, v in found.items() if v is not None}
+        known = dict(zip(KNOWN_CODES, known_codes(method, dataset, others), strict=True))
+        if (templates := learn_templates(method, dataset)) is not None:
+            known |= dict(zip(TEMPLATES, templates, strict=True))
+        tensors |= {k: v.half() if v.is_floating_point() else v for k, v in known.items() if v is not None}
     checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config))
     return target.stat().st_size

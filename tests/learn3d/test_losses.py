@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from vectors import load_vector
 
@@ -162,3 +163,16 @@ def test_energy_distance_equals_its_sum() -> None:
     found, wanted = silhouette_energy_distance(drawn, real), 2 * across - within
     torch.testing.assert_close(found, wanted)
     torch.testing.assert_close(*(torch.autograd.grad(value, drawn, retain_graph=True) for value in (found, wanted)))
+
+
+def test_energy_distance_is_least_for_the_same_distribution() -> None:
+    """Two kinds of masks, half and half: copies of the mean, of one kind, or of other shares are all farther away."""
+    kinds = torch.stack([F.pad(torch.ones(8), (0, 8)), F.pad(torch.ones(12), (4, 0))])
+    real = kinds.repeat(50, 1)
+    same = silhouette_energy_distance(real, real)
+    for other in (kinds.mean(0).repeat(100, 1), kinds[:1].repeat(100, 1), kinds[[0, 0, 0, 1]].repeat(25, 1)):
+        assert silhouette_energy_distance(other, real) > same + 0.01
+    empty = torch.zeros(3, 9, requires_grad=True)
+    loss = silhouette_energy_distance(empty, torch.zeros(2, 9))
+    assert loss == 0
+    assert torch.isfinite(torch.autograd.grad(loss, empty)[0]).all()

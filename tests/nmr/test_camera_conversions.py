@@ -32,9 +32,6 @@ K = np.array([[60.0, 2.0, 22.0], [0.0, 55.0, 26.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([0.1, -0.05, 0.01, -0.02, 0.03])
 
 
-# --- OpenCV
-
-
 def opencv_pixels(vertices, K, R, t, d):
     """The formulas of OpenCV's calib3d page; centres of pixels are integers."""
     k1, k2, p1, p2, k3 = d
@@ -73,9 +70,6 @@ def test_pixel_center_is_where_counting_begins():
     back = cameras.to_opencv(plain, height=SIZE, width=SIZE, pixel_center=0.5)
     for a, b in zip(back[:3], (K, rotation(1), T), strict=True):
         np.testing.assert_allclose(a[0], b, atol=1e-12)
-
-
-# --- OpenGL
 
 
 def opengl_pixels(vertices, view, projection):
@@ -130,9 +124,6 @@ def test_opengl_pixels_and_round_trip(make):
     np.testing.assert_allclose(back[0], projection, atol=1e-12)
 
 
-# --- PyTorch3D
-
-
 def pytorch3d_pixels(vertices, R, T, focal, principal, height, width, orthographic=False):
     """NDC as the page on cameras documents it: X left, Y up; the shorter side of the image spans [-1, 1]."""
     out = []
@@ -185,9 +176,6 @@ def test_pytorch3d_field_of_view(degrees):
     focal = 1 / math.tan(math.radians(25.0))
     wanted = pytorch3d_pixels(points(), rotation(4), T, [focal / 1.25, focal], [0, 0], SIZE, SIZE)
     np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
-
-
-# --- across conventions, and the left-handed cameras
 
 
 CAMERAS = {
@@ -271,9 +259,6 @@ def test_conversions_are_differentiable():
     assert torch.autograd.gradcheck(pytorch3d, tuple(map(parameter, values)))
     fov = parameter([40.0, 50.0])
     assert torch.autograd.gradcheck(lambda x: cameras.from_pytorch3d_fov(rotation(4), T, x).transform(vertices), fov)
-
-
-# --- errors
 
 
 def chain(vertices, matrix, intrinsics, distortion, origin, extent, perspective):

@@ -16,8 +16,6 @@ from vectors import load_vector
 import nmr
 from nmr.cameras import Projection, points_from_angles
 
-# --- geometry
-
 
 def test_the_origin_is_at_the_centre_at_the_eye_distance():
     camera = nmr.LookAt.from_angles(2.5, [0.0, 30.0, -40.0], [0.0, 77.0, 200.0])
@@ -45,7 +43,6 @@ def test_orthographic_keeps_sizes():
     torch.testing.assert_close(camera.transform(points), expected, atol=1e-6, rtol=0)
 
 
-# --- the published values. None of the defects that are fixed here shows in these files: they have no batch of 3
 # (crossed along the batch) and no vertex on the optical axis (NaN). Those two are tested further down.
 
 
@@ -113,9 +110,6 @@ def test_published_degenerate_poses():
     assert eye.grad.isfinite().all()
 
 
-# --- gradients
-
-
 def parameter(values):
     return torch.tensor(values, dtype=torch.float64, requires_grad=True)
 
@@ -146,9 +140,6 @@ def test_gradcheck_in_all_parameters(name):
     assert torch.autograd.gradcheck(
         lambda points, *parameters: make(*parameters).transform(points), (points, *map(parameter, values))
     )
-
-
-# --- batches
 
 
 def test_a_batch_of_three_is_three_cameras():
@@ -201,9 +192,6 @@ def test_fields_of_view_and_scales_under_vmap():
     ):
         many = torch.func.vmap(lambda x, make=make: make(x).transform(points))(values)
         assert torch.equal(many, torch.stack([make(x).transform(points) for x in values]))
-
-
-# --- vertices and cameras without an image
 
 
 def test_an_eye_at_the_place_that_it_looks_at_warns():
@@ -334,9 +322,6 @@ def test_never_nan(dtype, vertices, pose, calibration, distortion, upstream):
         grads = torch.autograd.grad(out, (vertices, *parameters), upstream)
         assert not any(grad.isnan().any() for grad in grads)
         assert not grads[0][out[..., 0] == math.inf].any()
-
-
-# --- cameras of one's own, errors
 
 
 def test_a_camera_of_ones_own_can_give_a_projection():

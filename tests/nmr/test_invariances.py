@@ -325,9 +325,6 @@ def test_cuda_tensors_are_staged_through_the_host(name):
         assert error.quantile(0.98) <= 1e-3 * a.abs().max()  # a GPU rounds the camera otherwise
 
 
-# --- how the operators are registered and what the kernels accept
-
-
 def call_everything(dtype, packed):
     """Every operator at least once, forward and backward."""
     meshes = [MESHES[1], (0.9 * MESHES[1][0], MESHES[1][1])]

@@ -136,9 +136,6 @@ def test_tensors_in_a_list_keep_their_gradient():
     assert strength.grad > 0
 
 
-# --- normals
-
-
 class Foreign:
     """A camera that nmr does not know."""
 

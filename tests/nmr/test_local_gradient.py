@@ -146,9 +146,6 @@ def test_together_with_other_images():
     assert wanted.any()
 
 
-# --- colours
-
-
 def scene_of(name):
     """Vertices in renderer space [B, V, 3] (of a pair of meshes if packed), faces, and whether depth is perspective."""
     vertices, faces = random_soup(3)

@@ -24,9 +24,6 @@ def random_points(*shape, seed=0):
     return torch.rand(*shape, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-# --- sample_surface
-
-
 def test_points_lie_on_their_faces_and_carry_their_normals():
     vertices, faces = nmr.icosphere(1)
     batch = torch.stack([vertices, vertices * torch.tensor([1.0, 2, 3])])
@@ -68,9 +65,6 @@ def test_points_repeat_with_the_generator_and_are_differentiable():
     torch.autograd.gradcheck(lambda x: draw(x)[:2], vertices)
 
 
-# --- distances of points
-
-
 def test_distances_equal_brute_force(search):
     a, b = random_points(2, 300), random_points(2, 211, seed=1)
     all_pairs = (a[:, :, None] - b[:, None]).norm(dim=-1)
@@ -109,9 +103,6 @@ def test_chamfer_of_equal_points_has_a_gradient_of_zero(search):
     for form in ("squared", "l1"):
         (grad,) = torch.autograd.grad(chamfer_distance(a, a.detach(), form), a)
         assert not grad.any()
-
-
-# --- grids
 
 
 def test_voxel_iou_of_boxes():

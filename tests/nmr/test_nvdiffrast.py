@@ -122,9 +122,6 @@ def test_gradients_of_rasterize_and_interpolate():
     torch.testing.assert_close(slopes[..., ::2], torch.where(covered, by_x, 0))
 
 
-# --- texture
-
-
 def slow_texture(tex, u, v, mode):
     """Bilinear at one place; tex [h, w, C] with row 0 at v = 0."""
     height, width, _ = tex.shape
@@ -238,9 +235,6 @@ def test_sample_texture():
         nmr.sample_texture(tex, uv[:1])
 
 
-# --- antialias
-
-
 def slow_antialias(color, rast, pos, tri):
     """As the documentation says, pair by pair, for one image."""
     height, width, _ = color.shape
@@ -297,9 +291,6 @@ def test_antialias(scene):
         for n in (1.0, 2.0)
     )
     torch.testing.assert_close(twice, 2 * once)
-
-
-# --- everything
 
 
 def pipeline(pos, tex, vertices_uv, tri):

@@ -140,9 +140,6 @@ def test_extreme_shapes(size):
         assert leaf.grad.isfinite().all()
 
 
-# --- the interface of neural_renderer
-
-
 def sphere(batch=2):
     vertices, faces = nmr.icosphere(1)
     return vertices.expand(batch, -1, -1), faces.expand(batch, -1, -1)

@@ -35,9 +35,6 @@ def relative(a, b):
     return float((a - b).norm() / b.norm())
 
 
-# --- values
-
-
 def test_depth_and_weights_of_a_tilted_plane_in_perspective():
     """The camera-space plane Z = 3 + X, seen as x = X / Z: Z = 3 / (1 - x)."""
     points = torch.tensor([[-1.0, -1.0], [1.2, -0.9], [0.9, 1.1], [-1.1, 0.8]], dtype=torch.float64)
@@ -214,9 +211,6 @@ def test_images_say_what_was_not_asked_for():
         images.colour  # noqa: B018
 
 
-# --- normals
-
-
 def test_flat_normals_point_at_the_viewer_and_are_those_of_the_faces():
     vertices, faces = nmr.icosphere(2)
     vertices = vertices.double()
@@ -240,9 +234,6 @@ def test_normals_point_at_the_viewer_in_a_right_handed_world_too(smooth):
     mirrored = nmr.render_normals(vertices * sides, faces, right_handed, image_size=16, smooth=smooth)
     assert (plain[..., 2] < 0).sum() > 50 and not (plain[..., 2] > 0.1).any()
     torch.testing.assert_close(mirrored * sides, plain)
-
-
-# --- gradients
 
 
 def one_large_face(dtype=torch.float64):

@@ -28,9 +28,6 @@ def with_gradients(op, *leaves, seed=1):
     return [output.detach(), *(t.grad for t in leaves)]
 
 
-# --- texture cubes
-
-
 @pytest.mark.parametrize("size, channels", [(1, 3), (2, 3), (3, 1), (4, 5)])
 @pytest.mark.parametrize("texture_batch", [1, 2])
 def test_texture_cubes_equal_the_slow_definition(size, channels, texture_batch):
@@ -69,9 +66,6 @@ def test_texture_cubes_at_their_far_end(eps):
         assert color == pytest.approx(expected, rel=1e-6)
     color = nmr.ops.sample_texture_cubes(textures, face_index, weights * float("nan"), None, eps)
     assert color == textures[0, 0, 0, 0, 0]
-
-
-# --- interpolate
 
 
 @pytest.mark.parametrize("attribute_batch", [1, 2])

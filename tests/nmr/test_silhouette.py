@@ -61,9 +61,6 @@ def test_one_openmp_runtime():
     subprocess.run([sys.executable, "-I", "-c", code], check=True)
 
 
-# --- bad input
-
-
 def test_vertices_without_a_finite_image_get_no_gradient_and_spoil_nothing():
     """A vertex in the plane of the eye, at the eye, or NaN: without clipping, other faces keep image and gradient."""
     vertices, faces = nmr.icosphere(1)

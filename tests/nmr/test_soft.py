@@ -181,9 +181,6 @@ def test_fragments_of_a_blur_know_the_distance():
         fragments.layer(0).resolve(fragments.interpolate(vertices)[..., 0, :])
 
 
-# --- transparency
-
-
 def test_transparent_surfaces_are_composited_front_to_back():
     vertices, faces = random_soup(0, 1)
     colors, opacity = noise(len(faces), 3).requires_grad_(), noise(len(faces), 1, seed=1).requires_grad_()

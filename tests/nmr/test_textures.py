@@ -27,9 +27,6 @@ def draw(colors, mesh=None, size=8, **kwargs):
     return nmr.render_rgb(*(mesh or screen()), colors=colors, image_size=size, anti_aliasing=False, **kwargs)
 
 
-# --- an image
-
-
 @pytest.mark.parametrize("channels", [1, 3, 5])
 def test_an_image_on_the_screen_is_read_back(channels):
     """Texel centres meet pixel centres: row 0 of the image is the top, uv (0, 0) its bottom left corner."""
@@ -197,9 +194,6 @@ def test_uv_that_are_not_numbers_spoil_nothing():
         assert rgb.isfinite().all() and leaf.grad.isfinite().all() and uv.grad.isfinite().all() and leaf.grad.any()
 
 
-# --- vertices, faces, cubes
-
-
 def test_vertex_colours_in_perspective():
     """A colour equal to the camera-space position shows the position seen at each pixel."""
     mesh = screen((1.0, 2.0, 4.0, 3.0))
@@ -222,8 +216,6 @@ def test_face_colours_are_exact():
             assert torch.equal(rgb[b][index[b] >= 0], expected[index[b][index[b] >= 0]])
             assert not rgb[b][index[b] < 0].any()
 
-
-# --- all of them
 
 MAKERS = {
     "vertices": (nmr.VertexColors, (4, 3)),

@@ -23,9 +23,6 @@ def rgb(vertices, colors=COLORS, lights=None):
     return nmr.render_rgb(vertices, FACES, CAMERA, colors=nmr.VertexColors(colors), lights=lights, **SIZE)
 
 
-# --- autocast
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_cast_under_autocast(dtype):
     """As the output of a Linear: the image and the gradient are those of the vertices in float32."""
@@ -56,9 +53,6 @@ def test_points_and_the_drop_in_under_autocast():
     assert drawn.any()
 
 
-# --- faces
-
-
 @pytest.mark.parametrize("dtype", [torch.uint16, torch.uint32, torch.uint64])
 def test_faces_may_be_unsigned(dtype):
     faces = torch.from_numpy(FACES.numpy().astype(str(dtype).removeprefix("torch.")))
@@ -76,9 +70,6 @@ def test_one_set_of_faces_may_have_a_batch_axis():
     assert torch.equal(*drawn)
 
 
-# --- arrays
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_parameters_of_cameras_are_copies_of_arrays(dtype):
     eye, matrix = np.array([0.0, 0.0, -3.0], dtype), np.array(INTRINSICS, dtype)
@@ -86,9 +77,6 @@ def test_parameters_of_cameras_are_copies_of_arrays(dtype):
     before = [x.transform(SPHERE) for x in (camera, pinhole)]
     eye[2], matrix[0, 0] = -9.0, 1.0
     assert torch.equal(camera.transform(SPHERE), before[0]) and torch.equal(pinhole.transform(SPHERE), before[1])
-
-
-# --- default device
 
 
 class Own:

@@ -58,9 +58,6 @@ def test_same_grid_for_any_number_of_threads_and_batch(definition):
     assert torch.equal(nmr.voxelize(batch[3], faces, definition=definition)[0], grids[0][3])
 
 
-# --- kato19
-
-
 def touched_cells(corners, size):
     """Cells that triangles touch, bool [s, s, s]: 13 axes, every cell, in whatever numbers the corners [F, 3, 3] are.
 
@@ -166,9 +163,6 @@ def test_kato19_of_a_face_far_larger_than_the_grid():
     tilted = vertices + torch.tensor([0.0, 0.0, 0.2]) + torch.tensor([0.0, 0.0, 1.0]) * vertices[:, :1]
     grid = nmr.voxelize(tilted, torch.tensor([[0, 1, 2]]), 256, definition="kato19")[0]
     assert 256 * 250 > grid.sum(0).bool().sum() > 128 * 250
-
-
-# --- bad input
 
 
 @settings(max_examples=150, deadline=None)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import skimage.color
 import torch
 from PIL import Image
 from tiny_networks import FixedMethod
@@ -111,6 +112,12 @@ def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth)
             assert (cell(grid, row, 0) == 255).all() == (k > 0), "the input stands in the first row alone"
 
 
+def test_the_truth_must_be_known(tiny_set) -> None:
+    blind = dataclasses.replace(tiny_set, voxels=None)
+    with pytest.raises(ValueError, match="airplane, test has no true voxels to show"):
+        comparison_grid([("a", Ellipsoids())], blind, torch.tensor([3]), truth=True)
+
+
 @pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
 def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_set, method) -> None:
     samples = torch.tensor([3, 30, 60])
@@ -177,6 +184,11 @@ def test_hostile_logs_are_refused(tmp_path, monkeypatch, line, message) -> None:
         report.read_metrics(folder)
 
 
+def test_numbers_of_a_run_have_titles(finished_run) -> None:
+    names = {name for _, name in report.read_metrics(finished_run)}
+    assert {"voxel_iou", "projection"} <= names <= report.TITLES.keys()
+
+
 def test_means_by_azimuth_are_those_of_views_or_sectors() -> None:
     azimuths, means = report.mean_by_azimuth(
         np.array([-15.0, 345.0, 359.999, -7.0, 0.0]), np.array([1, 3, 5, 7, np.nan])
@@ -230,6 +242,15 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set,
     assert all(words in text for words in ("$\\bad$", "view told from the code: ", " % (chance 4 %)", "90°"))
     paper.save_tsne(runs, tmp_path / "again")
     assert (tmp_path / "again.svg").read_text() == text
+
+
+def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
+    lab = skimage.color.rgb2lab(tsne.cyclic_colors(72)[None])[0]
+    steps = np.linalg.norm(np.diff(lab, axis=0, append=lab[:1]), axis=1)
+    assert steps.max() < 8  # no jump, at the end neither
+    lightness_and_blue = lab[:, [0, 2]]  # the colours that remain without red-green vision
+    opposite = np.linalg.norm(lightness_and_blue - np.roll(lightness_and_blue, 36, axis=0), axis=1)
+    assert opposite.min() > 45 and lab[:, 0].max() < 85  # none vanishes on white
 
 
 def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:

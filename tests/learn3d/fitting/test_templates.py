@@ -11,7 +11,7 @@ import trimesh
 
 import nmr
 from learn3d.data.layouts import load_dataset
-from learn3d.fitting.smoothing import divide, sharpen
+from learn3d.fitting.smoothing import divide, sharpen, smooth
 from learn3d.fitting.templates import learn_templates, template
 from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.sharded import make_shards
@@ -47,6 +47,7 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
     colors, mask = picture("chair", int(model.templates.numbers[2, 8]))
     made = reconstruct_picture(model, colors, mask)
     assert made.kind == "chair" and made.silhouette_iou > 0.8 and bodies(made.surface) >= 3
+    assert torch.allclose(made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08), "the picture's"
     unknown = model.known_codes._replace(output=model.known_codes.output + 100)
     lump = reconstruct_picture(model._replace(known_codes=unknown), colors, mask)
     assert lump.warning and bodies(lump.surface) < 3, "other things get the predicted shape"
@@ -72,3 +73,15 @@ def test_long_edges_are_divided_and_sharp_ones_stay_sharp() -> None:
     normals = nmr.vertex_normals(sharp.vertices, sharp.faces)
     assert torch.allclose(normals.abs().amax(1), torch.ones(len(normals)), atol=1e-4), "along the axes"
     assert torch.equal(sharp.colors, sharp.vertices.abs()) and torch.equal(sharp.vertices[sharp.faces], vertices[faces])
+
+
+def test_edges_are_rounded_and_flat_parts_stay() -> None:
+    box = trimesh.creation.box((1.0, 0.6, 0.4))
+    vertices, faces = divide(torch.tensor(box.vertices).float(), torch.tensor(box.faces), 0.05)
+    rounded = smooth(vertices, faces)
+    volume = trimesh.Trimesh(rounded.numpy(), faces.numpy(), process=False).volume
+    assert volume == pytest.approx(box.volume, rel=0.03)
+    top = rounded[(vertices[:, :2].abs() < 0.15).all(1) & (vertices[:, 2] > 0)]
+    assert len(top) > 5 and torch.allclose(top[:, 2], torch.tensor(0.2), atol=1e-3)
+    corner = torch.tensor([0.5, 0.3, 0.2])
+    assert 0.005 < float((rounded - corner).norm(dim=1).min()) < 0.1

@@ -90,9 +90,6 @@ def test_the_symmetric_sphere_is_the_published_one() -> None:
         assert gradient[0, output] == 0.5 * sign
 
 
-# --- cubes
-
-
 def test_cube_is_closed_and_its_faces_look_outwards() -> None:
     points, patches, faces = cube_surface()
     edges = nmr.edge_table(faces)  # raises unless every edge has two faces

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from vectors import load_vector
 
 from learn3d import device as precision_module
-from learn3d.device import resolve_precision
+from learn3d.device import autocast, resolve_precision
 from learn3d.methods import DatasetInfo, Method, create_method
 from learn3d.networks import ENCODERS, GENERATORS, PoseDiscriminator, create_encoder, network_input
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
@@ -185,9 +185,6 @@ def test_generator_rule_vectors() -> None:
     assert torch.equal(deform_sphere(case["base"], case["bias"]), case["vertices"])
 
 
-# --- encoders and their input
-
-
 def test_background_of_preact_is_grey() -> None:
     images = torch.tensor([[0.0, 1.0, 0.5, 0.0], [0.0, 1.0, 0.5, 1.0]])[:, :, None, None]
     assert grey_background(images).flatten(1).tolist() == [[0, 0, 0], [-1, 1, 0]]
@@ -260,9 +257,6 @@ def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> Non
     assert torch.equal(centre(image), image)
 
 
-# --- devices and precision
-
-
 def create(preset: str, seed: int = 0, device: str = "cpu") -> Method:
     return create_method(
         PRESETS[preset].settings, DatasetInfo(24, inverted=False), device=device, precision="fp32", seed=seed
@@ -288,6 +282,17 @@ def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, flags: str, wante
     assert resolve_precision("fp32", "cpu") == "fp32"
     monkeypatch.setattr(precision_module, "CPUINFO", str(tmp_path / "missing"))
     assert resolve_precision("auto", "cpu") == "fp32"
+
+
+def test_bf16_changes_results_little() -> None:
+    networks = create("peng2020-kato-vanilla").networks
+    images = torch.rand(1, 4, 64, 64)
+    with torch.no_grad():
+        exact = networks["generator"](networks["encoder"](images))
+        with autocast("cpu", "bf16"):
+            rough = networks["generator"](networks["encoder"](images))
+    assert rough.dtype == torch.float32
+    assert 0 < (rough - exact).abs().max() < 0.005
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

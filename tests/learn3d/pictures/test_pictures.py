@@ -17,6 +17,7 @@ from learn3d.pictures.sheets import (
     HEADER,
     MARGIN,
     draw_sheet,
+    magnify,
     make_row,
     natural_colors,
     save_gif,
@@ -114,6 +115,15 @@ def test_figures_need_poses() -> None:
         azimuths_deg(None)
 
 
+def test_the_light_goes_with_the_camera() -> None:
+    cameras = orbit(LookAtPoses(torch.zeros(1), 30.0, 2.732, 25.0), [0, 60, 180, 300])
+    pictures = draw_surface(Surface(*nmr.icosphere(4)), cameras, image_size=32).astype(int)
+    brightness = [picture[10:22, 10:22].mean() for picture in pictures]
+    assert max(brightness) - min(brightness) < 4
+    assert pictures[0][10:16].mean() > pictures[0][16:22].mean() + 8  # and it comes from above
+    assert pictures[0][:, 10:16].mean() > pictures[0][:, 16:22].mean() + 2  # and from the left
+
+
 def test_shapes_are_drawn_in_their_colours() -> None:
     vertices, faces = nmr.icosphere(3)
     red = torch.tensor([1.0, 0.0, 0.0]).expand_as(vertices)
@@ -157,6 +167,13 @@ def test_natural_colors_undo_the_inversion() -> None:
     colors = natural_colors(stored)
     assert (colors[0] == 255).all() and colors[1, 2, 4].tolist() == [0, 255, 255]
     assert natural_colors(stored, inverted=False)[1, 2, 4].tolist() == [255, 0, 0]
+
+
+def test_magnify_keeps_the_middle() -> None:
+    pictures = np.zeros((1, 40, 40, 3), np.uint8)
+    pictures[:, 10:30, 10:30] = 255
+    assert np.array_equal(magnify(pictures, 2.0), np.full((1, 20, 20, 3), 255))
+    assert np.array_equal(magnify(pictures, 1.0), pictures)
 
 
 def test_a_sheet_has_titles_free_places_and_rules() -> None:

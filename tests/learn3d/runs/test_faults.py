@@ -42,9 +42,6 @@ def full(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-# --- the disk
-
-
 @pytest.mark.parametrize("saves", [0, 1, 3])
 def test_full_disk_while_a_checkpoint_is_written(tiny_run, undisturbed, run_folder, monkeypatch, saves: int) -> None:
     save_file, done = checkpoint.save_file, []
@@ -129,9 +126,6 @@ def test_the_output_folder_vanishes(tiny_run, run_folder, monkeypatch) -> None:
     assert not run_folder.exists()
 
 
-# --- time and terminal
-
-
 def test_a_clock_that_jumps(tiny_run, undisturbed, run_folder, monkeypatch) -> None:
     now, jumps = time.time, iter([0.0, 1e9, -1e9, 3e8] * 10_000)
     monkeypatch.setattr(time, "time", lambda: now() + next(jumps))
@@ -174,9 +168,6 @@ def test_without_a_terminal_at_all(tiny_run, run_folder, monkeypatch, stream: io
     assert train(tiny_run(run_folder, iterations=2)).finished
 
 
-# --- TensorBoard
-
-
 def test_tensorboard_that_cannot_be_loaded(tiny_run, undisturbed, run_folder, monkeypatch, capsys) -> None:
     import torch.utils.tensorboard
 
@@ -210,9 +201,6 @@ def test_tensorboard_shows_every_step_once_after_a_kill(tiny_run, undisturbed, r
         events.Reload()
         assert [event.step for event in events.Scalars("train/total")] == [1, 2, 3, 4, 5, 6]
         assert [event.step for event in events.Scalars("val/voxel_iou")] == [2, 4, 6]
-
-
-# --- the beginning
 
 
 def test_resuming_before_the_first_checkpoint_starts_anew(tiny_run, undisturbed, run_folder, monkeypatch) -> None:
