@@ -44,7 +44,7 @@ class Templates(NamedTuple):
     axes: Tensor  # float [K + 1, C]: the mean of all codes, and K axes
 
     def nearest(self, code: Tensor, categories: Sequence[str]) -> tuple[list[tuple[str, int]], Tensor]:
-        """The `CANDIDATES` shapes with codes nearest to a code [C]: category and number, and the cosine of the codes."""
+        """The `CANDIDATES` shapes with codes nearest to a code [C]: category and number of each, and the cosines."""
         mean, *axes = self.axes.float()
         place = torch.stack(axes) @ (F.normalize(code, dim=0) - mean)
         cosines = 1 - (self.codes.float().flatten(0, 1) - place).square().sum(1) / 2
