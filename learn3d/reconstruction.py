@@ -36,7 +36,7 @@ from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.fitting.fit import Progress, fit, predict, silent
-from learn3d.fitting.smoothing import divide, outer_surface, sharpen
+from learn3d.fitting.smoothing import divide, outer_surface
 from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.methods import MeshMethod, Method
 from learn3d.methods.refinement import refine
@@ -53,7 +53,7 @@ STRIP_SIZE = 192  # side of each picture in a strip, in pixels
 _OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
 _PLAIN_SIDE = 1024  # side in pixels to which a photograph with a plain background is reduced
 _COLORED = 256  # side in pixels of the picture that gives the colours
-_LONGEST_EDGE = 0.04  # of a coloured template; vertices have the colours
+_LONGEST_EDGE = 0.1  # of a coloured template; hidden parts have the colours of its vertices
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
@@ -284,8 +284,8 @@ def reconstruct_picture(
         fitted = fit(method, predicted, mask, progress)
         mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
     progress("colours", 0.9)
-    surface = color_mesh(*mesh, fitted.view, fine[:3].transpose(1, 2, 0), fine[3], mirror)
-    surface = surface if templates is None else sharpen(surface)
+    picture = fine[:3].transpose(1, 2, 0), fine[3]
+    surface = color_mesh(*mesh, fitted.view, *picture, mirror, textured=templates is not None)
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
 
 
@@ -347,27 +347,45 @@ def export_mesh(path: Path, surface: Surface) -> None:
 def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
     """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed, normals outwards.
 
-    The object frame is left-handed, so the mesh is reflected and the order of each face reversed. GLB and PLY keep
-    the colours of the vertices. `name` is the node's in a GLB. Its material is double-sided: learnt surfaces cross
-    themselves, and viewers would hide the faces that are seen from behind.
+    The object frame is left-handed, so the mesh is reflected and the order of each face reversed. A GLB has the texture
+    or else the colours of the vertices, a PLY always these. `name` is the node's in a GLB. Its material is
+    double-sided: learnt surfaces cross themselves, and viewers would hide the faces that are seen from behind.
     """
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
-    if surface.colors is not None and kind != "obj":
+    if kind == "glb" and surface.texture is not None:
+        mesh = _with_texture(mesh, *surface.texture)
+    elif surface.colors is not None and kind != "obj":
         colors = surface.colors.detach().cpu().clamp(0, 1)
-        colors = colors**2.2 if kind == "glb" else colors  # colours in a GLB are linear
+        colors = colors**2.2 if kind == "glb" else colors  # colours of vertices in a GLB are linear
         mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
     if kind == "glb":
-        options = {"include_normals": True, "tree_postprocessor": _show_both_sides}
+        options = {"include_normals": True, "tree_postprocessor": _finish_materials}
         content = trimesh.Scene({name: mesh}).export(file_type=kind, **options)
     else:
         content = mesh.export(file_type=kind)
     return content.encode() if isinstance(content, str) else content
 
 
-def _show_both_sides(tree: dict) -> None:
-    """Give all meshes of a glTF tree a matt, double-sided material."""
-    tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}]
+def _with_texture(mesh: trimesh.Trimesh, image: Tensor, uv: Tensor) -> trimesh.Trimesh:
+    """The mesh with a texture; uv: float [F, 3, 2], the corners of each face before its order was reversed."""
+    corners = mesh.faces.ravel()
+    texture = Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=texture)
+    visual = trimesh.visual.TextureVisuals(uv.flip(1).flatten(0, 1).numpy(), material)
+    faces, normals = np.arange(len(corners)).reshape(-1, 3), mesh.vertex_normals[corners]
+    return trimesh.Trimesh(mesh.vertices[corners], faces, vertex_normals=normals, visual=visual, process=False)
+
+
+def _finish_materials(tree: dict) -> None:
+    """Make the materials of a glTF tree matt and double-sided; without smaller copies, whose texels mix faces."""
+    materials = tree.setdefault("materials", [{}])
+    for material in materials:
+        material.setdefault("pbrMetallicRoughness", {}).update(metallicFactor=0.0, roughnessFactor=1.0)
+        material["doubleSided"] = True
+    for texture in tree.get("textures", ()):
+        texture["sampler"] = 0
+        tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]  # linear, clamped
     for mesh in tree.get("meshes", ()):  # an empty shape has none
         for primitive in mesh["primitives"]:
             primitive["material"] = 0

@@ -27,7 +27,8 @@ class Variant:
     """A preset with changes. Its name is that of its run folders, so equal names mean the same runs in every table."""
 
     preset: str
-    changes: Mapping[str, Any] = field(default_factory=dict)  # settings of the method and options of the training
+    changes: Mapping[str, Any] = field(default_factory=dict)  # settings of the method and options of the training; a
+    # "batch_size" here replaces the divided one
     checkpoint: Literal["last", "best"] = "last"  # networks to test: the last ones, or the best on the validation split
     batch_divisor: int = 1  # divides the batch size and multiplies the iterations, so that as many images are seen
     estimates_poses: bool = False  # azimuths are estimated with the run's seed, and turned into the data's frame
@@ -69,6 +70,8 @@ _SCHEDULE = {"lr_schedule": "cosine", "warmup_steps": 100, "ema_decay": 0.99, "l
 _SYMMETRY = {"symmetry": "auto"}
 _SHARED_NAMES = ("encoder", "generator", "lambda_area", "clamp_to_cube", "lambda_smooth", "lambda_smooth_end")
 _SHARED = _SCHEDULE | _SYMMETRY | {name: getattr(_PLUS, name) for name in _SHARED_NAMES}
+_SUPERVISION = _SYMMETRY | {"encoder": "conv-light", "generator": "sphere", "clamp_to_cube": True}
+_SUPERVISION |= {"lambda_smooth": 3e-4, "augment": ("colors",)}
 #: Table 5: mean voxel IoU over the categories of Kar's data, by widths of the view bins in azimuth and elevation.
 BINS = {"60x60": 0.497, "30x30": 0.499, "20x20": 0.501, "20x15": 0.500, "15x20": 0.504, "15x15": 0.498, "10x10": 0.490}
 
@@ -81,6 +84,12 @@ def _plus(data: str, changes: Mapping[str, Any] | None = None, **options: Any) -
 
 def _kato(changes: Mapping[str, Any], method: str = "proposed", **options: Any) -> Variant:
     return Variant(full_name(method), changes, **options)
+
+
+def _supervision(method: str, changes: Mapping[str, Any] | None = None) -> Variant:
+    """A method with the networks, losses and schedule of many views, on as many encoded images as Plus sees."""
+    options = {"batch_divisor": _BATCH_DIVISOR, "length_of": full_name("proposed")}
+    return _kato(_SCHEDULE | _SUPERVISION | (changes or {}), method, **options)
 
 
 #: By name. Without the confusion loss the discriminator has no effect on the encoder, so its own loss is off, too.
@@ -104,6 +113,9 @@ VARIANTS: dict[str, Variant] = {
     "proposed-schedule-symmetry": _kato(_SCHEDULE | _SYMMETRY),
     "proposed-shared": _kato(_SHARED, batch_divisor=_BATCH_DIVISOR),
     "vanilla-shared": _kato(_SHARED, "vanilla", batch_divisor=_BATCH_DIVISOR),
+    "single-views": _supervision("vanilla"),
+    "pairs": _supervision("multi-view"),
+    "five-views": _supervision("many-views", {"batch_size": 160}),  # one of five is encoded
     "plus-without-symmetry": _plus("kato", {"symmetry": None}),
     "plus-without-novel-views": _plus("kato", {"lambda_novel_view": 0.0}),
 }
@@ -113,7 +125,7 @@ _PROPOSED = ".565 .410 .661 .670 .415 .532 .378 .434 .533 .592 .417 .684 .528  .
 _VPL_PAPER = "kato19, quoted from Kato and Harada 2019"
 _COMMENTED = "kato18; figures by category from comments in the paper's source"
 
-#: By name: the tables of the paper, and two about Plus.
+#: By name: the tables of the paper, and three of our own.
 TABLES: dict[str, Table] = {
     "kato": Table(
         "Voxel IoU on Kato's data (Table 1)",
@@ -214,6 +226,17 @@ TABLES: dict[str, Table] = {
             "Plus, w/o novel views": Row("plus-without-novel-views"),
             "Plus, w/o symmetry": Row("plus-without-symmetry"),
             "Plus": Row("plus"),
+        },
+        categories=("airplane", "chair", "table"),
+        seeds=3,
+    ),
+    "supervision": Table(
+        "One, two or five views behind each shape, voxel IoU on Kato's data (no table of the paper)",
+        "Single views",
+        {
+            "Single views": Row("single-views"),
+            "Pairs of views": Row("pairs"),
+            "Five views": Row("five-views"),
         },
         categories=("airplane", "chair", "table"),
         seeds=3,

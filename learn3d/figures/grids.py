@@ -35,7 +35,7 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
         shapes = method.decode(method.encode(batch.images)).surfaces()
     inputs = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     rows = []
-    for i, (vertices, faces, _) in enumerate(shapes):
+    for i, (vertices, faces, *_) in enumerate(shapes):
         pose = view_poses(torch.zeros(1)) if batch.poses is None else batch.poses[torch.tensor([i])]
         rendering = torch.zeros(MASK_SIZE, MASK_SIZE)
         if len(faces):

@@ -14,7 +14,6 @@ from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.losses import depth_loss, gaussian_prior_loss
 from learn3d.methods.method import MeshMethod, MeshSettings, check_groups
-from learn3d.methods.surfaces import Meshes
 from learn3d.networks import EncoderName, SymmetryOption
 from learn3d.settings import Positive, Weight, checked
 
@@ -25,6 +24,7 @@ class ManyViewsSettings(MeshSettings):
 
     encoder: EncoderName = "conv-light"
     symmetry: SymmetryOption = "auto"
+    clamp_to_cube: bool = True
     learning_rate: Positive = 4e-4
     lambda_smooth: Weight = 3e-4
     """Weight of the smoothness loss."""
@@ -59,9 +59,6 @@ class ManyViews(MeshMethod):
 
     def encode(self, images: Tensor) -> Tensor:
         return self.encode_symmetric(images)
-
-    def decode(self, codes: Tensor) -> Meshes:
-        return self.clamp_to_cube(super().decode(codes))
 
     def check_batch(self, batch: Batch) -> None:
         super().check_batch(batch)

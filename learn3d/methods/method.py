@@ -97,6 +97,9 @@ class MeshSettings(MethodSettings):
     it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
     learning_rate: Positive = 1e-4
     """Adam's learning rate, the same for all networks."""
+    clamp_to_cube: bool = False
+    """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers find
+    no inside in a shape that exceeds their grid."""
     pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
     weights). VPL then freezes its batch norms."""
@@ -301,22 +304,16 @@ class MeshMethod(Method):
 
     def decode(self, codes: Tensor) -> Meshes:
         with self.autocast():
-            return Meshes(self.generator(codes).cpu(), self.faces)
+            vertices = self.generator(codes).cpu()
+        if self.settings.clamp_to_cube and self.info.cube_side is not None:
+            limit = CLAMP_LIMIT * self.info.cube_side
+            vertices = vertices.clamp(-limit, limit)
+        return Meshes(vertices, self.faces)
 
     def encode_symmetric(self, images: Tensor) -> Tensor:
         """Shape codes; for symmetric shapes the mean of the codes of an image and its mirror image."""
         codes = MeshMethod.encode(self, images)
         return codes if self.generator.mirror is None else (codes + MeshMethod.encode(self, images.flip(3))) / 2
-
-    def clamp_to_cube(self, shapes: Meshes) -> Meshes:
-        """Clamp the vertices to the cube of the data set, if it has one.
-
-        The voxelizers find no inside in a shape that exceeds their grid.
-        """
-        if self.info.cube_side is None:
-            return shapes
-        limit = CLAMP_LIMIT * self.info.cube_side
-        return dataclasses.replace(shapes, vertices=shapes.vertices.clamp(-limit, limit))
 
     def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's device."""

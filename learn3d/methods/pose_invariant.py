@@ -14,7 +14,6 @@ from learn3d.device import upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod, MeshSettings, is_compact
 from learn3d.methods.optimization import frozen
-from learn3d.methods.surfaces import Meshes
 from learn3d.networks import PoseDiscriminator
 from learn3d.settings import Positive, Weight, checked
 
@@ -25,9 +24,6 @@ COMPACT_AREA_WEIGHT = 0.03
 class PoseInvariantSettings(MeshSettings):
     """Networks, weights and forms of the losses in L_tot; a loss with weight 0 is not computed."""
 
-    clamp_to_cube: bool = False
-    """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers find
-    no inside in a shape that exceeds their grid."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
@@ -98,10 +94,6 @@ class PoseInvariant(MeshMethod):
             return self.weights
         done = min(1.0, (step - 1) / max(1, self.schedule.iterations - 1))
         return self.weights | {"smoothness": first ** (1 - done) * last**done}
-
-    def decode(self, codes: Tensor) -> Meshes:
-        shapes = super().decode(codes)
-        return self.clamp_to_cube(shapes) if self.settings.clamp_to_cube else shapes
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Train encoder and generator in every step on projection + lambda_1 smoothness + lambda_area area + lambda_4

@@ -31,7 +31,7 @@ def studio_lights(light: Sequence[float] = KEY_LIGHT, ambient: float = 0.5, smoo
 def photograph(
     vertices: torch.Tensor | np.ndarray,
     faces: torch.Tensor | np.ndarray,
-    face_colors: np.ndarray | Sequence[float],
+    colors: np.ndarray | Sequence[float] | nmr.UVTexture,
     cameras: nmr.cameras.Camera,
     *,
     image_size: int,
@@ -40,19 +40,21 @@ def photograph(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One mesh in B views on white. Both sides of its faces are lit in the same way. Not differentiable.
 
-    vertices float [V, 3] in the object frame, faces integer [F, 3], face_colors float [F, 3] or [3] in [0, 1], a camera
-    of nmr with B poses. supersample: subpixels per pixel and axis, an even number; 2 covers exactly the pixels that
-    `nmr.render_silhouette` covers. Returns rgb uint8 [B, S, S, 3], row 0 = top, and alpha uint8 [B, S, S], 255 * the
-    covered share of each pixel. Raises TypeError and ValueError as `nmr.render` does.
+    vertices float [V, 3] in the object frame, faces integer [F, 3], a camera of nmr with B poses. colors: a texture, or
+    colours of the faces, float [F, 3] or [3] in [0, 1]. supersample: subpixels per pixel and axis, an even number; 2
+    covers exactly the pixels that `nmr.render_silhouette` covers. Returns rgb uint8 [B, S, S, 3], row 0 = top, and
+    alpha uint8 [B, S, S], 255 * the covered share of each pixel. Raises TypeError and ValueError as `nmr.render` does.
     """
     faces = torch.as_tensor(faces).cpu()
+    if not isinstance(colors, nmr.UVTexture):
+        colors = nmr.FaceColors(torch.as_tensor(np.float32(colors)).clamp(0.0, 1.0).expand(len(faces), 3))
     finer = supersample // 2  # the renderer halves once more
     images = nmr.render(
         torch.as_tensor(vertices, dtype=torch.float32).cpu(),
         faces,
         cameras,
         outputs=("rgb", "alpha"),
-        colors=nmr.FaceColors(torch.as_tensor(np.float32(face_colors)).clamp(0.0, 1.0).expand(len(faces), 3)),
+        colors=colors,
         lights=lights or studio_lights(),
         background=1.0,
         image_size=image_size * finer,

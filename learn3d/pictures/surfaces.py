@@ -22,12 +22,20 @@ _FAR = 5.0  # distance of orthographic cameras, outside of any object: faces beh
 Cameras = Sequence[nmr.LookAt | nmr.Orthographic]  # each of one view
 
 
+class Texture(NamedTuple):
+    """An image on the faces of a surface."""
+
+    image: Tensor  # float32 [H, W, 3] in [0, 1], row 0 = top
+    uv: Tensor  # float32 [F, 3, 2]: place of each corner of each face; (0, 0) is the image's bottom left corner
+
+
 class Surface(NamedTuple):
     """One shape as triangles, on the CPU."""
 
     vertices: Tensor  # float32 [V, 3], object frame
     faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape
     colors: Tensor | None = None  # float32 [V, 3] in [0, 1], R, G, B of each vertex; None: clay
+    texture: Texture | None = None  # it is shown instead of the colours
 
 
 def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> Cameras:
@@ -90,6 +98,9 @@ def draw_surface(surface: Surface, cameras: Cameras, *, image_size: int) -> np.n
         return np.full((len(cameras), image_size, image_size, 3), 255, np.uint8)
     colored = surface.colors is not None  # colours of a photograph have its light: shade them less
     colors = surface.colors.detach()[surface.faces].mean(dim=1).numpy() if colored else CLAY
+    if surface.texture is not None:
+        image, uv = surface.texture
+        colors = nmr.UVTexture(image, uv.flatten(0, 1), torch.arange(3 * len(uv)).view(-1, 3))
     pictures = []
     for camera in cameras:  # one at a time, to save memory
         direction = torch.tensor(_LIGHT, dtype=torch.float64) @ camera.projection().matrix[0, :, :3]

@@ -208,7 +208,7 @@ async function send(alpha, strokes = null, box = null) {
       if (done) break;
       const lines = (rest + value).split("\n");
       rest = lines.pop();
-      for (const line of lines) ended = handle(JSON.parse(line), pixels) || ended;
+      for (const line of lines) ended = (await handle(JSON.parse(line), pixels, mine.signal)) || ended;
     }
     if (!ended) throw new Error("the answer broke off");
   } catch (error) {
@@ -217,7 +217,7 @@ async function send(alpha, strokes = null, box = null) {
 }
 
 /** Handle one message of the server; returns whether it is the last. */
-function handle(message, pixels) {
+async function handle(message, pixels, signal) {
   if (message.place) say(message.place === 1 ? "You are next …" : `${message.place} are before you …`);
   if (message.mask) {
     const bits = bytes(message.mask);
@@ -230,7 +230,13 @@ function handle(message, pixels) {
     $("views").innerHTML = '<div class="card view empty"><p class="quiet">The mesh appears here.</p></div>';
     say(message.error, true);
   }
-  if (message.meshes) present(message.meshes);
+  if (message.meshes) {
+    const read = await Promise.all(message.meshes.map(async (made) => {
+      const glb = bytes(made.glb);
+      return { ...made, glb, mesh: await readGlb(glb.buffer) };
+    }));
+    if (!signal.aborted) present(read);
+  }
   return Boolean(message.error || message.meshes);
 }
 
@@ -251,7 +257,7 @@ function present(meshes) {
     const title = document.createElement("b"), label = meshes.length > 1 ? ` ${made.label}` : "";
     title.textContent = [label, made.kind && `Taken for: ${made.kind}${made.warning ? "?" : ""}`].filter(Boolean).join(" · ");
     view.append(title);
-    const glb = bytes(made.glb), mesh = readGlb(glb.buffer);
+    const { glb, mesh } = made;
     new Viewer(canvas, mesh, made.yaw);
     offer(`GLB${label} (3D viewers, Blender)`, `${name}${label}.glb`, () => new Blob([glb], { type: "model/gltf-binary" }));
     offer(`OBJ${label}`, `${name}${label}.obj`, () => new Blob([toObj(mesh)], { type: "model/obj" }));

@@ -1,12 +1,12 @@
 // A turning mesh in colour, drawn by the CPU on a canvas: it needs no WebGL and looks the same everywhere.
 "use strict";
 
-/** Positions, normals, colours (sRGB, 0 .. 255) and corners of the only mesh of a GLB file. */
-function readGlb(buffer) {
+/** Positions, normals, colours (sRGB, 0 .. 255), corners and texture of the only mesh of a GLB file. */
+async function readGlb(buffer) {
   const head = new DataView(buffer), size = head.getUint32(12, true);
   const tree = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, size)));
   const binary = 28 + size, kinds = { 5121: Uint8Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
-  const widths = { SCALAR: 1, VEC3: 3, VEC4: 4 };
+  const widths = { SCALAR: 1, VEC2: 2, VEC3: 3, VEC4: 4 };
   const read = (number) => {
     const accessor = tree.accessors[number], view = tree.bufferViews[accessor.bufferView];
     const start = binary + (view.byteOffset || 0) + (accessor.byteOffset || 0), kind = kinds[accessor.componentType];
@@ -20,7 +20,26 @@ function readGlb(buffer) {
     for (let v = 0; v < points.length / 3; v++)
       for (let c = 0; c < 3; c++) colors[3 * v + c] = 255 * Math.pow(values[width * v + c] / most, 1 / 2.2);
   }
-  return { points, normals: read(given.NORMAL).values, colors, corners: read(primitive.indices).values };
+  const mesh = { points, normals: read(given.NORMAL).values, colors, corners: read(primitive.indices).values };
+  if (tree.images) {
+    const { byteOffset, byteLength } = tree.bufferViews[tree.images[0].bufferView], start = binary + (byteOffset || 0);
+    const { width, height, data } = await decode(buffer.slice(start, start + byteLength));
+    Object.assign(mesh, { uv: read(given.TEXCOORD_0).values, texture: { width, height, texels: data } });
+    for (let v = 0; v < points.length / 3; v++) colors.set(data.subarray(texel(mesh.texture, mesh.uv[2 * v], mesh.uv[2 * v + 1])).subarray(0, 3), 3 * v);
+  }
+  return mesh;
+}
+
+async function decode(content) {
+  const image = await createImageBitmap(new Blob([content])), { width, height } = image;
+  const context = Object.assign(document.createElement("canvas"), { width, height }).getContext("2d");
+  context.drawImage(image, 0, 0);
+  return context.getImageData(0, 0, width, height);
+}
+
+/** Position of R of the texel at (u, v), v from the top. */
+function texel({ width, height }, u, v) {
+  return 4 * (Math.min(height - 1, Math.max(0, Math.floor(v * height))) * width + Math.min(width - 1, Math.max(0, Math.floor(u * width))));
 }
 
 /** A Wavefront file of a mesh; programs that know colours of vertices find them behind the positions. */
@@ -132,7 +151,7 @@ class Viewer {
   }
 
   place(width, height) {
-    const { points, normals, colors } = this.mesh, { seen, lit } = this, { axes, distance, focus } = this.camera(width, height);
+    const { points, normals, colors, texture } = this.mesh, { seen, lit } = this, { axes, distance, focus } = this.camera(width, height);
     const [right, up, eye] = axes, light = [0, 1, 2].map((k) => Viewer.LIGHT[0] * right[k] + Viewer.LIGHT[1] * up[k] + Viewer.LIGHT[2] * eye[k]);
     for (let v = 0; v < points.length; v += 3) {
       const x = points[v], y = points[v + 1], z = points[v + 2], n = normals[v], m = normals[v + 1], o = normals[v + 2];
@@ -143,13 +162,14 @@ class Viewer {
       const side = n * eye[0] + m * eye[1] + o * eye[2] < 0 ? -1 : 1; // both sides are lit
       const facing = side * (n * light[0] + m * light[1] + o * light[2]);
       const shade = 0.62 + 0.42 * Math.max(0, facing) + 0.06 * Math.min(0, facing);
-      for (let c = 0; c < 3; c++) lit[v + c] = Math.min(255, colors[v + c] * shade + 10 * Math.max(0, facing));
+      const gloss = 10 * Math.max(0, facing);
+      for (let c = 0; c < 3; c++) lit[v + c] = texture ? shade : Math.min(255, colors[v + c] * shade + gloss);
     }
   }
 
-  /** Draw the triangles with interpolated colours and a depth buffer. */
+  /** Draw the triangles with interpolated or textured colours and a depth buffer. */
   fill(width, height) {
-    const { corners } = this.mesh, { seen, lit, pixels, near } = this;
+    const { corners, uv, texture } = this.mesh, { seen, lit, pixels, near } = this, texels = texture?.texels;
     for (let f = 0; f < corners.length; f += 3) {
       const a = 3 * corners[f], b = 3 * corners[f + 1], c = 3 * corners[f + 2];
       const ax = seen[a], ay = seen[a + 1], bx = seen[b], by = seen[b + 1], cx = seen[c], cy = seen[c + 1];
@@ -161,6 +181,7 @@ class Viewer {
       const na = seen[a + 2], nb = seen[b + 2] - na, nc = seen[c + 2] - na;
       const ra = lit[a], rb = lit[b] - ra, rc = lit[c] - ra, ga = lit[a + 1], gb = lit[b + 1] - ga, gc = lit[c + 1] - ga;
       const ba = lit[a + 2], bb = lit[b + 2] - ba, bc = lit[c + 2] - ba;
+      const [ua, va, ub, vb, uc, vc] = texture ? [a, b, c].flatMap((v) => [uv[2 * v / 3], uv[2 * v / 3 + 1]]) : [];
       for (let y = top; y <= low; y++) {
         const dy = y + 0.5 - ay;
         let p = (left + 0.5 - ax) * bdx + dy * bdy, q = (left + 0.5 - ax) * cdx + dy * cdy; // shares of b and c
@@ -169,6 +190,13 @@ class Viewer {
           const n = na + p * nb + q * nc;
           if (n <= near[i]) continue;
           near[i] = n;
+          if (texture) {
+            const light = ra + p * rb + q * rc, r = 1 - p - q;
+            const t = texel(texture, r * ua + p * ub + q * uc, r * va + p * vb + q * vc);
+            const red = Math.min(255, light * texels[t]), green = Math.min(255, light * texels[t + 1]);
+            pixels[i] = 0xff000000 | (Math.min(255, light * texels[t + 2]) << 16) | (green << 8) | red;
+            continue;
+          }
           pixels[i] = 0xff000000 | ((ba + p * bb + q * bc) << 16) | ((ga + p * gb + q * gc) << 8) | (ra + p * rb + q * rc);
         }
       }

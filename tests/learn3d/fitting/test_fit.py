@@ -7,15 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 import nmr
 from learn3d.data.dataset import DatasetInfo
 from learn3d.data.layouts import load_dataset
 from learn3d.fitting.camera import AZIMUTHS, CENTRED_SIZE, View, find_view, frame_view
-from learn3d.fitting.coloring import color_mesh
+from learn3d.fitting.coloring import _nearest_clear, color_mesh
 from learn3d.fitting.familiarity import KnownCodes, known_codes, learn_others
 from learn3d.fitting.fit import fit, predict
+from learn3d.fitting.smoothing import joined
 from learn3d.methods import create_method
 from learn3d.methods.method import MeshMethod
 from learn3d.networks.encoders import centre
@@ -115,6 +117,16 @@ def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_m
             assert torch.allclose(found, torch.tensor(wanted), atol=0.12), (found, wanted)
     alone = color_mesh(vertices, faces, view, rgb[0], alpha[0])
     assert torch.isfinite(alone.colors).all() and alone.colors.min() >= 0 and alone.colors.max() <= 1
+
+
+def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
+    leg = trimesh.creation.box((0.1, 0.4, 0.1))
+    box, faces = torch.tensor(leg.vertices), torch.tensor(leg.faces)
+    places = torch.tensor([(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)])  # two legs, and another part near
+    vertices, faces = (box + places[:, None]).flatten(0, 1), torch.cat([faces, faces + 8, faces + 16])
+    clear = np.arange(24) % 24 // 8 != 1
+    nearest = _nearest_clear(vertices.numpy(), clear, joined(faces.numpy(), 24))
+    assert nearest.tolist() == [*range(8), *range(8), *range(16, 24)]
 
 
 def test_a_picture_without_a_seen_vertex_still_has_colours() -> None:

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 import trimesh
 
 import nmr
+from learn3d.data.conventions import mesh_to_object
 from learn3d.data.layouts import load_dataset
 from learn3d.fitting.smoothing import divide, sharpen, smooth
 from learn3d.fitting.templates import learn_templates, template
+from learn3d.fitting.texturing import paint
 from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.sharded import make_shards
 from learn3d.pictures.studio import photograph
 from learn3d.pictures.surfaces import Surface
-from learn3d.reconstruction import Model, load_model, reconstruct_picture
+from learn3d.reconstruction import Model, load_model, mesh_bytes, reconstruct_picture
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +52,7 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
     made = reconstruct_picture(model, colors, mask)
     assert made.kind == "chair" and made.silhouette_iou > 0.8 and bodies(made.surface) >= 3
     assert torch.allclose(made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08), "the picture's"
+    assert torch.allclose(made.surface.texture.image.mean((0, 1)), torch.tensor([0.3, 0.5, 0.4]), atol=0.2)
     unknown = model.known_codes._replace(output=model.known_codes.output + 100)
     lump = reconstruct_picture(model._replace(known_codes=unknown), colors, mask)
     assert lump.warning and bodies(lump.surface) < 3, "other things get the predicted shape"
@@ -73,6 +78,42 @@ def test_long_edges_are_divided_and_sharp_ones_stay_sharp() -> None:
     normals = nmr.vertex_normals(sharp.vertices, sharp.faces)
     assert torch.allclose(normals.abs().amax(1), torch.ones(len(normals)), atol=1e-4), "along the axes"
     assert torch.equal(sharp.colors, sharp.vertices.abs()) and torch.equal(sharp.vertices[sharp.faces], vertices[faces])
+
+
+def painted() -> Surface:
+    """A sphere and thin and small triangles with the colours 0.5 + p at p, and none of the vertices' own."""
+    shapes = [trimesh.creation.box((0.9, 0.02, 0.1)), trimesh.creation.icosphere(2, 0.4)]
+    mesh = trimesh.util.concatenate(shapes)
+    vertices, faces = divide(torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces), 0.1)
+    surface = Surface(vertices, faces, torch.zeros(len(vertices), 3))
+    return paint(surface, lambda points, normals: (0.5 + points, torch.full((len(points),), 1e3)))
+
+
+def test_every_place_of_a_texture_has_the_colour_of_its_point() -> None:
+    surface = painted()
+    image, uv = surface.texture
+    torch.manual_seed(0)
+    shares = torch.rand(len(uv), 9, 3) ** 3
+    shares /= shares.sum(2, keepdim=True)
+    grid = (shares @ uv * 2 - 1) * torch.tensor([1.0, -1.0])
+    found = F.grid_sample(image.movedim(2, 0)[None], grid[None], align_corners=False)[0].movedim(0, 2)
+    wanted = 0.5 + shares @ surface.vertices[surface.faces]
+    assert (found - wanted).abs().max() < 1e-4
+    plain = paint(
+        surface._replace(colors=wanted.new_full((len(surface.vertices), 3), 0.3)), lambda p, n: (p, 0 * p[:, 0])
+    )
+    assert plain.texture.image.unique().tolist() == pytest.approx([0.3, 1.0]), "the vertices', and unused texels"
+
+
+def test_a_glb_shows_the_texture() -> None:
+    surface = painted()
+    mesh = trimesh.load(io.BytesIO(mesh_bytes(surface, "glb", "box")), file_type="glb", force="mesh", process=False)
+    texture = np.asarray(mesh.visual.material.baseColorTexture)
+    u, v = mesh.visual.uv[mesh.faces].mean(1).T
+    found = texture[((1 - v) * len(texture)).astype(int), (u * texture.shape[1]).astype(int), :3] / 255
+    assert np.abs(found - 0.5 - mesh.triangles_center @ mesh_to_object().T).max() < 0.02
+    assert mesh.volume > 0 and mesh.visual.material.doubleSided
+    assert (mesh.vertex_normals[mesh.faces] * mesh.face_normals[:, None]).sum(2).min() > 0.5, "the surface's, outwards"
 
 
 def test_edges_are_rounded_and_flat_parts_stay() -> None:
