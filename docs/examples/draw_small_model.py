@@ -12,7 +12,7 @@ import tyro
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.pictures.sheets import save_png, tile
-from learn3d.pictures.studio import natural_look, photograph
+from learn3d.pictures.studio import PALETTES, natural_look, photograph
 from learn3d.pictures.surfaces import Surface, draw_around
 from learn3d.reconstruction import export_mesh, load_model, reconstruct_picture
 from learn3d.shapes import CATEGORIES, make_shape
@@ -35,9 +35,9 @@ def main(output: Path = Path("output"), azimuth: float = 40.0, elevation: float 
         shape = make_shape(category, rng)
         vertices = shape.vertices @ mesh_to_object("y", "z").T
         truth = Surface(torch.tensor(vertices, dtype=torch.float32), torch.tensor(shape.faces))
-        paint, lights = natural_look(vertices, shape.faces, rng)
+        paint, _ = natural_look(vertices, shape.faces, rng, PALETTES[category])
         camera = nmr.LookAt.from_angles(2.732, elevation, [azimuth], half_fov_deg=15.0)
-        colors, masks = photograph(*truth[:2], paint, camera, image_size=256, lights=lights)
+        colors, masks = photograph(*truth[:2], paint, camera, image_size=256)
         made = reconstruct_picture(model, colors[0], masks[0])
         save_png(output / f"{category}.png", np.dstack([colors[0], masks[0]]))
         export_mesh(output / f"{category}.glb", made.surface)

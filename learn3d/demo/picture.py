@@ -14,7 +14,7 @@ import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.framing import check_mask, largest_region, mask_box
 from learn3d.fitting.cutting import Box, correct, cut_out, find_mask
-from learn3d.pictures.studio import natural_look, photograph
+from learn3d.pictures.studio import PALETTES, natural_look, photograph
 from learn3d.reconstruction import Model, mesh_bytes, reconstruct_picture
 from learn3d.shapes import make_shape
 
@@ -97,7 +97,7 @@ def example(category: str) -> bytes:
     rng = np.random.default_rng(EXAMPLES[category])
     mesh = make_shape(category, rng)
     vertices = np.float32(mesh.vertices @ mesh_to_object("y", "z").T)
-    colors, lights = natural_look(vertices, mesh.faces, rng)
+    colors, lights = natural_look(vertices, mesh.faces, rng, PALETTES[category])
     azimuth = rng.choice([-1, 1]) * rng.uniform(20, 70)
     camera = nmr.LookAt.from_angles(DISTANCE, 22.0, [azimuth], half_fov_deg=HALF_FOV_DEG)
     rgb, alpha = photograph(vertices, mesh.faces, colors, camera, image_size=SIDE, lights=lights)

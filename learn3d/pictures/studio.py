@@ -66,15 +66,32 @@ def photograph(
     return np.ascontiguousarray(pixels[..., :3]), np.ascontiguousarray(pixels[..., 3])
 
 
-def natural_look(vertices: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, nmr.Lights]:
+#: Colours that go together, for pictures that people look at.
+PALETTES = {
+    "airplane": ((0.93, 0.93, 0.9), (0.78, 0.16, 0.13), (0.1, 0.2, 0.4)),
+    "car": ((0.75, 0.13, 0.1), (0.13, 0.13, 0.15), (0.2, 0.2, 0.22)),
+    "chair": ((0.62, 0.38, 0.2), (0.12, 0.42, 0.42), (0.9, 0.82, 0.66)),
+    "lamp": ((0.8, 0.6, 0.26), (0.94, 0.86, 0.68), (0.25, 0.18, 0.14)),
+    "sofa": ((0.76, 0.34, 0.2), (0.93, 0.84, 0.68), (0.6, 0.27, 0.17)),
+    "table": ((0.58, 0.36, 0.2), (0.82, 0.64, 0.4), (0.22, 0.24, 0.26)),
+}
+
+
+def natural_look(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    rng: np.random.Generator,
+    palette: Sequence[Sequence[float]] | None = None,
+) -> tuple[np.ndarray, nmr.Lights]:
     """Random colours [F, 3] and lights for a mesh [V, 3], [F, 3].
 
     Connected parts with the same number of faces get the same colour out of three. The light comes from any side.
+    palette: the three colours; None for random ones.
     """
     joined = coo_array((np.ones(len(faces) * 2), (faces[:, :2].ravel(), faces[:, 1:].ravel())), 2 * [len(vertices)])
     part = connected_components(joined, directed=False)[1][faces[:, 0]]
     kinds = np.unique(np.bincount(part)[part], return_inverse=True)[1]
-    palette = np.array([_material(rng) for _ in range(3)])
+    palette = np.array(palette or [_material(rng) for _ in range(3)])
     colors = palette[rng.choice(3, size=kinds.max() + 1, p=(0.6, 0.25, 0.15))][kinds]
     side, height = rng.normal(size=2), rng.uniform(0.3, 1.5)
     return colors, studio_lights((side[0], height, side[1]), rng.uniform(0.35, 0.7))
