@@ -186,8 +186,8 @@ def _read(
     try:
         check_mask(mask, cropped=not searched)
     except ValueError as error:
-        advice = ". Cut the object out (transparency), or give --masks" if searched else ""
-        raise ValueError(f"{mask_path or path}: {error}{advice}") from None
+        missed = "no object was found in it. Cut the object out (transparency), or give --masks"
+        raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
     return colors, mask
 
 

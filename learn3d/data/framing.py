@@ -20,6 +20,9 @@ from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
 
 MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 TOLERANCE = 0.12  # default of `threshold_mask`
+PLAIN_HOLE = 0.5  # share of a hole that must have the colour of the background for it to stay open
+JPEG_NOISE = 6  # levels by which compression changes the background near an object
+HOLES = 0.001, 0.4  # sizes that it may have then, as shares of the object; a larger one is often a white table top
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
 SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop (the box) and of the largest
@@ -108,16 +111,25 @@ def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
 
 
 def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Mask an object on a plain background, with holes filled: uint8 [H, W], 0 or 255.
+    """Mask an object on a plain background: uint8 [H, W], 0 or 255.
 
     colors: uint8 [H, W, 3]. The background colour is the median of the border. A pixel belongs to the object if a
-    channel differs from it by more than `tolerance` (0 .. 1).
+    channel differs from it by more than `tolerance` (0 .. 1). Holes are filled, but for some with the colour of the
+    background, which is seen between the rungs of a chair.
     """
     from scipy import ndimage  # imported here, as the sandbox's workers import this module
 
     border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
-    difference = np.abs(colors - np.median(border, axis=0)).max(axis=2)
-    return 255 * ndimage.binary_fill_holes(difference > 255 * tolerance).astype(np.uint8)
+    background = np.median(border, axis=0)
+    difference, noise = (np.abs(pixels - background).max(axis=-1) for pixels in (colors, border))
+    found = difference > 255 * tolerance
+    inside = ndimage.binary_fill_holes(found)
+    holes, count = ndimage.label(inside & ~found)
+    numbers = np.arange(1, count + 1)
+    plain = ndimage.mean(difference <= max(JPEG_NOISE, np.percentile(noise, 90)), holes, numbers) > PLAIN_HOLE
+    share = ndimage.sum(holes > 0, holes, numbers) / max(1, inside.sum())
+    seen_through = plain & (share > HOLES[0]) & (share < HOLES[1])
+    return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
 
 
 def largest_region(mask: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -45,7 +45,7 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
     written = reconstruct_files(*where, plain_background=True)
     assert len(trimesh.load(written[0], force="mesh").faces) > 100
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
-    with pytest.raises(ValueError, match=r"plain.png: its mask is empty.* or give --masks"):
+    with pytest.raises(ValueError, match=r"plain.png: no object was found .* or give --masks"):
         _read(tmp_path / "plain.png", None, threshold_mask)
     picture[40:80, 120:150] = 0
     Image.fromarray(picture).save(tmp_path / "two.png")
