@@ -31,10 +31,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         BASE | {"preset": "gadelha2017-kato", "iterations": 4},
         "encoder_from_step=53051 is after the last of 4 iterations: .* such as 3",
     ),
-    "bank": (
-        BASE | {"settings": {"bank_size": 3}},
-        r"\(--bank-size\): batch_size must lie in 2 .. 3, got 32",
-    ),
+    "bank": (BASE | {"settings": {"bank_size": 3}}, r"\(--bank-size\): batch_size must lie in 2 .. 3, got 32"),
     "form": (BASE | {"settings": {"prior_form": "cube"}}, "prior_form must be 'squared' or 'norm'"),
     "settings": (BASE | {"settings": 3}, "takes PlusSettings, got int"),
     "rate": (BASE | {"settings": {"learning_rate": "x"}}, "learning_rate must be a number, got 'x'"),

@@ -269,10 +269,7 @@ def chain(vertices, matrix, intrinsics, distortion, origin, extent, perspective)
         k1, k2, p1, p2, k3 = distortion[:, None].unbind(-1)
         r2 = x**2 + y**2
         radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        x, y = (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
-            y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
-        )
+        x, y = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y)
     q = torch.stack([x, y], dim=-1) / extent[:, None, None]
     xy = q @ intrinsics[:, :, :2].mT + intrinsics[:, None, :, 2]
     return torch.cat([xy, u[..., 2:]], dim=-1)

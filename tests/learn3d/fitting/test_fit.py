@@ -120,8 +120,7 @@ def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_m
 
 
 def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
-    leg = trimesh.creation.box((0.1, 0.4, 0.1))
-    box, faces = torch.tensor(leg.vertices), torch.tensor(leg.faces)
+    box, faces = map(torch.tensor, (trimesh.creation.box((0.1, 0.4, 0.1)).vertices, trimesh.creation.box().faces))
     places = torch.tensor([(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)])  # two legs, and another part near
     vertices, faces = (box + places[:, None]).flatten(0, 1), torch.cat([faces, faces + 8, faces + 16])
     clear = np.arange(24) % 24 // 8 != 1
