@@ -23,6 +23,8 @@ namespace {
 
 // Faces or pixels of a row that are worked on together, and pixels per side of a block.
 constexpr int64_t kTogether = 8;
+constexpr int64_t kBandPixels = int64_t(1) << 16;  // per band, each with 12 bytes; no fewer for this reason
+constexpr int64_t kPixelsPerFace = 64;             // per band and face, at least, if bands are small
 constexpr int64_t kChunk = 2048;  // faces that one thread sets up together
 
 // Data of eight faces for the fill.
@@ -65,8 +67,8 @@ struct BandScratch {
   std::vector<T> columns, rows;  // [W + 8] and [H + 8] pixel centres in [-1, 1]
   Size raster{0, 0};             // for which they are computed
   // [rows, W + 8] bounds of the nearest face's q; -infinity on background; 8 more at the end.
-  std::vector<T> most, least;
-  std::vector<int32_t> face_index;  // the nearest face
+  Buffer<T> most, least;
+  Buffer<int32_t> face_index;  // the nearest face
   // [rows / 8, W / 8] the smallest of `least` in a block: the second pass skips faces behind it.
   std::vector<T> block_least;
 };
@@ -122,13 +124,16 @@ void rasterize(const Rasterize<T>& args) {
   const int64_t H = raster.height, W = raster.width, batch = args.mesh.batch;
   // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
-  const int64_t bands = share ? std::min<int64_t>(args.num_threads * 4, (H + 2 * kTogether - 1) / (2 * kTogether)) : 1;
   parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {
     FaceTable<T>& table = thread_scratch<FaceTable<T>>();
     const int64_t num_faces = args.mesh.face_count(b);
     table.reserve_faces(num_faces);
     const Image<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), num_faces, args.settings, &table};
     const int threads = share ? args.num_threads : 1;
+    // A band's memory should fit into a core's cache, but every band looks at all faces.
+    const int64_t small = std::min(H * W / kBandPixels, H * W / (kPixelsPerFace * std::max<int64_t>(num_faces, 1)));
+    const int64_t bands = std::clamp<int64_t>(std::max<int64_t>(share ? threads * 4 : 1, small), 1,
+                                              (H + 2 * kTogether - 1) / (2 * kTogether));
     parallel_for((num_faces + kChunk - 1) / kChunk, threads,
                  [&](int64_t chunk) { NMR_AT_BEST_LEVEL(set_up_faces, image, chunk); });
     parallel_for(bands, threads, [&](int64_t n) {

@@ -16,11 +16,11 @@ template <class T>
 struct ScanlineColors {
   // [N, blocks, 1 + 2 C, 8] position on the line in pixels, ascending; colour; gradient. What belongs to eight
   // pixels is contiguous. The last block is filled with zeros, which have no effect.
-  std::vector<T> values;
-  std::vector<int32_t> face_index;  // [N, blocks, 8]
+  Buffer<T> values;
+  Buffer<int32_t> face_index;  // [N, blocks, 8]
   std::vector<int32_t> count;       // [N + pad] number of listed pixels
   // Number of listed pixels of line n before pixel m, for m up to M: before[n * step_n + m * step_m].
-  std::vector<int32_t> before;
+  Buffer<int32_t> before;
   std::vector<T>
       outer_end[2];  // [N + pad] by direction: a crossing before this has a listed pixel beyond its outer one
   std::vector<T> inner_start[2];  // [N + pad] by direction: a crossing before this has no listed pixel of a face inside

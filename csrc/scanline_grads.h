@@ -18,7 +18,7 @@ template <class T>
 struct ScanlineGrads {
   // [N, pad + M + pad] background pixels with gradient < 0, ascending, and -gradient. Their neighbours in the padding
   // have positions before and after every pixel.
-  std::vector<T> position, weight;
+  Buffer<T> position, weight;
   std::vector<int32_t> count;  // [N] their number
   // [N + pad] by direction: a crossing before outer_end has a pulling pixel beyond it; one before inner_start has no
   // pixel with gradient > 0 inside.
@@ -27,7 +27,7 @@ struct ScanlineGrads {
 
   void reserve_lines(int64_t N, int64_t M) {
     stride = M + 2 * kPad;
-    for (std::vector<T>* v : {&position, &weight}) reserve(*v, N * stride);
+    for (Buffer<T>* v : {&position, &weight}) reserve(*v, N * stride);
     for (std::vector<T>* v : {&outer_end[0], &outer_end[1], &inner_start[0], &inner_start[1]}) reserve(*v, N + kPad);
     reserve(count, N);
   }

@@ -16,7 +16,8 @@ namespace nmr {
 class ThreadScratch {
  public:
   // A thread whose buffers have grown by more than this since it last freed them frees them when it has finished.
-  static constexpr int64_t kLimit = int64_t(64) << 20;
+  // One image of 1024x1024 with anti-aliasing needs 118 MB.
+  static constexpr int64_t kLimit = int64_t(128) << 20;
 
   static ThreadScratch& mine() {
     static thread_local ThreadScratch scratch;
@@ -115,14 +116,29 @@ Scratch& thread_scratch() {
   return ThreadScratch::mine().get<Scratch>();
 }
 
+// An allocator that does not set new numbers: large buffers of which a part is used are not touched as a whole.
+template <class T>
+struct Unset : std::allocator<T> {
+  template <class U>
+  struct rebind {
+    using other = Unset<U>;
+  };
+  template <class U>
+  void construct(U* place) {
+    ::new (static_cast<void*>(place)) U;
+  }
+};
+template <class T>
+using Buffer = std::vector<T, Unset<T>>;
+
 // Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) the buffer is
 // new, has exactly this size, and all its bits are set, which is NaN in a floating-point number: sanitizers and tests
 // then notice reads beyond it and reads of unwritten values.
-template <class T>
-T* reserve(std::vector<T>& buffer, size_t size) {
+template <class T, class Allocator>
+T* reserve(std::vector<T, Allocator>& buffer, size_t size) {
   if (buffer.size() < size) ThreadScratch::mine().count(static_cast<int64_t>((size - buffer.size()) * sizeof(T)));
 #ifdef NMR_FRESH_SCRATCH
-  buffer = std::vector<T>(size);
+  buffer = std::vector<T, Allocator>(size);
   if constexpr (std::is_trivially_copyable_v<T>)
     if (size > 0) std::memset(static_cast<void*>(buffer.data()), 0xff, size * sizeof(T));
 #endif
