@@ -153,9 +153,10 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
   lines[1].reserve_lines(1, H, W, C);
   sweep_image(
       image, C, num_threads,
-      [&](uint8_t* seen, int32_t* ids) {
-        return NMR_AT_BEST_LEVEL(find_visible, image.face_index, raster.pixels(), image.num_faces, seen, ids);
+      [&](int64_t first, int64_t last, uint8_t* seen) {
+        NMR_AT_BEST_LEVEL(mark_visible, image.face_index + first, last - first, image.num_faces, seen);
       },
+      [&](uint8_t* seen, int32_t* ids) { return NMR_AT_BEST_LEVEL(list_visible, image.num_faces, seen, ids); },
       [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_resolved, args.image.pixels() * C); },
       [&](const LineRange& range, T* grad_row) { NMR_AT_BEST_LEVEL(collect_colors, image, range, grad_row); },
       [&](const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {

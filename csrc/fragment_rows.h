@@ -10,8 +10,8 @@ template <class T>
 NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& scratch) {
   const int64_t W = block.raster.width, F = block.num_faces;
   int32_t *ids = scratch.ids.data(), *slots = scratch.slots.data() + 1;
-  scratch.count =
-      find_visible(block.face_index + block.first * W, (block.last - block.first) * W, F, scratch.seen.data(), ids);
+  mark_visible(block.face_index + block.first * W, (block.last - block.first) * W, F, scratch.seen.data());
+  scratch.count = list_visible(F, scratch.seen.data(), ids);
   slots[-1] = 0;
   T* table = scratch.table.data();
   for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);

@@ -27,7 +27,7 @@ constexpr int64_t kEntry = 16;
 // Memory for one block. Faces that own a pixel are numbered from 1, ascending; the background is number 0.
 template <class T>
 struct FragmentScratch {
-  std::vector<uint8_t> seen;   // [2 F + 1 + 8] of find_visible
+  std::vector<uint8_t> seen;   // [2 F + 1 + 8] of mark_visible
   // [2 F + 1] number of face index id at [id + 1]; defined for visible faces and background.
   std::vector<int32_t> slots;
   std::vector<int32_t> ids;    // [visible + 8] face index of face n at [n - 1]

@@ -19,6 +19,8 @@
 namespace nmr {
 namespace {
 
+constexpr int64_t kBandPixels = int64_t(1) << 16;  // of an image, that one task averages
+
 template <class T>
 struct Lines {
   ScanlineGrads<T> lines[2];  // [0] columns: lines of constant x, swept along y; [1] rows
@@ -26,18 +28,21 @@ struct Lines {
 
 }  // namespace
 
-// Images in parallel.
+// Bands of rows of all images in parallel.
 template <class T>
 void silhouette_forward(const SilhouetteForward<T>& args) {
   const Size image = args.image, raster = raster_of(image, args.anti_aliasing);
-  parallel_for(args.batch, args.num_threads, [&](int64_t b) {
-    const int32_t* face_index = args.face_index + b * raster.pixels();
-    T* alpha = args.alpha + b * image.pixels();
+  const int64_t bands = std::min(image.height, image.pixels() / kBandPixels + 1);
+  parallel_for(args.batch * bands, args.num_threads, [&](int64_t n) {
+    const int64_t b = n / bands, k = n % bands, first = k * image.height / bands;
+    const Size band{(k + 1) * image.height / bands - first, image.width};
+    const int32_t* face_index = args.face_index + b * raster.pixels() + first * (raster.pixels() / image.height);
+    T* alpha = args.alpha + b * image.pixels() + first * image.width;
     if (!args.anti_aliasing) {
-      for (int64_t n = 0; n < image.pixels(); ++n) alpha[n] = face_index[n] >= 0 ? T(1) : T(0);
+      for (int64_t i = 0; i < band.pixels(); ++i) alpha[i] = face_index[i] >= 0 ? T(1) : T(0);
       return;
     }
-    NMR_AT_BEST_LEVEL(average_coverage, face_index, image, alpha);
+    NMR_AT_BEST_LEVEL(average_coverage, face_index, band, alpha);
   });
 }
 
@@ -66,9 +71,10 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
     lines[1].reserve_lines(raster.height, raster.width);
     sweep_image(
         image, 1, share ? args.num_threads : 1,
-        [&](uint8_t* seen, int32_t* ids) {
-          return NMR_AT_BEST_LEVEL(find_visible, image.face_index, raster.pixels(), image.num_faces, seen, ids);
+        [&](int64_t first, int64_t last, uint8_t* seen) {
+          NMR_AT_BEST_LEVEL(mark_visible, image.face_index + first, last - first, image.num_faces, seen);
         },
+        [&](uint8_t* seen, int32_t* ids) { return NMR_AT_BEST_LEVEL(list_visible, image.num_faces, seen, ids); },
         [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_alpha, args.image.pixels()); },
         [&](const LineRange& range, T* grad_row) { NMR_AT_BEST_LEVEL(collect_lines, image, range, grad_row); },
         [&](const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {

@@ -137,8 +137,10 @@ Size require_face_index(const Array<int32_t>& face_index, int64_t batch, const F
   const int64_t pixels = face_index.shape(1) * face_index.shape(2);
   const int32_t* entries = face_index.data();
   const py::gil_scoped_release release;
-  parallel_for(batch, num_threads, [&](int64_t b) {
-    require(are_face_indices(entries + b * pixels, pixels, face_count(b)),
+  const int64_t parts = pixels / (int64_t(1) << 18) + 1;  // of each image
+  parallel_for(batch * parts, num_threads, [&](int64_t n) {
+    const int64_t b = n / parts, k = n % parts, first = k * pixels / parts, last = (k + 1) * pixels / parts;
+    require(are_face_indices(entries + b * pixels + first, last - first, face_count(b)),
             "the face index map does not belong to these faces");
   });
   return {face_index.shape(1), face_index.shape(2)};
