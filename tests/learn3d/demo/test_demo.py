@@ -25,8 +25,7 @@ from learn3d.runs.export import export
 def photo() -> np.ndarray:
     """A grey, noisy background with a dark ring around a paler disc, and a dark speck."""
     colors = np.random.default_rng(0).integers(180, 200, (100, 160, 3)).astype(np.uint8)
-    rows, columns = np.ogrid[:100, :160]
-    distance = np.hypot(rows - 50, columns - 80)
+    distance = np.hypot(*np.ogrid[-50:50, -80:80])
     colors[(distance < 30) & (distance > 15)] = (60, 30, 40)
     colors[distance <= 15] = 210
     colors[10:12, 10:12] = 0
@@ -35,9 +34,8 @@ def photo() -> np.ndarray:
 
 def test_the_mask_is_the_largest_region_and_only_the_background_makes_holes(photo) -> None:
     mask, more = largest_region(threshold_mask(photo, 0.2))
-    rows, columns = np.ogrid[:100, :160]
     assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
-    assert np.array_equal(mask > 0, np.hypot(rows - 50, columns - 80) < 30)
+    assert np.array_equal(mask > 0, np.hypot(*np.ogrid[-50:50, -80:80]) < 30)
     assert not more and not threshold_mask(photo, 0.9).any()
     photo[45:55, 75:85] = photo[:10, :10]
     assert (largest_region(threshold_mask(photo, 0.05))[0] == 0)[45:55, 75:85].all(), "the background is seen"
