@@ -8,7 +8,9 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+import skimage.color
 import torch
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from sklearn.dummy import DummyClassifier
 from sklearn.manifold import TSNE
@@ -45,7 +47,7 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
     rows = -(-len(runs) // columns)
     figure = Figure(figsize=(side * columns + 1.6, (side + 0.5) * rows))
     grid = figure.add_gridspec(rows, columns + 1, width_ratios=[side] * columns + [1.3], wspace=0.1, hspace=0.28)
-    wheel = mpl.colormaps["twilight"]  # cyclic, and safe for every kind of colour vision
+    wheel = ListedColormap(cyclic_colors())
     for index, run in enumerate(runs):
         dataset = run.dataset
         samples = spread_samples(dataset.object_ids, dataset.view_ids, min(MOST_CODES, len(dataset)))
@@ -100,6 +102,17 @@ def view_accuracy(codes: np.ndarray, view_ids: np.ndarray, object_ids: np.ndarra
     models = KNeighborsClassifier(neighbours), DummyClassifier(strategy="most_frequent")
     right = [[model.fit(codes[a], view_ids[a]).score(codes[b], view_ids[b]) for a, b in folds] for model in models]
     return tuple(np.average(shares, weights=[len(b) for _, b in folds]) for shares in right)
+
+
+def cyclic_colors(count: int = 256) -> np.ndarray:
+    """A cyclic colour map, float [count, 3] in [0, 1], that is safe for every kind of colour vision.
+
+    A circle in CIE Lab through lightness and the blue-yellow axis: dark violet, blue, light green, brown. Opposite
+    directions differ clearly, and no colour is too light for a white page.
+    """
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    lab = np.stack([54 - 28 * np.cos(angle), 24 * np.cos(angle) - 16 * np.sin(angle), -50 * np.sin(angle)], axis=1)
+    return skimage.color.lab2rgb(lab[None])[0].clip(0, 1)
 
 
 @_styled

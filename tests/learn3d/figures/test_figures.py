@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import skimage.color
 import torch
 from PIL import Image
 from tiny_networks import FixedMethod
@@ -25,8 +26,6 @@ from learn3d.runs import checkpoint
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
-
-import matplotlib as mpl
 
 from learn3d.figures import paper, tsne
 from learn3d.pages import report
@@ -230,12 +229,12 @@ def test_an_embedding_keeps_neighbours_and_is_always_the_same() -> None:
 def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set, tmp_path, monkeypatch) -> None:
     points = np.random.default_rng(0).normal(size=(72, 2)).astype(np.float32)
     monkeypatch.setattr(tsne, "embed", lambda codes: points)
-    runs, wheel = [Run("$\\bad$", Ellipsoids(), tiny_set), Run("b", Ellipsoids(), tiny_set)], mpl.colormaps["twilight"]
+    runs, wheel = [Run("$\\bad$", Ellipsoids(), tiny_set), Run("b", Ellipsoids(), tiny_set)], tsne.cyclic_colors()
     scatter = tsne.draw_tsne(runs).axes[0].collections[0]
     azimuths = azimuths_deg(tiny_set.poses).numpy() % 360
     for position, color in zip(scatter.get_offsets(), scatter.get_facecolors(), strict=True):
         (index,) = np.flatnonzero((points == position).all(axis=1))
-        assert np.allclose(color[:3], wheel(azimuths[index] / 360)[:3], atol=1e-6)
+        assert np.allclose(color[:3], wheel[int(azimuths[index] / 360 * 256)], atol=1e-6)
     written = paper.save_tsne(runs, tmp_path / "new" / "maps.svg")
     assert written == [tmp_path / "new" / "maps.png", tmp_path / "new" / "maps.svg"]
     assert Image.open(written[0]).size > (800, 400)
@@ -243,6 +242,15 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set,
     assert all(words in text for words in ("$\\bad$", "view told from the code: ", " % (chance 4 %)", "90°"))
     paper.save_tsne(runs, tmp_path / "again")
     assert (tmp_path / "again.svg").read_text() == text
+
+
+def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
+    lab = skimage.color.rgb2lab(tsne.cyclic_colors(72)[None])[0]
+    steps = np.linalg.norm(np.diff(lab, axis=0, append=lab[:1]), axis=1)
+    assert steps.max() < 8  # no jump, at the end neither
+    lightness_and_blue = lab[:, [0, 2]]  # the colours that remain without red-green vision
+    opposite = np.linalg.norm(lightness_and_blue - np.roll(lightness_and_blue, 36, axis=0), axis=1)
+    assert opposite.min() > 45 and lab[:, 0].max() < 85  # none vanishes on white
 
 
 def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:
