@@ -1,6 +1,5 @@
 """load_obj and save_obj of neural_renderer."""
 
-import builtins
 import os
 import sys
 
@@ -160,14 +159,7 @@ def test_textures_of_another_material_file(tmp_path):
 
 def test_images_without_pillow(tmp_path, monkeypatch):
     path, _ = materials(tmp_path)
-    original = builtins.__import__
-
-    def without_pillow(name, *args, **kwargs):
-        if name.startswith("PIL"):
-            raise ImportError(name)
-        return original(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_pillow)
+    monkeypatch.setitem(sys.modules, "PIL", None)  # importing it fails
     assert len(nr.load_obj(path)) == 2
     with pytest.raises(ImportError, match=r"pip install pillow"):
         nr.load_obj(path, load_texture=True)
