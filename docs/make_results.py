@@ -23,7 +23,7 @@ def rows(name: str, part: str) -> list[list[str]]:
 
     part: a table of the file, or one made of "main" and "differences": "both" puts the difference under each method,
     "side" puts paper, here and difference of a single category side by side, "seeds" adds the mean difference over
-    seeds as a last column.
+    seeds as a last column, "means" leaves the means over seeds of "poses".
     """
     tables = json.loads((DOCS / "results" / f"{name}.json").read_text())
     if part == "seeds":
@@ -33,6 +33,10 @@ def rows(name: str, part: str) -> list[list[str]]:
         lines = [[*row, means.pop(tuple(row[:2]), "")] for row in main]
         last = [[name, title, *[""] * (len(header) - 2), mean] for (name, _), mean in means.items()]
         return [[*header, f"{title}: {spread}"], *lines, *last]
+    if part == "means":
+        header, *lines = tables["poses"]
+        kept = [k for k, name in enumerate(header) if name != "seed"]
+        return [[line[k] for k in kept] for line in [header, *(line for line in lines if line[1] == "mean")]]
     if part not in ("both", "side"):
         return [row for row in tables[part] if row[1] != "here (kato19)"]
     header, *main = [row for row in tables["main"] if row[1] != "here (kato19)"]
