@@ -124,11 +124,11 @@ def test_running_out_of_memory_is_an_exception():
     code = (
         "import resource, torch, nmr\n"
         "torch.set_num_threads(2)\n"
-        "v, f = nmr.icosphere(1); v = (v * .3 + torch.tensor([0, 0, 2.])).expand(2, -1, -1)\n"
-        "nmr.render_silhouette(v, f, image_size=64)\n"
+        "v, f = nmr.icosphere(1); v = (v * .3 + torch.tensor([0, 0, 2.])).repeat(2, 1, 1)\n"
+        "v.requires_grad_(); nmr.render_silhouette(v, f, image_size=64).sum().backward()\n"
         "held = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (held + 3 * 2**30, -1))\n"
-        "try: nmr.render_silhouette(v, f, image_size=8192)\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (held + 2**28, -1))\n"  # the gradient takes more
+        "try: nmr.render_silhouette(v, f, image_size=2048).sum().backward()\n"
         "except (MemoryError, RuntimeError): print('refused')\n"
         "nmr.render_silhouette(v, f, image_size=64); print('alive')"
     )
