@@ -23,8 +23,8 @@ namespace {
 
 // Faces or pixels of a row that are worked on together, and pixels per side of a block.
 constexpr int64_t kTogether = 8;
-constexpr int64_t kBandPixels = int64_t(1) << 16;  // per band, each with 12 bytes; no fewer for this reason
-constexpr int64_t kPixelsPerFace = 64;             // per band and face, at least, if bands are small
+constexpr int64_t kBandPixels = int64_t(1) << 16;  // of a band whose memory, 12 bytes a pixel, fits into a cache
+constexpr int64_t kPixelsPerFace = 64;             // least pixels of such a band for each face
 constexpr int64_t kChunk = 2048;  // faces that one thread sets up together
 
 // Data of eight faces for the fill.
@@ -130,7 +130,7 @@ void rasterize(const Rasterize<T>& args) {
     table.reserve_faces(num_faces);
     const Image<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), num_faces, args.settings, &table};
     const int threads = share ? args.num_threads : 1;
-    // A band's memory should fit into a core's cache, but every band looks at all faces.
+    // Small bands fit into a core's cache, but every band looks at all faces.
     const int64_t small = std::min(H * W / kBandPixels, H * W / (kPixelsPerFace * std::max<int64_t>(num_faces, 1)));
     const int64_t bands = std::clamp<int64_t>(std::max<int64_t>(share ? threads * 4 : 1, small), 1,
                                               (H + 2 * kTogether - 1) / (2 * kTogether));

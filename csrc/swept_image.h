@@ -16,7 +16,7 @@ namespace nmr {
 // Memory for one image.
 template <class T>
 struct SweptFaces {
-  std::vector<uint8_t> seen;  // [threads, 2 F + 1 + pad]
+  std::vector<uint8_t> seen;  // [parts, 2 F + 1 + pad]
   std::vector<int32_t> ids;   // [visible faces + pad] their face indices
   std::vector<T> grad;        // [visible faces, 3, 2] gradients of x and y of their corners, in drawing order
 };
@@ -37,16 +37,19 @@ struct SweepTask {
 //   collect(range, grad_row)          lists the pixels of some lines that can pull
 //   sweep(ids, first, last, block, grad)   writes the gradients of some of these faces
 template <class T, class Image, class Mark, class List, class Finite, class Collect, class Sweep>
-void sweep_image(const Image& image, int64_t channels, int num_threads, const Mark& mark, const List& list, const Finite& finite,
-                 const Collect& collect, const Sweep& sweep, T* grad_vertices) {
+void sweep_image(const Image& image, int64_t channels, int num_threads, const Mark& mark, const List& list,
+                 const Finite& finite, const Collect& collect, const Sweep& sweep, T* grad_vertices) {
   const int64_t H = image.raster.height, W = image.raster.width;
   SweptFaces<T>& faces = thread_scratch<SweptFaces<T>>();
-  const int64_t parts = std::max(num_threads, 1), marks = 2 * image.num_faces + 1 + kPad;
+  // Several threads mark the faces of a part of the pixels each, unless there are almost as many faces as pixels.
+  const int64_t marks = 2 * image.num_faces + 1 + kPad;
+  const int64_t parts = std::max<int64_t>(std::min<int64_t>(num_threads, H * W / (4 * marks)), 1);
   uint8_t* seen = reserve(faces.seen, parts * marks);
   int32_t* ids = reserve(faces.ids, std::min(2 * image.num_faces, H * W) + kPad);
   parallel_for(parts, num_threads,
                [&](int64_t k) { mark(k * H * W / parts, (k + 1) * H * W / parts, seen + k * marks); });
-  for (int64_t n = marks; n < parts * marks; ++n) seen[n % marks] |= seen[n];
+  for (int64_t k = 1; k < parts; ++k)
+    for (int64_t e = 0; e < marks; ++e) seen[e] |= seen[k * marks + e];
   const int64_t count = list(seen, ids);
   if (count == 0) return;
   T* grad = reserve(faces.grad, 6 * count);

@@ -11,7 +11,7 @@ void mark_visible(const int32_t* face_index, int64_t pixels, int64_t num_faces, 
   for (; n < pixels; ++n) seen[face_index[n] + 1] = 1;
 }
 
-// Writes the face indices of the marked faces to ids, ascending, and returns their number; ids has room for kLanes more.
+// Writes the face indices of the marked faces to ids, ascending; returns their number. ids has room for kLanes more.
 int64_t list_visible(int64_t num_faces, uint8_t* seen, int32_t* ids) {
   seen[0] = 0;  // the background
   int64_t count = 0;

@@ -38,8 +38,10 @@ def icons(package: Path) -> list[tuple[int, str, Image.Image]]:
 
 
 def main(output: Path, half: int = 1, count: int = 30, side: int = 128) -> None:
-    """Write OUTPUT/half-H.png: the first `count` icons of Debian's sweethome3d-furniture with an odd (half 1) or even
-    (half 0) CRC, and their meshes. Row titles: category, and what the picture was taken for; W: with a warning.
+    """Write OUTPUT/half-H.png: icons of Debian's sweethome3d-furniture, and the meshes made of them, one in a row.
+
+    The icons are in two halves, those with an even CRC (half 0) and with an odd one (half 1); the first `count` of a
+    half are drawn. The title of a row is the category, and what the picture was taken for; W means a warning.
     """
     output.mkdir(parents=True, exist_ok=True)
     model, rows, titles = load_model(None), [], []

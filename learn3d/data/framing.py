@@ -20,9 +20,9 @@ from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
 
 MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 TOLERANCE = 0.12  # default of `threshold_mask`
-PLAIN_HOLE = 0.5  # share of a hole that must have the colour of the background for it to stay open
 JPEG_NOISE = 6  # levels by which compression changes the background near an object
-HOLES = 0.001, 0.4  # sizes that it may have then, as shares of the object; a larger one is often a white table top
+PLAIN_HOLE = 0.5  # a hole of the mask shows the background if more than this share of it has the background's colour,
+HOLES = 0.001, 0.4  # and its size, as a share of the object, lies between these; larger ones are often white table tops
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
 SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop (the box) and of the largest

@@ -141,7 +141,7 @@ def _configure(
         settings=dataclasses.replace(preset.settings.for_iterations(iterations), **settings),
         layout=layout,
         iterations=iterations,
-        batch_size=changes.pop("batch_size", batch_size // divisor),
+        batch_size=batch_size // divisor * variant.batch_factor,
         seed=seed,
         device=request.device,
         threads=request.threads,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from learn3d.data.layouts import Layout
+from learn3d.data.sampling import GROUP_SIZE
 from learn3d.methods.plus import PlusSettings
 from learn3d.presets import full_name
 
@@ -27,10 +28,10 @@ class Variant:
     """A preset with changes. Its name is that of its run folders, so equal names mean the same runs in every table."""
 
     preset: str
-    changes: Mapping[str, Any] = field(default_factory=dict)  # settings of the method and options of the training; a
-    # "batch_size" here replaces the divided one
+    changes: Mapping[str, Any] = field(default_factory=dict)  # settings of the method and options of the training
     checkpoint: Literal["last", "best"] = "last"  # networks to test: the last ones, or the best on the validation split
     batch_divisor: int = 1  # divides the batch size and multiplies the iterations, so that as many images are seen
+    batch_factor: int = 1  # multiplies the batch size, if a batch also has images that are not encoded
     estimates_poses: bool = False  # azimuths are estimated with the run's seed, and turned into the data's frame
     length_of: str = ""  # preset whose batch size and iterations count; "" means its own
 
@@ -86,10 +87,12 @@ def _kato(changes: Mapping[str, Any], method: str = "proposed", **options: Any) 
     return Variant(full_name(method), changes, **options)
 
 
-def _supervision(method: str, changes: Mapping[str, Any] | None = None) -> Variant:
-    """A method with the networks, losses and schedule of many views, on as many encoded images as Plus sees."""
-    options = {"batch_divisor": _BATCH_DIVISOR, "length_of": full_name("proposed")}
-    return _kato(_SCHEDULE | _SUPERVISION | (changes or {}), method, **options)
+def _supervision(method: str, **options: Any) -> Variant:
+    """A method with the networks, smoothness and schedule of the table of supervision; it encodes as many images as
+    Plus.
+    """
+    options |= {"batch_divisor": _BATCH_DIVISOR, "length_of": full_name("proposed")}
+    return _kato(_SCHEDULE | _SUPERVISION, method, **options)
 
 
 #: By name. Without the confusion loss the discriminator has no effect on the encoder, so its own loss is off, too.
@@ -115,7 +118,7 @@ VARIANTS: dict[str, Variant] = {
     "vanilla-shared": _kato(_SHARED, "vanilla", batch_divisor=_BATCH_DIVISOR),
     "single-views": _supervision("vanilla"),
     "pairs": _supervision("multi-view"),
-    "five-views": _supervision("many-views", {"batch_size": 160}),  # one of five is encoded
+    "five-views": _supervision("many-views", batch_factor=GROUP_SIZE),  # one of each group is encoded
     "plus-without-symmetry": _plus("kato", {"symmetry": None}),
     "plus-without-novel-views": _plus("kato", {"lambda_novel_view": 0.0}),
 }

@@ -1,4 +1,4 @@
-"""Finds the camera of a framed picture: the view in which the silhouette of a shape fits the mask best.
+"""Finds the camera of a framed picture: the view from which the silhouette of a shape is most like the mask.
 
 A picture is framed if the bounding box of its mask is centred and its object size is `CENTRED_SIZE`.
 """

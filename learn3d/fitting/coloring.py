@@ -20,7 +20,7 @@ from learn3d.pictures.surfaces import Surface
 DEPTH_SIZE = 256  # side of the depth map that decides which vertices are visible
 BEHIND = 0.02  # distance behind the depth map from which a vertex is hidden, in units of the object frame
 GRAZING = 0.25  # cosine between normal and line of sight below which a colour is not used
-EQUAL = 0.06  # difference of the boxes and heights of two parts below which they count as equal
+EQUAL = 0.06  # two parts are equal if the sizes of their boxes and their heights above the ground differ by less
 BORDER = 2  # width in pixels of the border inside the outline that may have the background's colours; its inner
 # pixels count half, as thin legs have no others
 
@@ -91,8 +91,9 @@ def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> 
     """Spread colours [V, 3] from vertices [V, 3] with a high weight [V] to the others as smoothly as possible.
 
     The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2 + 1e-5 sum_v |c_v - near_v|^2.
-    near_v is the colour of the nearest vertex that is clearly seen, or of the corresponding one of an equal part. It
-    matters for hidden parts that no edge joins to a seen one.
+    So seen vertices (w_v near 1) keep their colours, and neighbours become alike. The last term decides on parts that
+    no edge joins to a seen vertex: near_v is the colour of the nearest vertex that is clearly seen, or of the
+    corresponding one of an equal part.
     """
     clear = (weight >= min(0.5, float(weight.max()))).numpy()
     neighbours = joined(faces.numpy(), len(colors))

@@ -57,7 +57,8 @@ class Templates(NamedTuple):
 def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | None:
     """The templates of a training set; None if one of its categories has none.
 
-    They are the generated shapes (`make-dataset --procedural`) of seed `SEED`, known by their names and voxels.
+    They are the objects that `make-dataset --procedural` generates with the seed `SEED`. They are recognised by their
+    names, and by their voxels, which must be those of the shape with the number in the name.
     """
     categories = [name.strip() for name in dataset.category.split(",")]
     first = np.unique(np.asarray(dataset.object_ids), return_index=True)[1]  # an image of each object

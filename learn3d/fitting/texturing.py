@@ -1,4 +1,4 @@
-"""A texture image for a mesh: each face has a triangle of it, whose colours come from the picture."""
+"""Makes a texture image for a mesh from a picture. Each face of the mesh has a triangle of its own in the image."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ class _Places(NamedTuple):
 def _lay_out(triangles: np.ndarray) -> _Places:
     """Lay triangles [F, 3, 3] out in an image.
 
-    Two triangles with sides of the same kinds share a rectangular cell, with a texel around each that continues it, so
-    that interpolation in one does not see another.
+    Each rectangular cell of the image holds two triangles of the same size. Around a triangle one more texel continues
+    its colours, so that interpolation at its sides does not read another triangle.
     """
     edges = np.linalg.norm(triangles - np.roll(triangles, 1, 1), axis=2)
     order = (edges.argmin(1)[:, None] + np.arange(3)) % 3  # the shortest edge goes down from the first corner

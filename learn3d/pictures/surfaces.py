@@ -97,10 +97,11 @@ def draw_surface(surface: Surface, cameras: Cameras, *, image_size: int) -> np.n
     if len(surface.faces) == 0:
         return np.full((len(cameras), image_size, image_size, 3), 255, np.uint8)
     colored = surface.colors is not None  # colours of a photograph have its light: shade them less
-    colors = surface.colors.detach()[surface.faces].mean(dim=1).numpy() if colored else CLAY
     if surface.texture is not None:
         image, uv = surface.texture
         colors = nmr.UVTexture(image, uv.flatten(0, 1), torch.arange(3 * len(uv)).view(-1, 3))
+    else:
+        colors = surface.colors.detach()[surface.faces].mean(dim=1).numpy() if colored else CLAY
     pictures = []
     for camera in cameras:  # one at a time, to save memory
         direction = torch.tensor(_LIGHT, dtype=torch.float64) @ camera.projection().matrix[0, :, :3]

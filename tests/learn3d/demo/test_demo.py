@@ -23,7 +23,7 @@ from learn3d.runs.export import export
 
 @pytest.fixture
 def photo() -> np.ndarray:
-    """A grey, noisy background with a dark ring around a paler disc, and a dark speck."""
+    """A noisy grey background with a dark ring, a pale disc inside the ring, and a dark dot."""
     colors = np.random.default_rng(0).integers(180, 200, (100, 160, 3)).astype(np.uint8)
     distance = np.hypot(*np.ogrid[-50:50, -80:80])
     colors[(distance < 30) & (distance > 15)] = (60, 30, 40)

@@ -79,7 +79,7 @@ def test_long_edges_are_divided_and_sharp_ones_stay_sharp() -> None:
 
 
 def painted() -> Surface:
-    """A sphere and thin and small triangles with the colours 0.5 + p at p, and none of the vertices' own."""
+    """A sphere and a thin box with a texture: the colour 0.5 + p at the point p. The vertices are black."""
     mesh = trimesh.util.concatenate([trimesh.creation.box((0.9, 0.02, 0.1)), trimesh.creation.icosphere(2, 0.4)])
     vertices, faces = divide(torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces), 0.1)
     return paint(
