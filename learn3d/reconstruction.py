@@ -53,7 +53,7 @@ STRIP_SIZE = 192  # side of each picture in a strip, in pixels
 _OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
 _PLAIN_SIDE = 1024  # side in pixels to which a photograph with a plain background is reduced
 _COLORED = 256  # side in pixels of the picture that gives the colours
-_LONGEST_EDGE = 0.1  # of a coloured template; hidden parts have the colours of its vertices
+_LONGEST_EDGE = 0.1  # longest edge of a coloured template, since hidden parts have the colours of its vertices
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 

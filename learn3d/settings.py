@@ -88,7 +88,7 @@ MOST = 1e30  # largest value of a setting; float32 ends at 3e38
 
 Positive = Annotated[float, Field(gt=0, le=MOST)]
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
-Weight = NonNegative  # of a loss
+Weight = NonNegative  # weight of a loss
 Share = Annotated[float, Field(ge=0, le=1)]
 Step = Annotated[int, Field(ge=1, le=10**9)]  # a training step, counted from 1
 Count = Annotated[int, Field(ge=1)]

@@ -255,7 +255,7 @@ def render_silhouette(
         the image, z = depth). One mesh and a camera with B poses give B images. The meshes of a list may have different
         sizes; they are not padded, and each is drawn as if it were alone.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices. A face is seen from its front where its vertices run counter-clockwise on the screen.
+        Vertex indices. A face is seen from its front if its vertices run counter-clockwise on the screen.
     camera : Camera, optional
         For example :class:`nmr.LookAt`.
     image_size : int or (height, width)
@@ -267,7 +267,7 @@ def render_silhouette(
         Also draw faces that are seen from behind (clockwise on the screen). LookAt, Look and Orthographic show mesh
         files mirrored, so that their outsides are clockwise, unless they are ``right_handed``.
     near, far : float
-        A pixel is covered only where near < depth < far.
+        A pixel is covered only if near < depth < far.
     clip : bool
         Cut the faces that reach behind the plane at depth ``near``, so that their part in front is drawn where it is
         seen, with gradients to their corners. Without this, as in the published renderer, corners behind the eye land
@@ -411,7 +411,7 @@ def render_depth(
     Returns
     -------
     Tensor [B, h, w]
-        ``depth[b, y, x]`` is z of the nearest face at the pixel in row y from the top, ``far`` where there is none.
+        ``depth[b, y, x]`` is z of the nearest face at the pixel in row y from the top, ``far`` on background.
         With anti-aliasing it is the mean of 2x2 pixels, so that edges mix in ``far``, as published; else z is exact.
 
     Notes
@@ -461,8 +461,8 @@ def render_normals(
     -------
     Tensor [B, h, w, 3]
         ``normals[b, y, x]`` is the unit normal of the side that is seen (:meth:`Fragments.normals`) at the pixel in row
-        y from the top: the normal of the face or, with ``smooth``, the interpolated normal of its vertices. 0 where
-        there is no face. With anti-aliasing it is the mean of 2x2 pixels, and shorter than 1 at edges.
+        y from the top: the normal of the face or, with ``smooth``, the interpolated normal of its vertices. 0 on
+        background. With anti-aliasing it is the mean of 2x2 pixels, and shorter than 1 at edges.
 
     Notes
     -----

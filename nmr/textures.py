@@ -166,8 +166,8 @@ class UVTexture:
     wrap : "repeat", "clamp" or "mirror"
         How the image continues outside [0, 1].
     filter : "bilinear" or "mipmap"
-        "bilinear": interpolated between the four nearest texels. Where the image is drawn smaller than it is, most
-        texels are then skipped: pictures flicker, and those texels get no gradient. "mipmap" takes such colours from
+        "bilinear": interpolated between the four nearest texels. If the image is drawn smaller than it is, most
+        texels are skipped: pictures flicker, and those texels get no gradient. "mipmap" takes such colours from
         smaller copies of the image, linearly between the two that fit best (trilinear), so that each pixel shows the
         mean of about the texels that it covers, and every texel gets a gradient.
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import docstring_parser
 import tyro
-from typing_extensions import Self  # of typing from Python 3.11 on
+from typing_extensions import Self  # in typing from Python 3.11 on
 
 from learn3d.settings import RARE
 

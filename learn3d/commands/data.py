@@ -190,7 +190,7 @@ class EstimatePoses(Command):
             views = estimate_views(datasets, self.cameras, self.options, self.candidates, bar.update)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
-        say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below .5: {doubtful:.0%}")
+        say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}")
         if self.compare:
             comparison = compare(views)
             say(comparison.text())

@@ -1,7 +1,7 @@
 """Conventions: the object frame, Kato's 24 views, and the axes of each data set's voxels.
 
 The object frame is that of the renderer: LEFT-handed, x right, y up, z away from the camera of view 0. Mesh files are
-right-handed; `mesh_to_object` converts their coordinates. A prediction is voxelised in the object frame, and the grid
+right-handed; `mesh_to_object` converts their coordinates. A prediction is voxelized in the object frame, and the grid
 is then converted to the axes of the stored ground truth. Sources: the published evaluation code, see
 docs/methods/README.md.
 """
@@ -38,7 +38,7 @@ class VoxelConvention:
     swap: tuple[int, int]  # dimensions of [B, x, y, z] to exchange
     flip: tuple[int, ...]  # dimensions to reverse after that
     cube_side: float = 1.0  # side of the cube of the grid, centred at the origin of the object frame
-    kato18_scale: float = 1.0  # scale of meshes before the kato18 voxeliser, whose rays are on the grid's corner lines
+    kato18_scale: float = 1.0  # scale of meshes before the kato18 voxelizer, whose rays are on the grid's corner lines
 
     def to_axes(self, grid: Tensor) -> Tensor:
         """Convert grids [B, s, s, s] from the axes (x, y, z) of the object frame to those of the stored voxels."""
@@ -51,7 +51,7 @@ class VoxelConvention:
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
         """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the stored voxels.
 
-        vertices: float [B, V, 3] or [V, 3]. faces: integer [F, 3] or [B, F, 3]. definition: "kato18" for the voxeliser
+        vertices: float [B, V, 3] or [V, 3]. faces: integer [F, 3] or [B, F, 3]. definition: "kato18" for the voxelizer
         of Kato et al. 2018 and of the paper, "kato19" for the conservative one of Kato and Harada 2019 (VPL), which
         fills every cell that a face touches. Their IoUs must not be compared with each other.
         """

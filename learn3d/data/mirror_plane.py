@@ -17,7 +17,7 @@ _SECTORS = round(360 / SECTOR_DEG)
 _MIN_IMAGES, _MAX_IMAGES = 4, 2048  # images of a sector: fewer are ignored, of more a part is used
 _MIN_SECTORS = _SECTORS // 2  # pairs of mirrored sectors that a candidate needs, or all if fewer sectors have images
 _MIN_PLANES = 6  # candidate planes that are needed, or one for each sector with images
-_MAX_RATIO = 0.1  # of the difference at the mirror plane to the median over all candidates
+_MAX_RATIO = 0.1  # largest ratio of the difference at the mirror plane to the median over all candidates
 
 
 def find_mirror_plane(dataset: ViewDataset) -> float | None:

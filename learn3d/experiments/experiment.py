@@ -34,8 +34,8 @@ _CANDIDATES = 4  # estimated poses of each image
 def estimate_poses(config: TrainConfig) -> None:
     """Write the table of estimated poses that a run needs, unless it exists, and a JSON file with its errors.
 
-    The estimate has the run's seed. It is turned into the frame of the data by the angle that fits the validation
-    images best.
+    The estimate has the run's seed. It is turned into the frame of the data by the angle that fits the training
+    and validation images best.
     """
     if config.poses.is_file():
         return

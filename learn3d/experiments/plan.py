@@ -36,9 +36,10 @@ class Request:
     methods: tuple[str, ...] = ()
     """Methods of the table: labels of rows, or names of variants (default: all)."""
     iterations: int | None = None
-    """Training steps of every run (default: the preset's)."""
+    """Training steps; methods with a quarter of the batch, such as Plus, take four times as many (default: the
+    preset's)."""
     batch_size: int | None = None
-    """Images per training step (default: the preset's)."""
+    """Images per step; Plus and others take a quarter of it (default: the preset's)."""
     seeds: int | None = None
     """Number of seeds, 0 .. seeds - 1 (default: the table's)."""
     layout: Rare[Layout | None] = None

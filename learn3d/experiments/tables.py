@@ -42,7 +42,7 @@ class Row:
 
     variant: str | None  # name in `VARIANTS`; None: a quoted row, never trained here
     figures: str = ""  # printed for 13 or 3 categories, and their mean; for the mean alone; "" if the row is ours
-    about: str = "kato18"  # the voxeliser of the printed figures, and their source if the paper quotes them
+    about: str = "kato18"  # the voxelizer of the printed figures, and their source if the paper quotes them
 
     @property
     def printed(self) -> dict[str, float]:
@@ -204,8 +204,8 @@ TABLES: dict[str, Table] = {
         "Voxel IoU on Pascal3D+, mean of five runs (Table 7)",
         "Baseline",
         {
-            "CSDM": Row(None, ".398 .600 .291  .429", "voxeliser not stated, quoted from Kar et al. 2015"),
-            "CMR": Row(None, ".46 .64 - -", "voxeliser not stated, quoted from Kanazawa et al. 2018"),
+            "CSDM": Row(None, ".398 .600 .291  .429", "voxelizer not stated, quoted from Kar et al. 2015"),
+            "CMR": Row(None, ".46 .64 - -", "voxelizer not stated, quoted from Kanazawa et al. 2018"),
             "VPL": Row("pascal-vpl", ".472 .689 .303  .488", f"{_VPL_PAPER}, without texture"),
             "Baseline": Row("pascal-baseline", ".423 .672 .265  .453"),
             "Proposed": Row("pascal-proposed", ".458 .695 .277  .477"),

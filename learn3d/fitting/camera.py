@@ -23,7 +23,7 @@ ELEVATIONS_DEG = (0.0, 12.0, 25.0, 40.0, 55.0)  # elevations that are tried with
 STARTS = 6  # best of these views, from which the camera is optimised
 STEPS = 25
 BELIEF = 0.05  # weight of the log-probability of a view, relative to the IoU
-_SCALES = (60.0, 60.0, 1.0, 1.0)  # of azimuth, elevation, distance and shift as variables
+_SCALES = (60.0, 60.0, 1.0, 1.0)  # units of azimuth, elevation, distance and shift as variables
 
 Meshes = Tensor | Sequence[Tensor]
 

@@ -20,7 +20,7 @@ MOST = 0.82  # distance above which a picture is unknown if no other objects wer
 OTHER = 2.0  # `KnownCodes.resemblance` above which a picture is unknown
 KNOWN_CODES = "known_codes", "hidden_layer", "output_layer"  # names of the tensors of `KnownCodes` in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
-_HIDDEN, _MEMBERS, _DROPOUT, _STEPS = 64, 2, 0.3, 300  # of the classifiers, whose logits are averaged
+_HIDDEN, _MEMBERS, _DROPOUT, _STEPS = 64, 2, 0.3, 300  # sizes of the classifiers, whose logits are averaged
 _SCALE = 10.0  # length of the codes that they see
 
 

@@ -32,7 +32,7 @@ class Prediction(NamedTuple):
     vertices: Tensor  # float32 [1, V, 3], object frame
     azimuths: Tensor | None  # float32 [AZIMUTHS], see `camera.find_view`
     view: View  # one view
-    iou: float  # of the mask and the silhouette in this view
+    iou: float  # IoU of mask and silhouette in this view
 
 
 class Fit(NamedTuple):
@@ -41,7 +41,7 @@ class Fit(NamedTuple):
     vertices: Tensor  # float32 [V, 3], object frame
     faces: Tensor  # int64 [F, 3]
     view: View  # one view
-    iou: float  # of the mask and the silhouette in this view
+    iou: float  # IoU of mask and silhouette in this view
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from learn3d.fitting.fit import Fit, Prediction, Progress, silent
 from learn3d.methods import MeshMethod
 from learn3d.shapes import CATEGORIES, numbered_shape
 
-SEED = 0  # of the data set with the templates; shapes of other seeds are no templates
+SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates
 COUNT = 1000  # templates of each category
 AXES = 24  # principal axes of the codes that are kept
 CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture

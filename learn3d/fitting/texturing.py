@@ -13,7 +13,7 @@ from torch import Tensor
 import nmr
 from learn3d.pictures.surfaces import Surface, Texture
 
-WIDTH = 1024  # of a texture in texels; its height depends on the mesh
+WIDTH = 1024  # texels; the height of a texture depends on the mesh
 TEXELS = 250.0  # per unit of the object frame
 SIDES = (2, 4, 8, 16, 24, 32)  # sides that a triangle in the image can have, in texels
 _SURE = 0.02  # squared reliability of a colour that counts as much as the colours of the vertices
@@ -42,7 +42,7 @@ def paint(surface: Surface, look_up: LookUp) -> Surface:
 class _Places(NamedTuple):
     """Where F faces lie in an image, and what its N used texels show."""
 
-    height: int  # of the image
+    height: int  # image height
     corners: Tensor  # float32 [F, 3, 2]: places of the corners in texels, x right and y down
     row: Tensor  # int64 [N]
     column: Tensor  # int64 [N]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-BATCH_NORM_EPS = 2e-5  # of the batch norms in the published code of Kato and Harada 2019
+BATCH_NORM_EPS = 2e-5  # batch norms have it in the published code of Kato and Harada 2019
 
 
 def linear_layers(*sizes: int) -> nn.Sequential:

@@ -241,7 +241,7 @@ def _fill(
     items = pack_shapes(runs, shown)
     for item, sample in zip(items, shown, strict=True):
         item |= {"ious": _numbers(ious[:, sample]), "means": _numbers(means[:, ids[sample]])}
-    first_item = {ids[sample]: number for number, sample in reversed(list(enumerate(shown)))}  # of an object
+    first_item = {ids[sample]: number for number, sample in reversed(list(enumerate(shown)))}
     views = []
     if dataset.poses is not None:
         by_view = [mean_by_azimuth(azimuths_deg(dataset.poses).numpy(), row) for row in ious]

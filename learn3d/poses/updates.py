@@ -19,7 +19,7 @@ from learn3d.poses.estimate import SIZE, TEMPERATURE
 _IMAGES = 128  # at a time
 _CELL_DEG = 15  # width of the cells of azimuth whose frequency is kept
 _LEAST_PRIOR = 0.01  # probability of candidates that the table leaves out
-_ROUNDS = 20  # of scaling to these frequencies
+_ROUNDS = 20  # rounds of scaling to these frequencies
 
 
 def update_steps(iterations: int, count: int) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ import trimesh
 
 Point = Sequence[float] | np.ndarray  # (x, y, z); in a profile (radius, y)
 
-# Thin bars get extra rings: a voxeliser that casts rays on a 32^3 grid misses bars between two grid lines, but it also
+# Thin bars get extra rings: a voxelizer that casts rays on a 32^3 grid misses bars between two grid lines, but it also
 # marks the cell of every vertex. Both lengths are in units of the longest side of the shape.
 THIN, STEP = 0.06, 0.031  # diameter below which a bar is thin, and the largest distance of its rings
 

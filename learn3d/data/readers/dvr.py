@@ -33,7 +33,7 @@ from learn3d.files.sandbox import Call
 PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("progress",))
 POINTS = 10_000  # points that are kept of each object's 100,000, which are in random order
 _EYE_TOLERANCE = 0.01  # largest error of a camera position, in units of the object frame
-_MIN_COSINE = 0.9995  # of the angle between an image axis or a viewing direction and Kato's
+_MIN_COSINE = 0.9995  # least cosine of the angle between an image axis or a viewing direction and Kato's
 _MATRICES = [f"world_mat_{k}" for k in range(NUM_VIEWS)]
 _CAMERAS = "an npz file with world_mat_0 .. world_mat_23, 4x4, from the world to Kato's 24 cameras"
 _CLOUD = "an npz file with the array 'points' [P, 3]: finite, within the unit cube"
