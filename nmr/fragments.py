@@ -51,6 +51,15 @@ class Fragments:
     With ``faces_per_pixel`` K > 1 or a ``blur_radius`` these have one more axis: sided_face_index and depth ``[B, H, W,
     K]``, weights ``[B, H, W, K, 3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`,
     :meth:`normals`, of colours and lights, and of the properties. :meth:`resolve` takes one image.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> fragments = nmr.render_fragments(0.5 * vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), image_size=64)
+    >>> heights = fragments.interpolate(vertices[:, 1:])  # a value for each vertex: [V, 2]
+    >>> image = fragments.resolve(heights)
+    >>> image.shape
+    torch.Size([1, 64, 64, 2])
     """
 
     sided_face_index: Tensor

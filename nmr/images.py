@@ -17,6 +17,15 @@ class Images:
 
     ``rgb [B, h, w, C]``, ``alpha [B, h, w]``, ``depth [B, h, w]``, ``normals [B, h, w, 3]``, ``fragments``
     (:class:`Fragments`). Outputs that were not requested raise an AttributeError.
+
+    Examples
+    --------
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
+    >>> images = nmr.render(0.5 * vertices, faces, camera, outputs=("rgb", "depth"), image_size=64)
+    >>> images.depth.shape
+    torch.Size([1, 64, 64])
+    >>> rgb, depth = images
     """
 
     rgb: Tensor

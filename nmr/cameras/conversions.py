@@ -102,6 +102,14 @@ def from_opencv(
     ------
     TypeError, ValueError
         For values that are not numbers, and wrong shapes, including those of OpenCV's longer distortion models.
+
+    Examples
+    --------
+    >>> K = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+    >>> camera = nmr.cameras.from_opencv(K, torch.eye(3), [0.0, 0.0, 3.0], height=480, width=640)
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> nmr.render_silhouette(vertices, faces, camera, image_size=(480, 640)).shape
+    torch.Size([1, 480, 640])
     """
     height, width = height_and_width((height, width), "height and width")
     K = batched(as_parameter(K, "K", 3, 3), torch.float64, 3, 3)
@@ -135,6 +143,13 @@ def to_opencv(
     A vertex keeps its pixel in images of ``image_size=(height, width)``.
     The determinant of R is -1 for the cameras of a left-handed world (see above). An orthographic camera raises a
     ValueError.
+
+    Examples
+    --------
+    >>> camera = nmr.LookAt.from_angles(2.732, 30.0, 45.0, half_fov_deg=15.0, right_handed=True)
+    >>> K, R, t, dist_coeffs = nmr.cameras.to_opencv(camera, height=256, width=256)
+    >>> K.shape, R.shape, t.shape, dist_coeffs
+    (torch.Size([1, 3, 3]), torch.Size([1, 3, 3]), torch.Size([1, 3]), None)
     """
     height, width = height_and_width((height, width), "height and width")
     projection = _plain(camera, height, width)
@@ -171,6 +186,15 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
     ------
     TypeError, ValueError
         For values that are not numbers, wrong shapes, or matrices of another form.
+
+    Examples
+    --------
+    >>> view = torch.eye(4)
+    >>> view[2, 3] = -3.0  # the eye at z = 3, looking along -z
+    >>> perspective = [[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, -1.02, -0.202], [0, 0, -1.0, 0]]
+    >>> camera = nmr.cameras.from_opengl(view, perspective)
+    >>> camera.transform(torch.tensor([[[0.5, 0.0, 1.0]]])).tolist()  # x, y, distance
+    [[[0.5, 0.0, 2.0]]]
     """
     view = batched(as_parameter(view, "view", 4, 4), torch.float64, 4, 4)
     clip = batched(as_parameter(projection, "projection", 4, 4), torch.float64, 4, 4)
@@ -197,6 +221,13 @@ def to_opengl(
     ``image_size`` (height, width) is that of the images to come; it must be given if they are not square.
     The determinant of ``view`` is -1 for the cameras of a left-handed world (see above); the winding of a face on the
     screen is the same as here. A distorted camera raises a ValueError.
+
+    Examples
+    --------
+    >>> camera = nmr.LookAt.from_angles(2.732, 30.0, 45.0, half_fov_deg=15.0, right_handed=True)
+    >>> view, projection = nmr.cameras.to_opengl(camera, near=0.1, far=10.0)
+    >>> view.shape, projection.shape
+    (torch.Size([1, 4, 4]), torch.Size([1, 4, 4]))
     """
     if not 0 <= near < far < float("inf"):
         raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
@@ -264,6 +295,12 @@ def from_pytorch3d(
     ------
     TypeError, ValueError
         For values that are not numbers, wrong shapes, or a missing or impossible image_size.
+
+    Examples
+    --------
+    >>> camera = nmr.cameras.from_pytorch3d(torch.eye(3), [0.0, 0.0, 2.0], focal_length=2.0)
+    >>> camera.transform(torch.tensor([[[0.5, 0.25, 0.0]]])).tolist()  # +1 is the right border here, the left one there
+    [[[-0.5, 0.25, 2.0]]]
     """
     R, T = (
         batched(as_parameter(R, "R", 3, 3), torch.float64, 3, 3),
@@ -300,6 +337,12 @@ def from_pytorch3d_fov(
 
     Its focal lengths are ``1 / (aspect_ratio tan(fov / 2))`` and ``1 / tan(fov / 2)``; the rest is
     :func:`from_pytorch3d`.
+
+    Examples
+    --------
+    >>> camera = nmr.cameras.from_pytorch3d_fov(torch.eye(3), [0.0, 0.0, 2.0], fov=90.0)
+    >>> [round(x, 4) for x in camera.transform(torch.tensor([[[-0.5, 0.25, 0.0]]])).flatten().tolist()]
+    [0.25, 0.125, 2.0]
     """
     fov = as_parameter(fov, "fov").to("cpu", torch.float64).reshape(-1)
     focal = 1 / torch.tan((torch.deg2rad(fov) if degrees else fov) / 2)
@@ -319,6 +362,12 @@ def to_pytorch3d(
     ------
     TypeError, ValueError
         For anything but a camera of nmr, a camera with distortion or skew, or a missing or impossible image_size.
+
+    Examples
+    --------
+    >>> camera = nmr.LookAt.from_angles(2.732, 30.0, 45.0, half_fov_deg=15.0, right_handed=True)
+    >>> sorted(nmr.cameras.to_pytorch3d(camera))
+    ['R', 'T', 'focal_length', 'in_ndc', 'principal_point']
     """
     height, width = _image_size(image_size, in_ndc)
     camera = _without_distortion(camera, "PyTorch3D", height, width)

@@ -37,6 +37,11 @@ def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: S
 
     Single numbers and sequences or tensors of one length broadcast; different lengths raise a ValueError, values that
     are not numbers a TypeError. At azimuth 0 and elevation 0 the point is ``(0, 0, -d)``.
+
+    Examples
+    --------
+    >>> [round(x, 2) for x in nmr.cameras.points_from_angles(2.0, 0.0, 90.0).tolist()]
+    [2.0, 0.0, -0.0]
     """
     d, e, a = (
         x if x.is_floating_point() else x.double()

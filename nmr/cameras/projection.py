@@ -26,6 +26,16 @@ class Camera(Protocol):
     divided by the depth (default: True; False: depth, colours and weights are linear on the screen), and, for normals
     and light, ``right_handed``, whether the world is right-handed (default: False). Highlights need ``eye``, ``[3]`` or
     ``[B, 3]``.
+
+    Examples
+    --------
+    >>> class Upright:  # orthographic, from the front: x and y stay, the depth is 2 - z
+    ...     perspective, right_handed = False, True
+    ...     def transform(self, vertices):
+    ...         return vertices * vertices.new_tensor([1.0, 1.0, -1.0]) + vertices.new_tensor([0.0, 0.0, 2.0])
+    >>> vertices, faces = nmr.icosphere(3)
+    >>> nmr.render_silhouette(0.5 * vertices[None], faces, Upright(), image_size=64).shape
+    torch.Size([1, 64, 64])
     """
 
     def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
@@ -122,6 +132,14 @@ class Projection(ProjectingCamera):
     ------
     ValueError
         For other shapes.
+
+    Examples
+    --------
+    >>> matrix = torch.tensor([[[1.0, 0, 0, 0], [0, -1.0, 0, 0], [0, 0, 1.0, 4.0]]])  # y down in the camera
+    >>> intrinsics = torch.tensor([[[2.0, 0, 0], [0, -2.0, 0]]])
+    >>> camera = nmr.cameras.Projection(matrix, intrinsics)
+    >>> camera.transform(torch.tensor([[[1.0, 0.5, 0.0]]])).tolist()
+    [[[0.5, 0.25, 4.0]]]
     """
 
     matrix: Tensor
