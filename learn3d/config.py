@@ -48,7 +48,7 @@ class TrainConfig:
     """Size of the view classes, azimuth x elevation in degrees (default: 15x20 for kar; one class for each fixed
     camera)."""
     views_per_object: Rare[Count | None] = None
-    """Number of training views of each object: the first ones for kar and r2n2, else random ones, the same in every run
+    """Number of training views of each object: the first ones for kar, else random ones, the same in every run
     (default: one for kar, else all)."""
     poses: MayDiffer[FilePath | None] = None
     """Table of poses from learn3d estimate-poses, instead of the poses of the data set (default: none)."""
