@@ -3,8 +3,6 @@
 Our own code is in blocks marked ``python``. Code of other libraries is not run; its blocks are marked ``py``.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import shlex

@@ -25,6 +25,7 @@ METHODS = {
     "proposed": TINY,
     "plus": TINY | {"preset": "plus-kato", "bank_size": 8},
     "multi-view": TINY | {"preset": "kato2018-kato"},
+    "many-views": TINY | {"preset": "many-views-kato", "batch_size": 10},
     "vpl": {"preset": "peng2020-kato-vpl", "generator": "sphere-small", "discriminator_channels": 2},
     "prgan": {"preset": "gadelha2017-kato", "encoder_from_step": 3}
     | {"generator_channels": (2, 2, 2, 1), "discriminator_channels": (2, 2, 2, 2)},
