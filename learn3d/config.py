@@ -85,7 +85,7 @@ class TrainConfig:
     val_split: Rare[MayDiffer[Literal["val", "test"]]] = "val"
     """Split for validation during training and for choosing the best checkpoint."""
     validate_every: MayDiffer[Step] = 2000
-    """Steps between validations (voxel IoU and MMD); the last step is always validated."""
+    """Steps between validations (IoU of voxels or silhouettes, and MMD); the last step is always validated."""
     max_val_images: Rare[MayDiffer[Count | None]] = None
     """Number of images to validate on, evenly from all objects and views of the split (default: all)."""
     pictures_every: Rare[MayDiffer[Step]] = 1000
@@ -167,7 +167,7 @@ _MAY_DIFFER_NAMES = {
 
 
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
-    """A line for each option of `config` that differs from the run `saved` and must not."""
+    """A line for each option that must not change, but differs between `config` and the run `saved`."""
     old, new = (_flat(c) for c in (saved, config))
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
     updates = "pose_updates" if config.poses is not None and config.pose_updates > 0 else ""

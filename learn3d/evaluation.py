@@ -34,17 +34,17 @@ MEASURED = (
     "voxel_iou_kato19",
     "precision",  # share of the predicted voxels that are true (kato18)
     "recall",  # share of the true voxels that are predicted (kato18)
-    "hollow",  # 1 if the mesh exceeds the grid: kato18 then fills no inside
+    "hollow",  # 1 if the mesh exceeds the grid: kato18 then leaves its inside empty
     "chamfer_l1",  # NaN if a surface is empty
     "f_score",  # 0 if only the prediction is empty
     "silhouette_iou",  # at the camera of another image of the object
 )
-NO_MMD = "no MMD: it takes two images of each of two views"
+NO_MMD = "no MMD: it needs at least two view classes with at least two images each"
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Metrics of each image of one class, and their means."""
+    """Metrics of each image of one split, and their means."""
 
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
@@ -220,7 +220,7 @@ def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> 
 
 
 def mean_mmd(codes: Tensor, view_ids: Tensor, forms: Sequence[str] = ("mmd",)) -> dict[str, float]:
-    """Mean MMD over all pairs of views between the codes [N,C] of their images, by name of the form.
+    """Mean MMD between the codes [N,C] of two views, over all pairs of views, for each of `forms`.
 
     The MMD of n codes has a bias of 1 / n, so every view has the same number of codes: that of the view with the
     fewest, at most 512. Views with one code are left out, as the MMD between two single codes is a constant. The result

@@ -33,7 +33,7 @@ def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -
 
 
 def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
-    """Mean distance between depth maps [B, S, S] over the pixels in which both show a surface.
+    """Mean absolute difference of depth maps [B, S, S] over the pixels in which both show a surface.
 
     Pixels without a surface are 100 (nmr's `far`) in `depth` and 0 in `target`. Differentiable in depth.
     """
@@ -42,7 +42,7 @@ def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
 
 
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:
-    """L_prior: batch mean of the length of the codes (eq. 5, "norm") or of its square (published code, "squared").
+    """L_prior: batch mean of the norm of the codes (eq. 5, "norm") or of its square (published code, "squared").
 
     codes [B,C]; differentiable; the gradient at a zero code is zero.
     """

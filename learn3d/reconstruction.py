@@ -137,7 +137,7 @@ def reconstruct_files(
         if made[-1].warning:
             note(f"warning: {name}: {made[-1].warning}")
         elif made[-1].kind:
-            note(f"{name}: taken for: {made[-1].kind}")
+            note(f"{name}: category {made[-1].kind}")
     stored, azimuths = np.stack([each.stored for each in made]), [each.azimuth_deg for each in made]
     return save(folder, names, model, stored, [each.surface for each in made], azimuths, mesh_format=mesh_format)
 
@@ -164,7 +164,7 @@ def reconstruct_dataset(
     dataset = checkpoint.load_data(model.config, split, data=data, category=category)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     if refined and batch.poses is None:
-        raise ValueError(f"{dataset.category} has no poses, and shapes are fitted to masks of known pose")
+        raise ValueError(f"the data of {dataset.category} have no poses, which fitting needs; leave out --refine")
     images = batch.images.numpy()
     surfaces = reconstruct(model.method, images, *(batch.masks, batch.poses) if refined else ())
     names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
@@ -348,7 +348,7 @@ def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
     """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed, normals outwards.
 
     The object frame is left-handed, so the mesh is reflected and the order of each face reversed. A GLB has the texture
-    or else the colours of the vertices, a PLY always these. `name` is the node's in a GLB. Its material is
+    or else the vertex colours, a PLY only the vertex colours. `name` is the node's in a GLB, whose material is
     double-sided: learnt surfaces cross themselves, and viewers would hide the faces that are seen from behind.
     """
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
@@ -378,7 +378,7 @@ def _with_texture(mesh: trimesh.Trimesh, image: Tensor, uv: Tensor) -> trimesh.T
 
 
 def _finish_materials(tree: dict) -> None:
-    """Make the materials of a glTF tree matt and double-sided; without smaller copies, whose texels mix faces."""
+    """Make the materials of a glTF tree matt and double-sided, without mipmaps, whose texels would mix faces."""
     materials = tree.setdefault("materials", [{}])
     for material in materials:
         material.setdefault("pbrMetallicRoughness", {}).update(metallicFactor=0.0, roughnessFactor=1.0)

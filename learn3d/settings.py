@@ -5,7 +5,7 @@
         learning_rate: Positive = 1e-4
         variant: Literal["a", "b"] = "a"
 
-Values are never converted: "1" and true are no numbers. NaN and infinity are refused.
+Values are never converted: "1" and true are not numbers. NaN and infinity are refused.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _sentence(error: Any, cls: type) -> str:
     if error["type"] == "missing":
         return f"the option {name} is missing"
     if error["type"] == "unexpected_keyword_argument":
-        return f"there is no option {name!r} (but {', '.join(field.name for field in fields(cls))})"
+        return f"there is no option {name!r}; choose from {', '.join(field.name for field in fields(cls))}"
     if error["type"] == "value_error":  # a validator's own message names the given value
         message = str(error["ctx"]["error"])
         return message if name in message.split() else f"{name} {message}".strip()

@@ -31,8 +31,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     checkpoint (bit-identical on the same CPU with the same number of threads), or from the start if there is no
     checkpoint yet. A finished run is left unchanged. overwrite: replace an older run in the folder.
 
-    Raises ValueError if the folder is in use, if the data set does not fit, or if options or data differ from those of
-    the resumed run; FloatingPointError if a loss is not finite (the last checkpoint is from before); OSError if a
+    Raises ValueError if the folder is not empty, if the data do not fit, or if options or data differ from those of
+    the resumed run; FloatingPointError if a loss is not finite (the last checkpoint predates it); OSError if a
     checkpoint cannot be written or another process works in the folder.
     """
     started, folder = time.monotonic(), config.output

@@ -28,7 +28,7 @@ class Evaluate(OnDataset):
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
     json: Path | None = None
-    """JSON file for the figures, with protocol and versions (default: none)."""
+    """JSON file for the results, with protocol and versions (default: none)."""
 
     @classmethod
     def about(cls, everything: bool) -> str:
@@ -66,7 +66,7 @@ class Reconstruct(OnDataset):
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model (default: the small model of the package)."""
     images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
-    """Images of any size, with a transparent background, --masks or --plain-background (default: images of --data)."""
+    """Images of any size, with transparency, --masks, --plain-background or --box (default: images of --data)."""
     masks: tuple[Path, ...] = ()
     """Mask images (white = object), one for each image (default: the transparency of the images)."""
     plain_background: bool = False
@@ -75,7 +75,7 @@ class Reconstruct(OnDataset):
     """Box around the object in a single photograph: X Y WIDTH HEIGHT in pixels, from the upper left. The object is cut
     out of it (needs the extra photos)."""
     crop: bool = True
-    """Centre and scale the object in each image as in the data set, or leave the images as they are."""
+    """Centre and scale the object in each image as in the data set. --no-crop: images are framed like that already."""
     data: Path | None = None
     """Data set from which images are taken (default: image files are given)."""
     indices: tuple[int, ...] = (0,)
@@ -232,7 +232,7 @@ class Demo(Command):
     host: str = "127.0.0.1"
     """Address to listen on. With 0.0.0.0 everybody in the network can use the page."""
     browser: bool = True
-    """Open a browser, or only print the address of the page."""
+    """Open a browser. --no-browser: only print the address of the page."""
 
     def run(self) -> None:
         from learn3d.demo.server import serve

@@ -78,7 +78,7 @@ class Train(Command):
 
 @dataclass(frozen=True)
 class Experiment(Request, Command):
-    """Make a table of the paper: train its runs, measure them, and report the paper's figures beside ours.
+    """Make a table of the paper: train its runs, measure them, and report the paper's values beside ours.
 
     Examples:
       learn3d experiment --list

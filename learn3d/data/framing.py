@@ -115,7 +115,7 @@ def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarr
 
     colors: uint8 [H, W, 3]. The background colour is the median of the border. A pixel belongs to the object if a
     channel differs from it by more than `tolerance` (0 .. 1). Holes are filled, but for some with the colour of the
-    background, which is seen between the rungs of a chair.
+    background, such as the gaps between the rungs of a chair.
     """
     from scipy import ndimage  # imported here, as the sandbox's workers import this module
 

@@ -67,7 +67,7 @@ class LookAtPoses:
         return nmr.cameras.points_from_angles(self.distance, self.elevation_deg, self.azimuth_deg).to(torch.float32)
 
     def mirrored(self, chosen: Tensor) -> LookAtPoses:
-        """The poses of the images, those with `chosen` (bool [M]) flipped left-right: their azimuths are negated."""
+        """The poses after the images `chosen` (bool [M]) are flipped left-right: their azimuths are negated."""
         return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
 
     def _values(self) -> tuple[Tensor | float, ...]:

@@ -118,7 +118,7 @@ def _views_by_class(dataset: ViewDataset) -> list[np.ndarray]:
 Augmentation = Literal["flip", "flip-image", "channels", "colors", "crop"]
 
 COLOR_GAIN = 0.3  # "colors" multiplies each colour by a factor in 1 - COLOR_GAIN .. 1 + COLOR_GAIN
-WITHOUT_COLOR = 0.3  # share of the images that "colors" makes black or white
+WITHOUT_COLOR = 0.3  # share of the images that "colors" makes white
 
 
 def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool) -> Batch:
@@ -128,7 +128,7 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
     "flip-image": only the colours mirrored (published code of both papers on Pascal3D+, whose meshes are symmetric).
     "channels": a random permutation of the three colour channels.
     "colors": a random permutation, each channel times a random factor in 0.7 .. 1.3, and in 30 % of the images times 0.
-    It changes 255 - colour, so that a white background stays white; `inverted`: images are stored as 255 - colour. Not
+    It acts on 255 - colour, so that white stays white; `inverted`: images are stored as 255 - colour. It is not meant
     for encoders that ignore the mask.
     "crop": the colours cropped anew from the original image, each side of the padded box moved by up to 15 % of the
     box (Pascal3D+, both papers). It must come first.

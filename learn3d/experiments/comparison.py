@@ -1,6 +1,6 @@
 """The report of a table from stored results: the paper's figures beside ours, with confidence intervals.
 
-No difference to the paper's figures is taken, because they are of other meshes. Intervals over test objects are by
+Our values are not subtracted from the paper's, which are for other meshes. Intervals over test objects are by
 bootstrap, intervals over seeds by Student's t.
 """
 

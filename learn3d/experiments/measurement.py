@@ -24,7 +24,7 @@ MEASURES = {
         "voxel IoU",
         "IoU of predicted and true 32^3 grids, voxelizer of Kato et al. 2018 (kato18), as in the paper",
     ),
-    "voxel_iou_kato19": ("IoU (kato19)", "by Kato and Harada 2019: every cell that a face touches; not comparable"),
+    "voxel_iou_kato19": ("IoU (kato19)", "voxelizer of Kato and Harada 2019; not comparable with the voxel IoU"),
     "precision": ("precision", "part of the predicted voxels that is true: low if shapes are too full"),
     "recall": ("recall", "part of the true voxels that is predicted: low if parts are missing"),
     "chamfer_l1": (
@@ -104,7 +104,7 @@ def measure(
 ) -> Result:
     """Measure a checkpoint on all images of a split; `data` and `category` default to those of the training.
 
-    With estimated poses, if the model learnt from some and the data are those of the training (`data` is None).
+    A model that learnt from estimated poses is measured with them only on its own data (`data` is None).
     """
     method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
     label, category = PRESETS[config.preset].label, category or config.category

@@ -41,7 +41,7 @@ class Row:
     """One method in a table."""
 
     variant: str | None  # name in `VARIANTS`; None: a quoted row, never trained here
-    figures: str = ""  # printed for 13 or 3 categories, and their mean; for the mean alone; "" if the row is ours
+    figures: str = ""  # printed values: 13 or 3 categories and their mean, or the mean alone; "" if the row is ours
     about: str = "kato18"  # the voxelizer of the printed figures, and their source if the paper quotes them
 
     @property

@@ -47,7 +47,7 @@ class Call:
     function: Callable[..., Any]
     path: Path
     arguments: tuple[Any, ...] = ()
-    wanted: str = "a sound file"  # description of the file, for messages
+    wanted: str = "an intact file"  # description of the file, for messages
     memory: int = MEMORY  # limit in bytes, without the result
     seconds: float = SECONDS  # limit of processor time
 

@@ -106,7 +106,7 @@ def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> 
 
 
 def _nearest_clear(points: np.ndarray, clear: np.ndarray, neighbours: coo_array) -> np.ndarray:
-    """For each point [V, 3] the nearest that is clear. For a part without clear points it is the nearest to its place
+    """Index of the clear point nearest to each point [V, 3]; in a part without any, of the one nearest to its place
     in an equal part, for example another leg.
     """
     nearest = np.flatnonzero(clear)[cKDTree(points[clear]).query(points)[1]]

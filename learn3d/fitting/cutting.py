@@ -42,7 +42,7 @@ def is_plain(colors: np.ndarray, tolerance: float = TOLERANCE) -> bool:
 def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
     """GrabCut (Rother et al. 2004): the mask uint8 [H, W], 0 or 255, of the object within a box of a photograph.
 
-    colors: uint8 [H, W, 3]. Pixels outside the box are background (default: the picture but a narrow border). Holes
+    colors: uint8 [H, W, 3]. Pixels outside the box are background (default box: all but a narrow border). Holes
     are filled. Raises ValueError without OpenCV, or if the box exceeds or fills the picture.
     """
     cv2 = _opencv()

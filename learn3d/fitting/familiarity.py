@@ -42,7 +42,8 @@ class KnownCodes(NamedTuple):
         return float(output[:-1] @ units + output[-1])
 
     def is_strange(self, code: Tensor) -> bool:
-        """Whether a code [C] is like those of other objects or, if none were learnt, far from the training images'."""
+        """Whether a code [C] is out of distribution: by the classifiers if there are any, else by its distance to the
+        centres."""
         if self.hidden is not None:
             return self.resemblance(code) > OTHER
         return float(_distance(code, self.kinds.flatten(0, 1))) > MOST

@@ -26,7 +26,7 @@ _SHRINK, _GROW = 0.5, -0.53  # weights of Taubin 1995: smoothing without loss of
 
 
 def smooth(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Vertices [V, 3] of a mesh with rounded edges: a few rounds of Taubin's smoothing."""
+    """The vertices [V, 3] of a mesh after a few rounds of Taubin's smoothing, which rounds its edges."""
     points = vertices.double().numpy()
     neighbours = joined(faces.numpy(), len(points))
     mean = diags_array(1 / np.maximum(neighbours.sum(1), 1)) @ neighbours
@@ -79,7 +79,7 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Tensor]:
-    """Divide a mesh [V, 3], [F, 3] until no edge is longer than `longest`. The surface stays, and closed meshes closed.
+    """Divide a mesh [V, 3], [F, 3] until no edge is longer than `longest`. Closed meshes stay closed.
 
     An edge is halved, and with it all its faces, if it is the longest of each of them (Rivara 1984).
     """

@@ -1,4 +1,4 @@
-"""Templates: generated shapes, of which the one that explains a picture best is bent until it has its outline.
+"""Templates: generated shapes. The one that fits a picture best is stretched and bent until its outline matches.
 
 A template has the thin legs, gaps and straight edges that a deformed sphere cannot have. A model knows the codes of its
 templates; the shapes themselves are made again from their numbers.

@@ -40,7 +40,7 @@ def paint(surface: Surface, look_up: LookUp) -> Surface:
 
 
 class _Places(NamedTuple):
-    """Where F faces lie in an image, and what its N used texels show."""
+    """Layout of F faces in a texture image, and the surface points that its N used texels show."""
 
     height: int  # image height
     corners: Tensor  # float32 [F, 3, 2]: places of the corners in texels, x right and y down

@@ -61,7 +61,7 @@ class DatasetConfig:
         if self.source is None and self.procedural == 0:
             raise ValueError("give --source (a folder of meshes or a mesh pack .npz), --procedural (a number), or both")
         if self.source and self.procedural and (self.up, self.front_axis) != ("y", "z"):
-            raise ValueError("meshes beside shapes of --procedural must stand like these: up y, front z")
+            raise ValueError("with --procedural, meshes of --source must have its axes: --up y --front z")
         if WRITERS[self.layout].only_shards and not self.shards:
             raise ValueError(f"the layout {self.layout} is made as shards: add --shards")
         if self.shards and self.layout not in ("kato", "around"):

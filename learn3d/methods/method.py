@@ -212,7 +212,7 @@ class Method(abc.ABC):
     def take_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Take training step `step` (from 1); return all computed losses, unweighted, and "total".
 
-        Raises FloatingPointError if a loss is not finite; no weight has changed then.
+        Raises FloatingPointError if a loss is not finite, before any gradient of that loss is computed.
         """
         factor = self.schedule.lr_factor(step)
         for name, optimizer in self.optimizers.items():

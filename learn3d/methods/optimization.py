@@ -26,7 +26,7 @@ class TrainingSchedule:
     def __post_init__(self) -> None:
         if 0 < self.iterations <= self.warmup_steps:
             raise ValueError(f"warmup_steps must be below the {self.iterations} iterations, got {self.warmup_steps}")
-        self.lr_factor(self.warmup_steps + 1)  # it knows the schedule
+        self.lr_factor(self.warmup_steps + 1)  # raises ValueError for an unknown schedule
 
     def lr_factor(self, step: int) -> float:
         """The learning rate of step `step` (from 1), as a share of the full one.

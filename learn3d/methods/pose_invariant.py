@@ -41,7 +41,7 @@ class PoseInvariantSettings(MeshSettings):
     adversarial_form: Literal["log", "probability"] = "log"
     """Confusion loss: squared differences of log-probabilities (log, published code) or of probabilities (eq. 4)."""
     prior_form: Literal["squared", "norm"] = "squared"
-    """Prior: squared length of the codes (squared, published code) or their length (norm, eq. 5)."""
+    """Prior: squared norm of the codes (squared, published code) or their norm (norm, eq. 5)."""
 
     @property
     def reads_view_ids(self) -> bool:

@@ -1,7 +1,7 @@
 """View prior learning (VPL; Kato and Harada 2019), as re-implemented by Peng et al. 2020 and as published.
 
 A discriminator learns to separate silhouettes of predicted shapes at the view of the input image ("real") from those
-at other views ("fake"); the shapes learn to prevent that. docs/methods/vpl.md has the equations.
+at other views ("fake"); encoder and generator learn to fool it. docs/methods/vpl.md has the equations.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class LightConvEncoder(ConvEncoder):
     """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers. Unpublished.
 
     3.9 million weights, not 19. With torch's initial weights the codes of the first hundred steps hardly depend on the
-    image, and modes may collapse, so the convolutions have He's. A white background has the same effect, so colours
+    image: mode collapse may follow, so the convolutions get He's. A white background has the same effect, so colours
     that are not `inverted` (stored as 1 - colour over black) are inverted first.
     """
 

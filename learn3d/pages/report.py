@@ -177,7 +177,7 @@ def write_report(
     data is missing, and ValueError for runs on several categories or on different images.
     """
     if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
-        raise ValueError(f"shapes can be shown of 1 to {MOST_SHOWN} images, and {count} are asked for")
+        raise ValueError(f"the page can show the shapes of 1 to {MOST_SHOWN} images, got {count}")
     source = {"data": data, "category": category, "split": split, "which": which}
     runs = open_runs(paths, labels=labels, report_progress=report_progress, **source)
     _check_same_images(runs, data)

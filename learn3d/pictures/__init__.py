@@ -1,1 +1,1 @@
-"""Drawing for all other rooms: meshes as pictures, pictures in rows and columns, image files."""
+"""Drawing for the other packages: meshes as pictures, pictures in rows and columns, image files."""

@@ -211,7 +211,7 @@ def _part(
 
 
 def near_mass(mass: Tensor, azimuth: Tensor) -> Tensor:
-    """The share of the probability mass [N, A] within NEAR_DEG of an azimuth, whose number is int64 [N]: float [N]."""
+    """Share float [N] of the probability mass [N, A] within NEAR_DEG of the candidate azimuth of index int64 [N]."""
     reach = math.floor(NEAR_DEG * mass.shape[1] / 360)
     near = (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]
     return mass.gather(1, near).sum(1) / mass.sum(1).clamp_min(1e-9)

@@ -2,7 +2,7 @@
 
 The shape that the model predicts from an image is rendered at all candidate poses of the image. The IoU with the mask
 and the table's probability give the weights. As all images share the networks, the shape of an image with a wrong pose
-comes out in the frame of the others all the same, so its IoU is best at the right pose.
+is still predicted in the frame of the others, so its IoU is best at the right pose.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
 
     The weights are softmax(IoU / TEMPERATURE + log p + b) over the candidates, with masks and renderings of SIZE
     pixels. p is the candidate's probability in the table, at least _LEAST_PRIOR. b is a number for each 15 degrees of
-    azimuth, which stay as frequent as in the table.
+    azimuth, chosen so that each such cell keeps its frequency in the table.
     """
     candidates, logits = dataset.candidates, []
     count = candidates.weights.shape[1]

@@ -203,7 +203,7 @@ def load_data(
 ) -> ViewDataset:
     """A split of a run's data, or of another folder, category or layout, in the form that its networks take.
 
-    The run's own data have the poses and, in the training split, the views of its training.
+    The run's own data get its options `poses` and, in the training split, `views_per_object`.
     Raises ValueError if the layout inverts colours and the training layout does not, or the other way round.
     """
     layout = layout or config.layout

@@ -43,7 +43,7 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         if name.startswith(("network.encoder.", "network.generator.", "network.view_classifier."))
     }
     if not trained_on.data.is_dir():
-        note(f"note: {trained_on.data} is not there, so the file has no known codes, and reconstruction will not warn")
+        note(f"note: {trained_on.data} is missing, so reconstruction with this file cannot warn of unknown objects")
     elif isinstance(method, MeshMethod):
         dataset = checkpoint.load_data(trained_on, "train")
         known = dict(zip(KNOWN_CODES, known_codes(method, dataset, others), strict=True))

@@ -81,7 +81,7 @@ def check_can_start(folder: Path, overwrite: bool) -> None:
         raise ValueError(f"{folder} has {name}, but no run that it could belong to; choose another folder")
     if not overwrite and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise ValueError(
-            f"{folder} is not empty; choose another folder, or put the run beside what is in it (--overwrite)"
+            f"{folder} is not empty; choose another folder, or add the run to the files there (--overwrite)"
         )
 
 

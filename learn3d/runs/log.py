@@ -112,7 +112,7 @@ def _numbers(step: int, split: str = "", **values: Any) -> dict[str, float]:
 
 
 class _Csv:
-    """metrics.csv: a row for each number, with the columns step, name, value; metrics.jsonl has the earlier rows."""
+    """metrics.csv: a row for each number, with the columns step, name, value. Earlier rows come from metrics.jsonl."""
 
     def __init__(self, folder: Path, start: int) -> None:
         writing.write_bytes(folder / METRICS_CSV, b"step,name,value\n", sync=True)

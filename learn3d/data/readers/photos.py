@@ -172,7 +172,7 @@ def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Find
     scales = [2 * f.object_size * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs]
     middle = float(np.median(scales)) if scales else 1.0
     message = f"the objects are {middle:.2g} times as large in the photographs as in the table; distance must be in "
-    message += "lengths of the object's longest side, fov_deg the full angle across the longer side"
+    message += "units of the object's longest side, fov_deg the full angle across the photograph's longer side"
     if not 1 / _SCALE_OFF < middle < _SCALE_OFF:
         findings.take(DamagedFile(table, message))
     elif not 1 / _SCALE_ODD < middle < _SCALE_ODD:

@@ -255,7 +255,7 @@ function present(meshes) {
     view.append(canvas);
     $("views").append(view);
     const title = document.createElement("b"), label = meshes.length > 1 ? ` ${made.label}` : "";
-    title.textContent = [label, made.kind && `Taken for: ${made.kind}${made.warning ? "?" : ""}`].filter(Boolean).join(" · ");
+    title.textContent = [label, made.kind && `Category: ${made.kind}${made.warning ? "?" : ""}`].filter(Boolean).join(" · ");
     view.append(title);
     const { glb, mesh } = made;
     new Viewer(canvas, mesh, made.yaw);

@@ -129,7 +129,7 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
         ({"source": "nowhere"}, "folder of meshes or a mesh pack"),
         ({"source": "nothing"}, "there is no mesh"),
         ({"source": "bad"}, r"no mesh can be used for training; .* a.obj: no faces"),
-        ({"procedural": 3, "front": "x"}, "must stand like these: up y, front z"),
+        ({"procedural": 3, "front": "x"}, "must have its axes: --up y --front z"),
         ({"source": None, "procedural": 3, "category": "unicorn"}, "procedural generator makes"),
         ({"up": "z", "front": "-z"}, "two different axes"),
         ({"out": "bad/a.obj"}, "a.obj"),

@@ -85,7 +85,7 @@ def test_a_run_is_replaced_only_when_asked_and_other_files_stay(tmp_path) -> Non
         run_folder.remove_old_run(tmp_path, overwrite=False)
     run_folder.remove_old_run(tmp_path, overwrite=True)
     assert files(tmp_path) == ["pictures/holiday.jpg"]
-    with pytest.raises(ValueError, match="is not empty; choose another folder, or put the run beside"):
+    with pytest.raises(ValueError, match="is not empty; choose another folder, or add the run to the files there"):
         run_folder.remove_old_run(tmp_path, overwrite=False)
     run_folder.remove_old_run(tmp_path, overwrite=True)
     shutil.rmtree(tmp_path / "pictures")
