@@ -27,7 +27,7 @@ bool any_behind(const T* vertices, int64_t count, T near) {
   return std::any_of(behind, behind + kLanes, [](int32_t any) { return any != 0; });
 }
 
-// Triangles that are left of a face with 0, 1, 2, 3 corners behind the plane.
+// Number of triangles that remain of a face with 0, 1, 2 or 3 corners behind the plane.
 constexpr int64_t kPieces[4] = {1, 2, 1, 0};
 
 // The corners of a face that are behind the plane.
@@ -51,8 +51,8 @@ NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face, T near) {
   return ordered ? sides : Sides{};
 }
 
-// Whether a face is wholly behind the plane, but on both sides of the plane of the eye, or touches it: its depths
-// between the corners mean nothing, and could pass for some in front.
+// Whether some face lies wholly behind the near plane, and crosses or touches the plane of the eye. Its interpolated
+// depths are meaningless, and could pass the test against `near`.
 template <class T>
 bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
   const T* vertices = mesh.image_vertices(b);

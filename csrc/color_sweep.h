@@ -230,7 +230,7 @@ NMR_INLINE void pull_own(const ScanlineColors<T>& lines, int64_t n, int64_t firs
 // Crossings of one axis and direction, before their pixels are pulled.
 template <class T>
 struct PlacedCrossings {
-  // The pixel inside, the listed pixels of the face, its face index, the first listed pixel outside, all of the line.
+  // Inner pixel; listed pixels [first, last) inside; face; start (up) or end (down) of those outside; size of the list.
   int32_t pixel_at[kCrossings + kPad], first_at[kCrossings + kPad], last_at[kCrossings + kPad],
       id_at[kCrossings + kPad], outer_at[kCrossings + kPad], count_at[kCrossings + kPad];
   int32_t extreme[2][kCrossings + kPad];  // as Crossings::outer and ::inner, if a factor has extreme size

@@ -48,7 +48,7 @@ NMR_INLINE Radial<T> radial_of(const T* d, T r2) {
     s.per_r = centre ? T(1) : a / r;
     const T a2 = s.angle2;
     s.m = s.per_r * (1 + a2 * (d[0] + a2 * (d[1] + a2 * (d[2] + a2 * d[3]))));
-    const T turn = 1 + a2 * (3 * d[0] + a2 * (5 * d[1] + a2 * (7 * d[2] + a2 * (9 * d[3]))));  // (a m')' by a
+    const T turn = 1 + a2 * (3 * d[0] + a2 * (5 * d[1] + a2 * (7 * d[2] + a2 * (9 * d[3]))));  // d (m r) / d a
     s.slope = centre ? d[0] - T(1) / 3 : (turn / (1 + r2) - s.m) / (2 * r2);
     return s;
   }

@@ -239,8 +239,8 @@ NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T r
 
 constexpr int32_t kBits[kLanes] = {1, 2, 4, 8, 16, 32, 64, 128};
 
-// For eight pixels (i .. i + 7, j) of a row: which of the contested ones face `id` wins from the nearest faces so far
-// by exact depth. Of equally near faces the first one wins, in whichever order they are filled.
+// Which of the contested pixels among (i .. i + 7, j) face `id` wins: it is nearer there, by exact depth, than the face
+// stored so far. Of equally near faces the one with the smaller index wins, in whichever order they are filled.
 template <class T>
 LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, int64_t i, int64_t j,
                     const int32_t* face_index_at) {

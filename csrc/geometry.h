@@ -84,9 +84,9 @@ NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
   return (bt - at) / (bs - as) * (n - as) + at;
 }
 
-// The last pixel of a sweep into a face, at which it leaves the face, in the direction of t = -infinity if d > 0 and of
-// +infinity if d < 0; at most one pixel outside [0, R). Rounded and converted as published: truncated, saturated, NaN
-// to 0.
+// The last pixel of a sweep into a face, before it leaves the face on the far side. The sweep goes towards smaller t if
+// d > 0, towards larger t if d < 0. The result lies in [-1, R]. As published: rounded towards the inner pixel, clamped;
+// NaN becomes 0.
 template <class T>
 NMR_INLINE int64_t sweep_limit(T far_side, int64_t d, int64_t R) {
   const T t = d > 0 ? std::ceil(far_side) : std::floor(far_side);

@@ -1,14 +1,14 @@
 // Compiles one file of inner loops for several instruction sets (levels) and lets the program choose at run time:
 //
-//   #define NMR_LEVEL_FILE "sweep.h"   // functions and templates only: no #include, no namespace, no include guard
+//   #define NMR_LEVEL_FILE "sweep.h"   // functions and templates: no namespace, no guard, #include only of such files
 //   #include "levels.h"
 //   ...
 //   NMR_AT_BEST_LEVEL(sweep_faces, image, faces);   // calls base::sweep_faces, v3::sweep_faces or v4::sweep_faces
 //
 // The file is included once per level, each time in a namespace of its own that also holds the lanes (level_lanes.h)
-// of that level. Loops over plain arrays are vectorized by the compiler, others use lanes. Its own includes stand
-// above, so that nothing of the standard library is compiled for a level and then shared with code for all processors:
-// a function of a level never has the name of one that another file could call. Levels other than `base` exist for
+// of that level. Loops over plain arrays are vectorized by the compiler, others use lanes. Headers are included before
+// the levels: the linker could otherwise keep the AVX copy of an inline library function for code of every processor,
+// because functions of a level are local to their file, and those of the library are not. Levels above `base` exist for
 // x86-64 with GCC 12 or later and glibc, if NMR_MULTIVERSION is defined. NMR_CPU_LEVEL=base or v3 in the environment
 // keeps a process at that level; results do not depend on it.
 #include <cstdint>

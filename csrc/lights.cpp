@@ -246,7 +246,7 @@ void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight
 
 constexpr double kShortest = 1e-5;  // an interpolated normal that is shorter stays short: its gradient is finite
 
-// Offset of the values of image b.
+// Pointers to the values of image b, and the sign of its front normals.
 template <class T>
 struct View {
   ImageAttributes<T> image;
@@ -380,7 +380,7 @@ void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const Lit
   }
 }
 
-// Their gradients: those of colours, and in sums.values from number 9 on those of the light of each face.
+// Gradients of lit_faces_forward: those of colours, and in sums.values, from entry 9 of each face on, of its light.
 template <int64_t kColors, class T>
 void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<T>& sums) {
   const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;

@@ -114,8 +114,8 @@ template <class T>
 struct Rates {
   T up = 0, down = 0;
 
-  // A border of the object: the upper (lower) neighbour is background. `own` and `other` are the gradients of the two
-  // pixels.
+  // The surface ends before the upper (lower) neighbour. `own` and `other` are (I - I of the neighbour) times the
+  // gradients of the pixel and of that neighbour.
   void add_upper_end(T own, T other) {
     up -= other;
     down += own;

@@ -41,7 +41,7 @@ NMR_INLINE Vec3 direction_backward(const Direction& d, const Vec3& grad) {
   return (grad - d.unit * d.unit.dot(grad)) / d.length;
 }
 
-// The meshes' vertices as they count.
+// Whether a vertex is used: finite, with coordinates below kLargest. Others count as the origin.
 template <class T>
 NMR_INLINE bool counts(const T* vertex) {
   return std::abs(vertex[0]) < T(kLargest) && std::abs(vertex[1]) < T(kLargest) && std::abs(vertex[2]) < T(kLargest);

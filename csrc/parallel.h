@@ -55,8 +55,8 @@ inline int cpu_level() {
 #endif
 }
 
-// Decides whether loops use several threads. A loop ends when its last thread has ended, and a thread that has no core,
-// because other programs use them, may need many times as long as the whole loop. A caller that waited in vain
+// Keeps loops on one thread while cores are oversubscribed. A loop ends when its last thread has ended, and a thread
+// without a core may need many times as long as the whole loop. A caller that waited for such a thread
 // therefore works alone for 50 times as long as it waited, so that no more than a fiftieth of the time is lost.
 class Company {
  public:
@@ -80,8 +80,8 @@ class Company {
 
   bool wanted() const { return now() >= alone_until_.load(std::memory_order_relaxed); }
 
-  // A caller had nothing left to do at `finished`. worked and stopped: the longest times for which another thread was
-  // at work with and without a core.
+  // finished: when the caller ran out of iterations. worked: the longest time that another thread spent on a core;
+  // stopped: the longest time that another thread spent without one.
   void judge(int64_t finished, int64_t worked, int64_t stopped) {
     const int64_t time = now(), waited = time - finished;
     if (waited < kPatience || (waited < worked + kPatience && stopped < waited / 2)) return;

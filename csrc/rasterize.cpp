@@ -23,8 +23,8 @@ namespace {
 
 // Faces or pixels of a row that are worked on together, and pixels per side of a block.
 constexpr int64_t kTogether = 8;
-constexpr int64_t kBandPixels = int64_t(1) << 16;  // of a band whose memory, 12 bytes a pixel, fits into a cache
-constexpr int64_t kPixelsPerFace = 64;             // least pixels of such a band for each face
+constexpr int64_t kBandPixels = int64_t(1) << 16;  // pixels of a band that fits into a core's cache: 12 bytes each
+constexpr int64_t kPixelsPerFace = 64;             // bands get that small only with this many pixels per face
 constexpr int64_t kChunk = 2048;  // faces that one thread sets up together
 
 // Data of eight faces for the fill.

@@ -66,9 +66,9 @@ class ThreadScratch {
   template <class Scratch>
   struct Kept : AnyKept {
     Scratch value;
-    Kept** face_index;
-    explicit Kept(Kept** face_index) : face_index(face_index) {}
-    ~Kept() override { *face_index = nullptr; }
+    Kept** holder;  // the thread's pointer to this object (see get)
+    explicit Kept(Kept** holder) : holder(holder) {}
+    ~Kept() override { *holder = nullptr; }
   };
   struct Registry {
     std::mutex mutex;

@@ -58,8 +58,8 @@ NMR_INLINE void reached(T lo, T hi, int64_t size, int64_t& first, int64_t& last)
   last = std::min<int64_t>(size - 1, static_cast<int64_t>(to > -1 ? (to < n ? to : n) : T(-2)) + 1);
 }
 
-// Whether face f is drawn. It is not if its corners are all one vertex, if one of them is not finite, if all lie in front
-// of `near` or all behind `far`, or, without fill_back, if it is seen from behind.
+// Whether face f is drawn. It is not if its corners are all one vertex, if one of them is not finite, if all are nearer
+// than `near` or all farther than `far`, or, without fill_back, if it is seen from behind.
 template <class T>
 NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& face) {
   const T largest = std::sqrt(std::sqrt(std::numeric_limits<T>::max()));  // squares of squares stay finite

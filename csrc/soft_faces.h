@@ -127,8 +127,8 @@ void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
   }
 }
 
-// The gradient of one face: x and y of its corners, and sigma; pull [H, W] is the gradient of x_j without the factor D_j: grad
-// alpha * clear.
+// The gradient of one face: x and y of its corners, and sigma. pull [H, W] is grad_alpha * clear: the gradient of x_j
+// (soft.cpp) without its factor D_j.
 template <class T>
 void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, const T* pull, T* grad) {
   const Size raster = image.settings.raster;

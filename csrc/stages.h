@@ -1,6 +1,6 @@
-// The argument struct of each stage: inputs, outputs, sizes, settings. Raw arrays only, row-major. Every image has row
-// 0 at the top. Stages in the order of a render: camera, clip, rasterize, then those that use the face index map:
-// silhouette, fragments, depth, shading, resolve.
+// The argument struct of each stage: inputs, outputs, sizes, settings. Raw arrays only, row-major. Row 0 of an image is
+// the top one, except in clip space (ClipMesh). Stages in the order of a render: camera, clip, rasterize, then those
+// that use the face index map: silhouette, fragments, depth, shading, resolve. Voxels and losses come last.
 #pragma once
 
 #include <cstdint>
@@ -168,8 +168,8 @@ struct SilhouetteBackward {
 // The soft silhouette of SoftRas (soft.cpp): alpha = 1 - clear, clear = the product of 1 - D over all faces.
 template <class T>
 struct SoftSettings {
-  RasterSettings<T> raster;  // faces wholly in front of near or behind far are left out
-  T sigma;                   // D = 1 / (1 + exp(-+ d^2 / sigma)); d in units of half the shorter side of the raster
+  RasterSettings<T> raster;  // faces wholly nearer than near or farther than far are left out
+  T sigma;                   // D = sigmoid(+-d^2 / sigma), + inside; d in units of half the shorter side of the raster
   T reach;                   // faces whose border is at d^2 >= reach from a pixel outside are left out there
 };
 
@@ -203,7 +203,7 @@ struct SoftLayers {
   int num_threads;
 };
 
-// Of such faces: weights, depth and distance, and their derivatives (soft_fragments.cpp).
+// Weights, depth and distance of the faces that SoftLayers finds, and their derivatives (soft_fragments.cpp).
 template <class T>
 struct SoftFragments {
   MeshBatch<T> mesh;
@@ -376,8 +376,8 @@ template <class T>
 struct Antialias {
   ClipMesh<T> mesh;
   const T* rast;          // [B, H, W, 4] of ClipWeights
-  const int64_t* twins;   // [F, 3]: for the edge opposite to corner k of face f the next of the mesh with the same two
-                          // vertices, 3 f + k; cyclic
+  const int64_t* twins;   // [F, 3]: edge 3 f + k is opposite to corner k of face f. Its entry is the next edge with the
+                          // same two vertices, cyclically: itself if there is no other
   int64_t channels;       // C
   const T* colors;        // [B, H, W, C]
   T* blended;             // forward out [B, H, W, C]
@@ -399,8 +399,8 @@ struct Normals {
   int num_threads;
 };
 
-// The parameters of lights, in this order in `layout`; those of each kind have a row per image or one for all, and per
-// light.
+// The parameters of lights, in this order in `layout`. Each has a row for every image or one for all, and in a row a
+// number, or a vector of three, for every light or one for all.
 enum class Light : int {
   ambient, ambient_color, directional, directional_color, direction, point, point_color, position, falloff,
   specular, shininess, count
@@ -448,7 +448,7 @@ struct Resolve {
   int64_t background_batch; // 1 or B
   T* resolved;              // forward out [B, h, w, C]
   const T* grad_resolved;   // backward in
-  T* grad_pixels;           // backward out [B, H, W, C], 0 at background pixels; or nullptr
+  T* grad_pixels;           // backward out [B, H, W, C], or nullptr; 0 at background pixels if `background` is given
   T* grad_background;       // backward out [B, C], or nullptr
   int num_threads;
 };

@@ -26,7 +26,7 @@ NMR_INLINE Grid grid_of(const int64_t* grids, int64_t images, int64_t levels, in
 
 // --- mipmaps
 
-// The finer texels under texel i of a row of `size` that replaces one of `finer`: from 2 i on, with the share of each.
+// The weights of the fine texels that texel i of a coarse row covers. The first is 2 i, or i if the sizes are equal.
 template <class T>
 struct Share {
   int64_t count;

@@ -19,8 +19,8 @@ from .cameras.projection import ProjectingCamera, Projection
 from .lights import Lights
 from .textures import FaceColors, NormalMap, TextureCubes, UVTexture, VertexColors
 
-# Pixels of the raster that are shaded at once, and how many times as many a batch must have to be cut: 2 GB would be
-# kept then. Smaller batches are not worth the second shading, a fifth of the time if freed memory is kept by malloc.
+# Pixels of the raster that are shaded at once, and the least number of such chunks for which a batch is cut: uncut, it
+# would keep 2 GB. Fewer are not worth the second shading, a fifth of the time if freed memory is kept by malloc.
 RASTER_AT_ONCE, FEWEST_CHUNKS = 2**20, 32
 
 # Axes that a field has if it holds a value for each image.
@@ -136,7 +136,7 @@ class _Chunked(torch.autograd.Function):
         ctx.chunks, ctx.draw, ctx.names, ctx.ids = chunks, draw, names, ids
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        # Face indices and images come first: they would lie between the memory that every chunk uses again.
+        # Face indices and images are allocated first: later, they would fragment the memory that the chunks reuse.
         ctx.face_index = [rasterize(*chunks.take(rows, part)) for rows in chunks]
         images: dict[str, Tensor] = {}
         for rows, face_index in zip(chunks, ctx.face_index, strict=True):

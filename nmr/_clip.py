@@ -86,7 +86,7 @@ def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: floa
 def _room(mesh: MeshBatch, plane: float) -> list[tuple[int, int]] | None:
     """New vertices and drawn faces of each mesh; None if nothing is cut.
 
-    What has no values yet (in torch.compile and torch.func.vmap) gets room for the case that every face is cut.
+    Meshes whose values are not known yet (torch.compile, torch.func.vmap) get room for every face to be cut.
     """
     counts = mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch
     if not torch.compiler.is_compiling():

@@ -46,7 +46,7 @@ def render_soft_rgb(
     Parameters
     ----------
     sigma : float or Tensor []
-        Blur beyond the border of faces, as in :func:`render_soft_silhouette`: ``D = sigmoid(-+ d^2 / sigma)``.
+        Blur beyond the border of faces, as in :func:`render_soft_silhouette`: ``D = sigmoid(+-d^2 / sigma)``, + inside.
     gamma : float or Tensor []
         How sharply nearer faces hide others.
     faces_per_pixel : int

@@ -33,7 +33,7 @@ _HARMONICS = (
     0.54627422,
 )
 
-# In the order of the kernel's enum Light: the shapes that are accepted, and the number of axes after those of lights.
+# In the order of the kernel's enum Light: accepted shapes, as text and as numbers of axes; then 1 for vectors, else 0.
 _SHAPES = {
     "ambient": ("[] or [B]", (0, 1), 0),
     "ambient_color": ("[3] or [B, 3]", (1, 2), 1),
@@ -79,8 +79,8 @@ class Lights:
     directional_color : [3], [L, 3] or [B, L, 3]
     smooth : bool
     position : [3], [L, 3] or [B, L, 3], optional; keyword only, as all that follow
-        World-space positions of point lights (default: no point lights). Other numbers of lights than of directional
-        ones are possible.
+        World-space positions of point lights (default: no point lights). Their number may differ from that of the
+        directional lights.
     point : number, or Tensor [], [L] or [B, L]
         Intensity of each point light.
     point_color : [3], [L, 3] or [B, L, 3]

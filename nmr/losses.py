@@ -292,8 +292,8 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
 def area_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     """The area of surfaces: mean over meshes of ``sum over faces |(v1 - v0) x (v2 - v0)| / 2``.
 
-    Of the shapes that agree with given silhouettes, a small weight on the area takes one without folds, whose sides
-    that no camera sees are flat.
+    Among the shapes that match given silhouettes, a small weight on the area selects one without folds, flat on the
+    sides that no camera sees.
 
     Parameters
     ----------

@@ -128,7 +128,7 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
             remedy = "remove the extra faces, and faces that use a vertex twice"
         raise ValueError(
             f"every edge must have two different vertices and {wanted}, but {len(bad)} of {len(edges)} edges do not: "
-            f"edge ({v0}, {v1}) has {int(counts[bad[0]])}; {remedy}"
+            f"edge ({v0}, {v1}) has {int(counts[bad[0]])} face(s); {remedy}"
         )
     inner = counts[edge_of_side] == 2
     order = torch.argsort(edge_of_side[inner], stable=True)

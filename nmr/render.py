@@ -271,15 +271,15 @@ def render_silhouette(
     clip : bool
         Cut the faces that reach behind the plane at depth ``near``, so that their part in front is drawn where it is
         seen, with gradients to their corners. Without this, as in the published renderer, corners behind the eye land
-        mirrored on the image, and the whole face is drawn wrongly. Scenes in front of the plane are the same. With near
-        = 0 the plane lies at far / 1e5, with a smaller near than far / 1e8 there: nothing nearer is drawn. Without a
+        mirrored on the image, and the whole face is drawn wrongly. Scenes in front of the plane are the same. The plane
+        lies at far / 1e5 if near is 0, at far / 1e8 if near is smaller than that: nothing nearer is drawn. Without a
         camera, x and y are taken as divided by z (perspective). In float32, a near of less than a thousandth of a
         scene around the eye can leave single pixels open where cut faces meet; take float64 or a larger near
         (a warning says so).
     eps : float
         In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]). In the local one,
         the gradient is 0 if the two directions lower the loss at rates that differ by less than eps. Both as published.
-        (It also ends the lookup in :class:`nmr.TextureCubes`.)
+        (It also limits coordinates in texture cubes to ts - 1 - eps: see :class:`nmr.TextureCubes`.)
     gradient : "nmr", "local" or "none"
         The definition of the gradient. The images are the same.
 
@@ -368,7 +368,7 @@ def render_soft_silhouette(
     -----
     Differentiable in x and y of the vertices (and through the camera): this is the true derivative of the image (up to
     the jump of dist_eps), and in sigma. z gets 0. Formulas and constants are the published ones. Unlike there, faces
-    that lie wholly in front of ``near`` or behind ``far`` are left out, and ``fill_back=False`` leaves out those seen
+    wholly nearer than ``near`` or farther than ``far`` are left out, and ``fill_back=False`` leaves out those seen
     from behind. There is no second derivative.
 
     Raises

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Makes the model that comes with the package, learn3d/models/small.safetensors: one network for six categories. It learns from
 # 2,000 generated objects of each, and from the models of Debian's furniture packages that are in the public domain or under
-# CC BY, 12 stretched forms of each; 12 random sides and heights. Its encoder scales every object to one size, because nobody
-# knows how far away the camera of a picture stood. The first 1,000 generated objects of each category become templates. A stopped
-# run continues. Usage: bash tools/small_model.sh. Settings: STEPS, OBJECTS, OUT (environment), OTHERS (a folder of cut-out pictures of other things, PNG, of which it is to warn; see docs/demo.md).
-# An hour and a half on two cores.
+# CC BY, 12 stretched forms of each; 12 random views per form. Its encoder scales every object to one size, because nobody
+# knows how far away the camera of a picture was. The first 1,000 generated objects of each category become templates. A stopped
+# run continues. Environment: STEPS, OBJECTS, OUT, BIN, OTHERS (cut-out PNG files of things to warn of, see docs/demo.md).
+# Usage: bash tools/small_model.sh. It takes an hour and a half on two cores.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=${BIN:-.venv/bin}

@@ -2,7 +2,7 @@
 # Installs the package with everything its tests need into .venv and runs the tests.
 # Usage: bash tools/test.sh [--all] [PYTEST ARGUMENTS]
 #   --all   the slow tests as well: trainings of minutes, sanitizers, long kills; and the coverage (what CI runs)
-# JOBS: number of processes (default one per core; 0: in this one).
+# JOBS: number of test processes (default: one per core, at most 8; 0: pytest's own process, for --pdb).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . tools/setup.sh

@@ -132,7 +132,7 @@ def _posed(
 
 
 def _perspective(half_fov_deg: float | Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
-    """The angle is rounded to ``dtype``, as published. The tangent is rounded once more: the same on all processors."""
+    """Intrinsics and extent. The angle is rounded to ``dtype``, as published; its tangent is computed in float64."""
     if isinstance(half_fov_deg, Tensor):
         angle = half_fov_deg.to("cpu", torch.float64).reshape(-1) * (math.pi / 180)
     else:

@@ -41,7 +41,7 @@ class Pinhole(ProjectingCamera):
         k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of OpenCV's fisheye. Beyond the radius at
         which the formula turns back (or comes near to it, with p1 and p2), where no lens follows it, the image goes on
         straight: nothing is folded into the picture, and vertices there have no gradient to the coefficients. Edges of
-        faces are drawn straight: give large faces smaller ones.
+        faces are drawn straight: subdivide large faces.
     orig_size : number or (height, width), keyword only
         The image that K belongs to. It is mapped onto the whole rendered image: stretched, if that has another shape.
 

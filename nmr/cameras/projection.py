@@ -1,4 +1,4 @@
-"""The general camera: an affine motion, a perspective division, and the map to the image."""
+"""The general camera: an affine map, a perspective division, and the map to the image."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Projection(ProjectingCamera):
     matrix : Tensor [B, 3, 4]
         ``[A | t]``, world to camera axes.
     intrinsics : Tensor [B, 2, 3]
-        Maps p to renderer space. Its second row usually changes the sign of y, which is up there.
+        Maps p / extent to renderer space. Its second row usually changes the sign of y: in renderer space y is up.
     distortion : Tensor [B, 4], [B, 5] or [B, 8], optional
         OpenCV's k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of a fisheye. Not used without
         perspective. See :class:`nmr.Pinhole` about points beyond the reach of the formula.

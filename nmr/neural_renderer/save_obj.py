@@ -39,7 +39,7 @@ def create_texture_image(textures: Tensor, texture_size_out: int = 16) -> tuple[
     columns = int((num_faces - 1) ** 0.5) + 1
     rows = (num_faces - 1) // columns + 1
 
-    # One tile's pixel (x, y) is at the weights (1 - y, y - x, x) / (T - 1) of the corners (0, 0), (0, 1), (1, 1).
+    # Corners of a tile are at its pixels (0, 0), (0, T - 1), (T - 1, T - 1). x and y run from 0 to 1 over the tile.
     y, x = np.mgrid[:size, :size] / (size - 1)
     weights = np.stack([1 - y, y - x, x], axis=-1) / (1 + _EPS)
     texels = _blend(textures.detach().cpu().float().numpy(), weights.reshape(-1, 3))

@@ -12,7 +12,7 @@ def vertices_to_faces(vertices: Tensor, faces: Tensor) -> Tensor:
     """Corners ``[B, F, 3, 3]``: ``corners[b, f, k] = vertices[b, faces[b, f, k]]``.
 
     ``vertices [B, V, 3]``; ``faces [B, F, 3]`` (or ``[1, F, 3]``, ``[F, 3]`` for all meshes), whole numbers of any
-    type. Differentiable in ``vertices``. :class:`Renderer` does not use this: the kernels read vertices and faces.
+    type. Differentiable in ``vertices``. :class:`Renderer` uses it for light only: the kernels read vertices and faces.
 
     Raises
     ------

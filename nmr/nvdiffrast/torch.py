@@ -284,7 +284,7 @@ class _Mip(NamedTuple):
 def texture_construct_mip(tex: Tensor, max_mip_level: int | None = None, cube_mode: bool = False) -> _Mip:
     """The mipmaps of a texture for the argument ``mip`` of :func:`texture`.
 
-    Textures with a gradient ignore them there, because the gradient passes through the mipmaps.
+    If tex requires a gradient, :func:`texture` makes them anew, so that the gradient passes through them.
     """
     tex = _texture_of(tex, cube_mode)
     sizes = tuple(tex.shape[-3:-1])
@@ -321,8 +321,8 @@ def texture(
     derivatives of uv from :func:`interpolate`: the mipmap level is log2 of the longer half axis of the ellipse of
     texels that a pixel covers. ``mip_level_bias [B, H, W]`` is added, or without uv_da is the level. ``mip`` is from
     :func:`texture_construct_mip`, or a list of tensors like tex, each with half the sides of the one before, rounded
-    down, and with a gradient of its own. Differentiable in tex, except with "nearest" in uv, and with
-    "linear-mipmap-linear" in uv_da and mip_level_bias.
+    down, and with a gradient of its own. Differentiable in tex; in uv unless filter_mode is "nearest"; in uv_da and
+    mip_level_bias if it is "linear-mipmap-linear".
     """
     modes = ("auto", "nearest", "linear", "linear-mipmap-nearest", "linear-mipmap-linear")
     check_choice(filter_mode, "filter_mode", modes)
