@@ -149,7 +149,7 @@ VALUES = [
     (r"subdivisions must lie in 0\.\.7", lambda: nmr.icosphere(12)),
     (r"3 of 120 edges do not: edge .* has 1.*fill_holes", lambda: nmr.edge_table(F[:-1])),
     (r"at most two faces, but .* has .*extra faces", lambda: nmr.edge_table(torch.cat([F, F]), open_mesh=True)),
-    (r"edge \(0, 0\) has 2; remove the extra", lambda: nmr.edge_table(torch.tensor([[0, 0, 1], [0, 0, 1]]))),
+    (r"edge \(0, 0\) has 2 face\(s\); remove the extra", lambda: nmr.edge_table(torch.tensor([[0, 0, 1], [0, 0, 1]]))),
     ("faces of one mesh", lambda: nmr.unique_edges(F[None])),
     # settings
     (r"a pair \(height, width\), got \(8, 9, 10\)", lambda: render(image_size=(8, 9, 10))),
