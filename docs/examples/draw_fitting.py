@@ -31,8 +31,7 @@ def fit(masks: torch.Tensor, cameras: nmr.LookAt, steps: int) -> list[torch.Tens
     for step in range(steps + 1):
         vertices = softness @ shape
         shapes.append(vertices.detach())
-        for group in optimizer.param_groups:
-            group["lr"] = 0.02 * (1 - 0.9 * step / steps)
+        optimizer.param_groups[0]["lr"] = 0.02 * (1 - 0.9 * step / steps)
         images = nmr.render_silhouette(vertices, faces, cameras, image_size=masks.shape[1])
         smooth = 3e-4 * 0.1 ** (step / steps) * nmr.losses.smoothness_loss(vertices, edges)
         optimizer.zero_grad()
@@ -42,9 +41,7 @@ def fit(masks: torch.Tensor, cameras: nmr.LookAt, steps: int) -> list[torch.Tens
 
 
 def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> dict[str, float]:
-    """Write fitting.gif: above the objects, below the meshes while they are fitted; everything turns.
-
-    Returns the IoU of the silhouettes by category.
+    """Write fitting.gif (objects, and meshes while they are fitted), and return the outlines' IoU by category.
 
     output: folder for it, made if needed.
     frames: pictures; the fit takes the first half of them.
@@ -53,24 +50,20 @@ def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> d
     """
     views = nmr.LookAt.from_angles(2.732, [-20.0, 30.0] * 12, [15.0 * k for k in range(24)], half_fov_deg=13.0)
     turn = [30.0 - 360.0 * frame / frames for frame in range(frames)]
-    columns, ious = [], {}
+    cameras = [nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0) for azimuth in turn]
+    shown = [min(steps, round(steps * (2 * frame / frames) ** 2)) for frame in range(frames)]  # slowly at first
+    sphere_faces, columns, ious = nmr.icosphere(4)[1], [], {}
     for category, seed in OBJECTS.items():
         mesh = make_shape(category, np.random.default_rng([seed, 0, 0]))
         vertices = torch.as_tensor(np.asarray(mesh.vertices) * (1, 1, -1), dtype=torch.float32)  # left-handed
         faces = torch.as_tensor(np.asarray(mesh.faces))
         masks = nmr.render_silhouette(vertices, faces, views, image_size=96)
         shapes = fit(masks, views, steps)
-        sphere_faces = nmr.icosphere(4)[1]
-        with torch.no_grad():
-            drawn = nmr.render_silhouette(shapes[-1], sphere_faces, views, image_size=96)
+        drawn = nmr.render_silhouette(shapes[-1], sphere_faces, views, image_size=96)
         ious[category] = 1 - nmr.losses.soft_iou_loss(drawn, masks).item()
-        rows = ([], [])
-        for frame, azimuth in enumerate(turn):
-            camera = nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0)
-            shape = shapes[min(steps, round(steps * (2 * frame / frames) ** 2))]  # slowly at first
-            for row, surface in zip(rows, (Surface(vertices, faces), Surface(shape, sphere_faces)), strict=True):
-                row.append(draw_surface(surface, [camera], image_size=size)[0])
-        columns.append(rows)
+        pairs = zip(shown, cameras, strict=True)
+        fitted = [draw_surface(Surface(shapes[k], sphere_faces), [view], image_size=size)[0] for k, view in pairs]
+        columns.append((draw_surface(Surface(vertices, faces), cameras, image_size=size), fitted))
     sheets = [
         tile([[column[row][frame] for column in columns] for row in (0, 1)], list(OBJECTS), tile_size=size)
         for frame in range(frames)

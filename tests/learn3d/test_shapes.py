@@ -25,7 +25,7 @@ def shapes(category: str) -> list[trimesh.Trimesh]:
 
 @lru_cache
 def voxels(category: str) -> np.ndarray:
-    """The 32^3 voxels of the first 50 shapes, by the metric's voxeliser."""
+    """The 32^3 voxels of the first 50 shapes, by the metric's voxelizer."""
     return np.stack([voxelize(mesh) for mesh in shapes(category)[:50]])
 
 
@@ -149,7 +149,7 @@ def test_parts_are_turned_right_handedly_mirrored_and_joined(part: Part, centers
     np.testing.assert_allclose([rings.mean((0, 1)) for rings, _ in part.lofts], centers, atol=1e-12)
 
 
-def test_thin_bars_do_not_vanish_between_the_rays_of_the_voxeliser() -> None:
+def test_thin_bars_do_not_vanish_between_the_rays_of_the_voxelizer() -> None:
     """A slanted rod much thinner than a voxel stays one piece from end to end."""
     voxels = voxelize(assemble(bar((0, 0, 0), (0.35, 0.98, 0.27), 0.006)))
     assert count_pieces(voxels) == 1

@@ -88,8 +88,8 @@ def test_quoted_rows_are_shown_and_never_trained(tmp_path, make, monkeypatch, re
     rows = {name: TABLES["pascal"].rows[name] for name in ("CSDM", "CMR")} | dict(table.rows)
     monkeypatch.setitem(TABLES, "kato", dataclasses.replace(table, rows=rows))
     assert make(request_for()) == 0
-    assert "| CSDM | paper (voxeliser not stated, quoted from Kar et al. 2015) | 0.398 | 0.398 |" in read_report()
-    assert "| CMR | paper (voxeliser not stated, quoted from Kanazawa et al. 2018) | 0.460 | 0.460 |" in read_report()
+    assert "| CSDM | paper (voxelizer not stated, quoted from Kar et al. 2015) | 0.398 | 0.398 |" in read_report()
+    assert "| CMR | paper (voxelizer not stated, quoted from Kanazawa et al. 2018) | 0.460 | 0.460 |" in read_report()
     assert len(list(tmp_path.glob("out/runs/*/*"))) == 2
 
 

@@ -161,7 +161,7 @@ def test_curves_are_those_of_the_log(page, runs, read_metrics) -> None:
         ("{run} {tmp}/no --output {tmp}/page.html", "there is no checkpoint"),
         ("{run} --category chair --output {tmp}/page.html", "chair"),
         ("{run} --indices 24 --output {tmp}/page.html", "indices must lie in 0 .. 23"),
-        ("{run} --objects 101 --output {tmp}/page.html", "of 1 to 100 images, and 101 are"),
+        ("{run} --objects 101 --output {tmp}/page.html", "of 1 to 100 images, got 101"),
     ],
 )
 def test_mistakes_are_one_clear_line(words: str, message: str, runs, tmp_path, command) -> None:
