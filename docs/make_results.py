@@ -40,8 +40,9 @@ def rows(name: str, part: str) -> list[list[str]]:
     if part not in ("both", "side"):
         return [row for row in tables[part] if row[1] != "here (kato19)"]
     header, *main = [row for row in tables["main"] if row[1] != "here (kato19)"]
-    compared = {row[0] for row in tables["differences"]}
-    baseline = next(name for name, source, *_ in main if name not in compared and source.startswith("here"))
+    ours = {name for name, source, *_ in main if source.startswith("here")}
+    main = [row for row in main if row[0] in ours]  # quoted methods stay in the file
+    baseline = next(row[0] for row in main if row[0] not in {row[0] for row in tables["differences"]})
     differences = {row[0]: row[2 - len(header) :] for row in tables["differences"]}
     groups = [list(group) for _, group in groupby(main, key=lambda row: row[0])]
     if part == "both":

@@ -136,7 +136,7 @@ class _Chunked(torch.autograd.Function):
         ctx.chunks, ctx.draw, ctx.names, ctx.ids = chunks, draw, names, ids
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        # Face indices and images are allocated first: later, they would fragment the memory that the chunks reuse.
+        # Face indices and images are allocated first, so that they do not fragment the memory that the chunks reuse.
         ctx.face_index = [rasterize(*chunks.take(rows, part)) for rows in chunks]
         images: dict[str, Tensor] = {}
         for rows, face_index in zip(chunks, ctx.face_index, strict=True):

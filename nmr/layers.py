@@ -41,7 +41,7 @@ def render_soft_rgb(
 ) -> Images:
     """The soft colours of SoftRas (Liu et al. 2019), as PyTorch3D's softmax_rgb_blend blends them, and their alpha.
 
-    Other arguments are those of :func:`render` and :func:`render_silhouette`.
+    Other arguments are those of :func:`render` and :func:`render_silhouette`; ``near`` is 1 by default, as in SoftRas.
 
     Parameters
     ----------
