@@ -35,24 +35,28 @@ class Images:
     fragments: Fragments
 
     def __init__(self, outputs: dict[str, Tensor | Fragments]) -> None:
-        self.__dict__.update(outputs)
+        object.__setattr__(self, "_names", tuple(outputs))  # torch.compile cannot follow self.__dict__ in every torch
+        for name, value in outputs.items():
+            object.__setattr__(self, name, value)
 
     def __getattr__(self, name: str) -> Tensor | Fragments:
+        if name.startswith("_"):
+            raise AttributeError(f"Images has no attribute {name!r}")
         if name in OUTPUTS:
-            raise AttributeError(f"{name} was not rendered; request it with outputs={(*self.__dict__, name)}")
-        raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self.__dict__)}")
+            raise AttributeError(f"{name} was not rendered; request it with outputs={(*self._names, name)}")
+        raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self._names)}")
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"Images cannot be changed, so {name} cannot be set")
 
     def __iter__(self) -> Iterator[Tensor | Fragments]:
-        return iter(self.__dict__.values())
+        return iter([getattr(self, name) for name in self._names])
 
     def __len__(self) -> int:
-        return len(self.__dict__)
+        return len(self._names)
 
     def __getitem__(self, index: int) -> Tensor | Fragments:
         return tuple(self)[index]
 
     def __repr__(self) -> str:
-        return f"Images({', '.join(f'{name}: {describe(value)}' for name, value in self.__dict__.items())})"
+        return f"Images({', '.join(f'{name}: {describe(getattr(self, name))}' for name in self._names)})"

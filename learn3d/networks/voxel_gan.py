@@ -228,8 +228,9 @@ def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) 
         values.append(weight[inside])
     step = 2 * views.half_width  # distance of samples in voxels: (2 half_width / size) / (1 / size)
     indices, weights = torch.stack([torch.cat(pixels), torch.cat(voxels)]), torch.cat(values) * step
-    matrix = torch.sparse_coo_tensor(indices, weights, (size**2, size**3), check_invariants=False).coalesce()
-    return _by_rows(matrix, device), _by_rows(matrix.t().coalesce(), device)
+    with torch.sparse.check_sparse_tensor_invariants(False):  # older torch warns if nobody chooses
+        matrix = torch.sparse_coo_tensor(indices, weights, (size**2, size**3)).coalesce()
+        return _by_rows(matrix, device), _by_rows(matrix.t().coalesce(), device)
 
 
 def _by_rows(matrix: Tensor, device: torch.device) -> Table:

@@ -46,7 +46,9 @@ class ThreadTuner:
 
     def __str__(self) -> str:
         """The number of threads, for the first line of a run's log."""
-        return f"{self.all} threads or 1, whichever is faster" if self._trying else f"{self.threads} threads"
+        if self._trying:
+            return f"{self.all} threads or 1, whichever is faster"
+        return f"{self.threads} thread{'s' * (self.threads > 1)}"
 
     def after_step(self, seconds: float) -> str:
         """Record the duration of a step. Returns a line for the log when a number is chosen, else ""."""

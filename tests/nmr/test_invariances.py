@@ -47,20 +47,20 @@ def of_colors(make, smooth=False):
         how = dict(lights=nmr.Lights(smooth=smooth, **LIGHTS), smooth_normals=smooth, interpolation_gradient=True)
         each = [f] * len(v) if isinstance(v, list) and not isinstance(f, list) else f
         how |= dict(colors=make(*values, each) if make == seams else make(*values), background=0.3, image_size=size)
-        return (*nmr.render(v, f, nmr.LookAt(eyes), outputs=("rgb", "alpha", "depth", "normals"), **how),)
+        return tuple(nmr.render(v, f, nmr.LookAt(eyes), outputs=("rgb", "alpha", "depth", "normals"), **how))
 
     return draw
 
 
 def of_soft_rgb(v, f, eyes, size, colors):
     how = dict(colors=nmr.VertexColors(colors), sigma=1e-3, gamma=0.02, faces_per_pixel=5, near=0.1, image_size=size)
-    return (*nmr.render_soft_rgb(v, f, nmr.LookAt(eyes), lights=nmr.Lights(**LIGHTS), **how),)
+    return tuple(nmr.render_soft_rgb(v, f, nmr.LookAt(eyes), lights=nmr.Lights(**LIGHTS), **how))
 
 
 def of_transparent(v, f, eyes, size, colors, opacity):
     how = dict(colors=nmr.VertexColors(colors), opacity=nmr.FaceColors(opacity), faces_per_pixel=3, image_size=size)
     lights = nmr.Lights(harmonics=HARMONICS, normals=Outward(), **LIGHTS)
-    return (*nmr.render_transparent(v, f, nmr.LookAt(eyes), lights=lights, **how),)
+    return tuple(nmr.render_transparent(v, f, nmr.LookAt(eyes), lights=lights, **how))
 
 
 class Outward:
