@@ -1,6 +1,6 @@
 // Compiles one file of inner loops for several instruction sets (levels) and lets the program choose at run time:
 //
-//   #define NMR_LEVEL_FILE "sweep.h"   // functions, templates and more files of this kind; no namespace, no guard
+//   #define NMR_LEVEL_FILE "sweep.h"   // has functions and templates, but no namespace and no include guard
 //   #include "levels.h"
 //   ...
 //   NMR_AT_BEST_LEVEL(sweep_faces, image, faces);   // calls base::sweep_faces, v3::sweep_faces or v4::sweep_faces

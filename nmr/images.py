@@ -40,7 +40,7 @@ class Images:
             object.__setattr__(self, name, value)
 
     def __getattr__(self, name: str) -> Tensor | Fragments:
-        if name.startswith("_"):
+        if name.startswith("_"):  # copy and pickle ask before there are names
             raise AttributeError(f"Images has no attribute {name!r}")
         if name in OUTPUTS:
             raise AttributeError(f"{name} was not rendered; request it with outputs={(*self._names, name)}")

@@ -41,7 +41,7 @@ def fit(masks: torch.Tensor, cameras: nmr.LookAt, steps: int) -> list[torch.Tens
 
 
 def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> dict[str, float]:
-    """Write fitting.gif (objects, and meshes while they are fitted), and return the outlines' IoU by category.
+    """Write fitting.gif: objects, and below them the meshes during the fit. Returns the outlines' IoU by category.
 
     output: folder for it, made if needed.
     frames: pictures; the fit takes the first half of them.
