@@ -16,8 +16,8 @@ from torch import Tensor
 from learn3d.data.batch import Batch, PoseCandidates
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.disk_array import DiskArray
-from learn3d.data.framing import Crops, join_crops
-from learn3d.data.poses import LookAtPoses, Poses, join_poses
+from learn3d.data.framing import Crops
+from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.renderings import MASK_SIZE
 from learn3d.settings import checked
@@ -68,23 +68,19 @@ class ViewDataset:
     candidates: PoseCandidates | None = None  # M sets of poses for training to draw from; None: `poses` alone
 
     def __post_init__(self) -> None:
-        m, n = len(self.images), self.num_objects
-        if len(self.images.shape) != 4 or self.images.shape[1] != 4 or self.images.dtype != np.uint8:
+        m, n, side = len(self.images), self.num_objects, self.images.shape[-1]
+        if self.images.shape != (m, 4, side, side) or self.images.dtype != np.uint8:
             raise ValueError(f"images must be uint8 [M, 4, S, S], got {self.images.dtype} {list(self.images.shape)}")
-        masks = self.images.shape[:1] + self.images.shape[2:] if self.masks is None else self.masks.shape
-        if masks[1:] != (MASK_SIZE, MASK_SIZE):
-            raise ValueError(f"masks must be [M, {MASK_SIZE}, {MASK_SIZE}], got {list(masks)}")
-        if self.depth is not None and self.depth.shape[1:] != (MASK_SIZE, MASK_SIZE):
-            raise ValueError(f"depth must be [M, {MASK_SIZE}, {MASK_SIZE}], got {list(self.depth.shape)}")
-        if self.voxels is not None and self.voxels.shape[1:] != (VOXEL_SIZE,) * 3:
-            raise ValueError(f"voxels must be [N, {VOXEL_SIZE}, {VOXEL_SIZE}, {VOXEL_SIZE}]")
-        wanted = dict.fromkeys(
-            ("poses", "view_ids", "object_ids", "masks", "depth", "crops", "stored_sizes", "candidates"), m
-        )
-        wanted |= dict.fromkeys(("voxels", "points", "class_ids"), n)
-        sizes = {name: len(getattr(self, name)) for name in wanted if getattr(self, name) is not None}
-        if wrong := {name: size for name, size in sizes.items() if size != wanted[name]}:
-            raise ValueError(f"expected {m} images and {n} objects, got {wrong}")
+        if self.masks is None and side != MASK_SIZE:
+            raise ValueError(f"images of {side} pixels need masks of {MASK_SIZE}, got None")
+        wanted = dict.fromkeys(("masks", "depth"), (m, MASK_SIZE, MASK_SIZE))
+        wanted |= dict.fromkeys(("poses", "view_ids", "object_ids", "crops", "stored_sizes", "candidates"), (m,))
+        wanted |= {"voxels": (n, *[VOXEL_SIZE] * 3), "points": (n,), "class_ids": (n,)}
+        for name, shape in wanted.items():
+            if (part := getattr(self, name)) is not None:
+                found = getattr(part, "shape", (len(part),))
+                if found[: len(shape)] != shape:
+                    raise ValueError(f"{name} of {m} images of {n} objects must be {list(shape)}, got {list(found)}")
         for name, end in (("view_ids", self.num_views), ("object_ids", n)):
             values = getattr(self, name)
             if m and not (values.min() >= 0 and values.max() < end):
@@ -120,42 +116,43 @@ class ViewDataset:
         known = self.num_views, self.inverted, self.num_classes, features, mirror_plane_deg, cube_side
         return DatasetInfo(*known, solidity)
 
-    def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
+    def read(self, samples: np.ndarray) -> tuple[np.ndarray | None, ...]:
+        """The images, masks and depth of the samples `samples`, int64 [B], as they are stored."""
+        return tuple(None if part is None else part[samples] for part in (self.images, self.masks, self.depth))
+
+    def batch(
+        self, indices: Tensor, *, voxels: bool = True, pixels: tuple[np.ndarray | None, ...] | None = None
+    ) -> Batch:
         """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU. ValueError for other indices.
 
-        voxels: False for training, which needs none; they are twice as large as the images.
+        voxels: False for training, which needs none; they are twice as large as the images. pixels: the result of
+        `read` for these samples; None to read them now.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64)
         samples = indices.numpy()
         if len(samples) and not 0 <= samples.min() <= samples.max() < len(self):
             given = f"{samples.min()} .. {samples.max()}"
             raise ValueError(f"indices must lie in 0 .. {len(self) - 1}, got {given}")  # --indices of commands
+        pixels = self.read(samples) if pixels is None else pixels
+        images, masks, depth = (None if part is None else torch.from_numpy(part) for part in pixels)
         poses = None if self.poses is None else self.poses[indices]
         view_ids, objects = (array[samples].astype(np.int64) for array in (self.view_ids, self.object_ids))
         classes = np.zeros_like(objects) if self.class_ids is None else self.class_ids[objects]
-        images = torch.from_numpy(self.images[samples])
-        masks = images[:, 3] if self.masks is None else torch.from_numpy(self.masks[samples])
         return Batch(
             images=images,
-            masks=masks.to(torch.float32) / 255,
+            masks=(images[:, 3] if masks is None else masks).to(torch.float32) / 255,
             poses=poses,
             view_ids=torch.from_numpy(view_ids),
             object_ids=torch.from_numpy(objects),
             class_ids=torch.from_numpy(classes),
             voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
             crops=None if self.crops is None else self.crops[samples],
-            depth=None if self.depth is None else depth_of_levels(torch.from_numpy(self.depth[samples]), poses),
+            depth=None if depth is None else depth_of_levels(depth, poses),
         )
 
     def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
         """Occupancy bool [B, 32, 32, 32] of meshes in the data set's voxel axes, see `VoxelConvention.voxelize`."""
         return self.convention.voxelize(vertices, faces, definition)
-
-    def prepare(self, indices: Tensor) -> None:
-        """Start to read the samples of the next `batch` in the background, if they are on disk."""
-        for array in (self.images, self.masks, self.depth):
-            if isinstance(array, DiskArray):
-                array.prepare(indices.numpy())
 
     def digest(self, *, voxels: bool = True) -> int:
         """CRC-32 of images, masks, poses and classes, and of voxels if wanted. Arrays on disk count by checksums."""
@@ -273,22 +270,16 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     for other in datasets[1:]:
         if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
             raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
-
-    def joined(name: str) -> Array | Crops | None:
+    joined = {}
+    for name in ("images", "masks", "depth", "poses", "view_ids", "voxels", "points", "stored_sizes", "crops"):
         parts = [getattr(d, name) for d in datasets]
         if len({type(part) for part in parts}) > 1:
-            raise ValueError(f"some categories lack {name} or do not have it as shards; convert all categories or none")
-        if parts[0] is None:
-            return None
-        join = {DiskArray: DiskArray.join, Crops: join_crops}.get(type(parts[0]), np.concatenate)
-        return join(parts)
-
+            raise ValueError(f"{name} of different kinds cannot be joined: convert all categories to shards, or none")
+        joined[name] = None if parts[0] is None else getattr(parts[0], "join", np.concatenate)(parts)
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1].tolist()
-    names = ("images", "masks", "depth", "view_ids", "voxels", "points", "stored_sizes", "crops")
     return dataclasses.replace(
         first,
-        **{name: joined(name) for name in names},
-        poses=join_poses([d.poses for d in datasets]),
+        **joined,
         object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
         object_names=tuple(name for d in datasets for name in d.object_names),
     )

@@ -7,8 +7,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,40 +16,33 @@ from learn3d.files.reading import DamagedFile, open_file
 
 MAX_BYTES = 2**45  # size of a file
 WANTED = "a shard of a data set"
-_reader = ThreadPoolExecutor(1, "read ahead")
+CHANGED = "its content has changed since it was written: another CRC-32"
+#: A row of an array: the number of its file, its number in the file, and its CRC-32.
+ROW = np.dtype([("file", np.int32), ("row", np.int32), ("crc", np.uint32)])
 
 
 @dataclass(frozen=True, eq=False)
 class DiskArray:
-    """An array [M, ...] on disk, a selection of the R rows of some files. `array[samples]` reads rows, int64 [B].
+    """An array [M, ...] on disk, whose rows are in some files. `array[samples]` reads rows, int64 [B].
 
     Files are not mapped into memory: if a mapped file is truncated later, a signal ends the process. Here a DamagedFile
     with its name is raised.
     """
 
     files: tuple[tuple[Path, int], ...]  # (file, position of its first row in bytes)
-    starts: np.ndarray  # int64 [files + 1]: number of the first row of each file, and R
-    checksums: np.ndarray  # uint32 [R]: CRC-32 of each row
+    rows: np.ndarray  # ROW [M]
     row_shape: tuple[int, ...]
     dtype: np.dtype
-    rows: np.ndarray  # int64 [M] in 0 .. R-1: the rows of this array
-    _ahead: dict[bytes, Future] = field(default_factory=dict)  # bytes of `samples` -> rows that `prepare` reads
 
     @classmethod
     def join(cls, parts: Sequence[DiskArray]) -> DiskArray:
         """Concatenate several arrays. Raises ValueError if their rows differ in shape or dtype."""
         if len({(part.row_shape, part.dtype) for part in parts}) != 1:
             raise ValueError("the arrays have rows of different shapes or types")
-        begins = np.cumsum([0] + [part.starts[-1] for part in parts])[:-1]
-        ends = [part.starts[1:] + begin for part, begin in zip(parts, begins, strict=True)]
-        return dataclasses.replace(
-            parts[0],
-            files=tuple(file for part in parts for file in part.files),
-            starts=np.concatenate([[0], *ends]),
-            checksums=np.concatenate([part.checksums for part in parts]),
-            rows=np.concatenate([part.rows + begin for part, begin in zip(parts, begins, strict=True)]),
-            _ahead={},
-        )
+        rows = np.concatenate([part.rows for part in parts])
+        starts = np.cumsum([0] + [len(part.files) for part in parts])[:-1]
+        rows["file"] += np.repeat(starts, [len(part) for part in parts]).astype(np.int32)
+        return dataclasses.replace(parts[0], files=tuple(file for part in parts for file in part.files), rows=rows)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -62,39 +54,28 @@ class DiskArray:
 
     def select(self, samples: np.ndarray) -> DiskArray:
         """The array of the rows `samples`, int64 [B]; nothing is read."""
-        return dataclasses.replace(self, rows=self.rows[samples], _ahead={})
+        return dataclasses.replace(self, rows=self.rows[samples])
 
     def digest(self) -> int:
         """CRC-32 of the checksums of all rows."""
-        return zlib.crc32(self.checksums[self.rows])
-
-    def prepare(self, samples: np.ndarray) -> None:
-        """Start a thread that reads the rows `samples`, int64 [B], for the next `array[samples]`."""
-        self._ahead.clear()
-        self._ahead[samples.tobytes()] = _reader.submit(self._read, samples)
+        return zlib.crc32(np.ascontiguousarray(self.rows["crc"]))
 
     def __getitem__(self, samples: np.ndarray) -> np.ndarray:
         if not isinstance(samples, np.ndarray) or samples.ndim != 1 or samples.dtype.kind not in "iu":
             raise TypeError(f"the index of an array on disk must be an integer array [B], got {samples!r}")
-        future = self._ahead.pop(samples.tobytes(), None)
-        return self._read(samples) if future is None else future.result()
-
-    def _read(self, samples: np.ndarray) -> np.ndarray:
-        rows = self.rows[samples]
-        result = np.empty((len(rows), *self.row_shape), self.dtype)
-        content = result.reshape(len(rows), math.prod(self.row_shape)).view(np.uint8)
-        size = content.shape[1]
-        file_of = np.searchsorted(self.starts, rows, side="right") - 1
-        for number, samples_of_file in itertools.groupby(np.argsort(rows), key=file_of.__getitem__):
+        file_of, row_of, crc_of = (self.rows[samples][name] for name in ROW.names)
+        result, size = np.empty((len(samples), *self.row_shape), self.dtype), math.prod(self.row_shape)
+        content = result.reshape(len(samples), size).view(np.uint8)
+        for number, samples_of_file in itertools.groupby(np.lexsort((row_of, file_of)), key=file_of.__getitem__):
             path, position = self.files[number]
             try:
                 with open_file(path, MAX_BYTES, WANTED) as file:
                     for k in samples_of_file:
-                        file.seek(position + int(rows[k] - self.starts[number]) * size)
-                        if file.readinto(content[k]) != size:
+                        file.seek(position + int(row_of[k]) * content.shape[1])
+                        if file.readinto(content[k]) != content.shape[1]:
                             raise OSError("it ends early")
-                        if zlib.crc32(content[k]) != self.checksums[rows[k]]:
-                            raise ValueError("its content has changed since it was written: another CRC-32")
+                        if zlib.crc32(content[k]) != crc_of[k]:
+                            raise ValueError(CHANGED)
                         if self.dtype == np.bool_ and content[k].max() > 1:  # such bools compute wrongly
                             raise ValueError("its bools have values other than 0 and 1")
                         if self.dtype.kind == "f" and not np.isfinite(result[k]).all():

@@ -208,6 +208,12 @@ class Crops:
             regions.append((left, top, right, bottom))
         return cls(pixels, np.array(regions, np.int64), boxes, size)
 
+    @classmethod
+    def join(cls, parts: Sequence[Crops]) -> Crops:
+        """Concatenate several sets of the same image size."""
+        regions, boxes = (np.concatenate([getattr(part, name) for part in parts]) for name in ("regions", "boxes"))
+        return cls([pixels for part in parts for pixels in part.pixels], regions, boxes, parts[0].size)
+
     def __getitem__(self, samples: np.ndarray) -> Crops:
         """The samples `samples`, int64 [B]; the pixels are shared."""
         return Crops([self.pixels[k] for k in samples], self.regions[samples], self.boxes[samples], self.size)
@@ -239,9 +245,3 @@ def bounds(box: np.ndarray, shift: np.ndarray, width: int, height: int) -> tuple
         min(int(width), int(left + w + padding[2] * w)),
         min(int(height), int(top + h + padding[3] * h)),
     )
-
-
-def join_crops(parts: Sequence[Crops]) -> Crops:
-    """Concatenate several sets of the same image size."""
-    regions, boxes = (np.concatenate([getattr(part, name) for part in parts]) for name in ("regions", "boxes"))
-    return Crops([pixels for part in parts for pixels in part.pixels], regions, boxes, parts[0].size)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -21,7 +20,31 @@ def wrap_deg(angle_deg: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class LookAtPoses:
+class _PoseSet:
+    """Poses of M views: tensors [M, ...], and numbers that all views share."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, indices: Tensor) -> Poses:
+        """The poses of the samples `indices`, int64 [B]."""
+        return replace(self, **{name: v[indices] for name, v in vars(self).items() if isinstance(v, Tensor)})
+
+    @classmethod
+    def join(cls, parts: Sequence[Poses]) -> Poses:
+        """Concatenate the poses of several sets."""
+        joined = {}
+        for name in vars(parts[0]):
+            values = [getattr(part, name) for part in parts]
+            if any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1:  # else one number for all
+                tensors = [torch.as_tensor(v, dtype=torch.float32) for v in values]
+                values = [torch.cat([v if v.ndim else v.expand(len(p)) for v, p in zip(tensors, parts, strict=True)])]
+            joined[name] = values[0]
+        return cls(**joined)
+
+
+@dataclass(frozen=True, eq=False)
+class LookAtPoses(_PoseSet):
     """M perspective cameras that look at the origin from (distance, elevation, azimuth) in the object frame.
 
     Conventions of `nmr.cameras.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e cos a).
@@ -34,33 +57,23 @@ class LookAtPoses:
     num_features: ClassVar[int] = 3
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        for name, value in list(vars(self).items()):
             if isinstance(value, (np.ndarray, Tensor)):
-                value = torch.as_tensor(value, dtype=torch.float32)
-                object.__setattr__(self, field.name, value)
+                object.__setattr__(self, name, torch.as_tensor(value, dtype=torch.float32))
                 if value.shape != (len(self),):
-                    raise ValueError(f"{field.name} must be [{len(self)}] or one number, got {list(value.shape)}")
-
-    def __len__(self) -> int:
-        return len(self.azimuth_deg)
-
-    def __getitem__(self, indices: Tensor) -> LookAtPoses:
-        """The poses of the samples `indices`, int64 [B]."""
-        return LookAtPoses(*(value[indices] if isinstance(value, Tensor) else value for value in self._values()))
+                    raise ValueError(f"{name} must be [{len(self)}] or one number, got {list(value.shape)}")
 
     def in_range(self) -> Tensor:
         """Which poses are finite and within the bounds of `files.limits`: bool [M]."""
         (near, far), (narrow, wide) = limits.DISTANCE, limits.FOV_DEG
-        azimuth, elevation, distance, half_fov = map(torch.as_tensor, self._values())
+        azimuth, elevation, distance, half_fov = map(torch.as_tensor, vars(self).values())
         sound = (azimuth.abs() <= limits.ANGLE_DEG) & (elevation.abs() < 90)
         return sound & (distance >= near) & (distance <= far) & (half_fov > narrow / 2) & (half_fov < wide / 2)
 
     def cameras(self) -> nmr.LookAt:
         """The M cameras as one batch."""
-        return nmr.LookAt.from_angles(
-            self.distance, self.elevation_deg, self.azimuth_deg, half_fov_deg=self.half_fov_deg
-        )
+        angles = self.distance, self.elevation_deg, self.azimuth_deg
+        return nmr.LookAt.from_angles(*angles, half_fov_deg=self.half_fov_deg)
 
     def features(self) -> Tensor:
         """The input of a discriminator: the eye's position of each view, float32 [M, 3]."""
@@ -70,12 +83,9 @@ class LookAtPoses:
         """The poses after the images `chosen` (bool [M]) are flipped left-right: their azimuths are negated."""
         return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
 
-    def _values(self) -> tuple[Tensor | float, ...]:
-        return self.azimuth_deg, self.elevation_deg, self.distance, self.half_fov_deg
-
 
 @dataclass(frozen=True, eq=False)
-class RotationPoses:
+class RotationPoses(_PoseSet):
     """M orthographic cameras, each given by a rotation (Pascal3D+): v' = R v, and x', y' in [-1, 1] span the image.
 
     Objects are moved in front of the camera (z' + `depth_offset`), which changes no pixel of a silhouette.
@@ -89,13 +99,6 @@ class RotationPoses:
         object.__setattr__(self, "rotation", torch.as_tensor(self.rotation, dtype=torch.float32))
         if self.rotation.ndim != 3 or self.rotation.shape[1:] != (3, 3):
             raise ValueError(f"rotation must be [M, 3, 3], got {list(self.rotation.shape)}")
-
-    def __len__(self) -> int:
-        return len(self.rotation)
-
-    def __getitem__(self, indices: Tensor) -> RotationPoses:
-        """The poses of the samples `indices`, int64 [B]."""
-        return RotationPoses(self.rotation[indices], self.depth_offset)
 
     def in_range(self) -> Tensor:
         """Which matrices are finite and invertible: bool [M]. Rotations may include a reflection."""
@@ -123,20 +126,3 @@ class RotationPoses:
 
 
 Poses = LookAtPoses | RotationPoses
-
-
-def join_poses(poses: Sequence[Poses | None]) -> Poses | None:
-    """Concatenate the poses of several sets; None if they are unknown. Raises ValueError for different kinds."""
-    kind = type(poses[0])
-    if any(type(p) is not kind for p in poses):
-        raise ValueError("the categories have cameras of different kinds")
-    if poses[0] is None:
-        return None
-    joined = {}
-    for field in dataclasses.fields(kind):
-        values = [getattr(p, field.name) for p in poses]
-        if any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1:  # else one number for all
-            parts = [torch.as_tensor(v, dtype=torch.float32) for v in values]
-            values = [torch.cat([v if v.ndim else v.expand(len(p)) for v, p in zip(parts, poses, strict=True)])]
-        joined[field.name] = values[0]
-    return kind(**joined)

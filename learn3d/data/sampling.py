@@ -9,7 +9,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Literal, Protocol, get_args
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -37,17 +38,20 @@ class BatchOptions(Protocol):
 def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1) -> Iterator[Batch]:
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
-    If the data set is on disk, a thread reads the next batch during a step.
+    A thread reads the images of the next batch during a step.
     """
-    indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, start)
-    for step in range(start, options.iterations + 1):
-        batch = dataset.batch(indices, voxels=False)
-        if dataset.candidates is not None:
-            batch = dataset.candidates.draw(batch, indices, options.seed, step)
-        if step < options.iterations:
-            indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, step + 1)
-            dataset.prepare(indices)
-        yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted)
+    sample = functools.partial(sample_indices, dataset, options.sampling, options.batch_size, options.seed)
+    indices = sample(start)
+    with ThreadPoolExecutor(1, "read ahead") as reader:
+        ahead = reader.submit(dataset.read, indices.numpy())
+        for step in range(start, options.iterations + 1):
+            batch = dataset.batch(indices, voxels=False, pixels=ahead.result())
+            if dataset.candidates is not None:
+                batch = dataset.candidates.draw(batch, indices, options.seed, step)
+            if step < options.iterations:
+                indices = sample(step + 1)
+                ahead = reader.submit(dataset.read, indices.numpy())
+            yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted)
 
 
 def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int) -> Tensor:
@@ -61,25 +65,21 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
     if sampling == "views":
         return shuffled_epochs(len(dataset), batch_size, seed, step)
     rng = np.random.default_rng([seed, step])
-    if sampling in ("pairs", "groups"):
-        starts, order = _views_by_object(dataset)
-        sizes = np.diff(starts)
-        able = np.flatnonzero(sizes >= 2)
-        if len(able) == 0:
-            raise ValueError("no object has two views; a multi-view method needs at least two views of an object")
-        if sampling == "groups":
-            objects = able[rng.integers(len(able), size=batch_size // GROUP_SIZE)]
-            views = [rng.permutation(max(size, GROUP_SIZE))[:GROUP_SIZE] % size for size in sizes[objects]]
-            return torch.from_numpy(order[starts[objects, None] + np.array(views)].T.reshape(-1))
-        objects = able[rng.integers(len(able), size=batch_size // 2)]
-        first = rng.integers(sizes[objects])
-        second = (first + rng.integers(1, sizes[objects])) % sizes[objects]
-        return torch.from_numpy(np.concatenate([order[starts[objects] + first], order[starts[objects] + second]]))
+    starts, order = _grouped_views(dataset, by_class=sampling == "classes")
+    sizes = np.diff(starts)
     if sampling == "classes":
-        members = _views_by_class(dataset)
         drawn = rng.integers(dataset.num_classes, size=batch_size)
-        return torch.from_numpy(np.array([members[c][rng.integers(len(members[c]))] for c in drawn]))
-    raise ValueError(f"sampling must be {', '.join(get_args(Sampling))}, got {sampling!r}")
+        return torch.from_numpy(np.array([order[starts[c] + rng.integers(sizes[c])] for c in drawn]))
+    able = np.flatnonzero(sizes >= 2)
+    if len(able) == 0:
+        raise ValueError("no object has two views; a multi-view method needs at least two views of an object")
+    objects = able[rng.integers(len(able), size=batch_size // VIEWS_OF_OBJECT[sampling])]
+    if sampling == "groups":
+        views = [rng.permutation(max(size, GROUP_SIZE))[:GROUP_SIZE] % size for size in sizes[objects]]
+        return torch.from_numpy(order[starts[objects, None] + np.array(views)].T.reshape(-1))
+    first = rng.integers(sizes[objects])
+    second = (first + rng.integers(1, sizes[objects])) % sizes[objects]
+    return torch.from_numpy(order[starts[objects] + np.stack([first, second])].reshape(-1))
 
 
 def shuffled_epochs(num_samples: int, batch_size: int, seed: int, step: int) -> Tensor:
@@ -100,19 +100,13 @@ def _epoch_order(num_samples: int, seed: int, epoch: int) -> Tensor:
 
 
 @functools.lru_cache(maxsize=2)
-def _views_by_object(dataset: ViewDataset) -> tuple[np.ndarray, np.ndarray]:
-    """Samples int64 [M] sorted by object, after the position int64 [N+1] at which each object starts."""
-    order = np.argsort(dataset.object_ids, kind="stable")
-    return np.searchsorted(dataset.object_ids[order], np.arange(dataset.num_objects + 1)), order
-
-
-@functools.lru_cache(maxsize=2)
-def _views_by_class(dataset: ViewDataset) -> list[np.ndarray]:
-    """The samples of each category."""
-    if dataset.class_ids is None:
-        return [np.arange(len(dataset))]
-    of_sample = dataset.class_ids[dataset.object_ids]
-    return [np.flatnonzero(of_sample == c) for c in range(dataset.num_classes)]
+def _grouped_views(dataset: ViewDataset, by_class: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Samples int64 [M] sorted by object or category, after the positions int64 at which each starts, and M."""
+    ids, count = dataset.object_ids, dataset.num_objects
+    if by_class:
+        ids, count = np.zeros_like(ids) if dataset.class_ids is None else dataset.class_ids[ids], dataset.num_classes
+    order = np.argsort(ids, kind="stable")
+    return np.searchsorted(ids[order], np.arange(count + 1)), order
 
 
 Augmentation = Literal["flip", "flip-image", "channels", "colors", "crop"]
@@ -133,20 +127,16 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
     "crop": the colours cropped anew from the original image, each side of the padded box moved by up to 15 % of the
     box (Pascal3D+, both papers). It must come first.
 
-    Raises ValueError for an unknown name, and for "crop" if it is not first or there are no original images.
+    Raises ValueError for "crop" if it is not first or there are no original images.
     """
     rng = np.random.default_rng([seed, step, 1])
     count = len(batch)
     for position, name in enumerate(names):
-        if name not in get_args(Augmentation):
-            raise ValueError(f"augmentation must be {', '.join(get_args(Augmentation))}, got {name!r}")
         images, colors = batch.images, batch.images[:, :3]
         if name == "crop":
-            if position > 0:
-                raise ValueError(f"crop must be the first augmentation, got {', '.join(names)}")
-            if batch.crops is None:
-                wanted = "needs the original images, which only the layout pascal3d without shards has"
-                raise ValueError(f"the augmentation crop {wanted}; leave it out")
+            if position > 0 or batch.crops is None:
+                wanted = "the original images, which only the layout pascal3d without shards has"
+                raise ValueError(f"crop must be the first augmentation, and needs {wanted}; got {', '.join(names)}")
             colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))))
         elif name in ("channels", "colors"):
             order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1))
@@ -160,14 +150,16 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
                 colors = darkness if inverted else 255 - darkness
         else:
             mirrored = torch.from_numpy(rng.random(count) < 0.5)
-            chosen = mirrored[:, None, None, None]
-            colors = torch.where(chosen, colors.flip(3), colors)
+            colors = _flip(colors, mirrored)
             if name == "flip":
-                images = torch.where(chosen, images.flip(3), images)
-                masks = torch.where(chosen[:, 0], batch.masks.flip(2), batch.masks)
-                depth = None if batch.depth is None else torch.where(chosen[:, 0], batch.depth.flip(2), batch.depth)
-                batch = dataclasses.replace(batch, masks=masks, depth=depth)
-                if batch.poses is not None:
-                    batch = dataclasses.replace(batch, poses=batch.poses.mirrored(mirrored))
+                images = _flip(images, mirrored)
+                depth = None if batch.depth is None else _flip(batch.depth, mirrored)
+                poses = None if batch.poses is None else batch.poses.mirrored(mirrored)
+                batch = dataclasses.replace(batch, masks=_flip(batch.masks, mirrored), depth=depth, poses=poses)
         batch = dataclasses.replace(batch, images=torch.cat([colors, images[:, 3:]], dim=1))
     return batch
+
+
+def _flip(images: Tensor, chosen: Tensor) -> Tensor:
+    """Flip the images [B, ..., H, W] with `chosen`, bool [B], left-right."""
+    return torch.where(chosen.view(-1, *[1] * (images.ndim - 1)), images.flip(-1), images)

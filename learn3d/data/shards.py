@@ -35,8 +35,8 @@ from torch import Tensor
 
 from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS, ViewDataset, join_datasets
-from learn3d.data.disk_array import MAX_BYTES, WANTED, DiskArray
-from learn3d.data.poses import LookAtPoses, Poses, RotationPoses
+from learn3d.data.disk_array import CHANGED, MAX_BYTES, ROW, WANTED, DiskArray
+from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.data.readers import READERS
 from learn3d.files import limits
 from learn3d.files.reading import STRICT, DamagedFile, Findings, open_file, parse_json, read_bytes
@@ -56,7 +56,7 @@ _DTYPES = {  # name of a tensor -> names of its dtype in safetensors and NumPy; 
 }
 _POSES = {kind.__name__: kind for kind in (LookAtPoses, RotationPoses)}
 _MAKE_AGAIN = "make or copy it again"
-_ROWS_AT_ONCE = 256  # rows that `_read_rows` reads at a time
+_ROWS_AT_ONCE = 256  # rows that the check reads at a time
 
 Text = Annotated[str, Field(max_length=1000)]
 
@@ -103,7 +103,7 @@ def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
     """Write `part` of a data set, with its arrays in memory, as shard `number` in the folder of its split."""
     tensors = {name: getattr(part, name).astype(np.int32) for name in ("object_ids", "view_ids")}
     tensors["sides"] = part.object_sizes().astype(np.float32)
-    tensors |= {name: v.numpy() for name, v in _fields(part.poses).items() if isinstance(v, Tensor)}
+    tensors |= {name: v.numpy() for name, v in _pose_fields(part).items() if isinstance(v, Tensor)}
     arrays = {name: np.ascontiguousarray(a) for name in _ARRAYS if (a := getattr(part, name)) is not None}
     for name, array in arrays.items():
         tensors[f"{name}.checksums"] = np.array([zlib.crc32(row) for row in array], np.uint32)
@@ -121,7 +121,7 @@ def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> Non
         image_size=part.image_size,
         view_names=list(part.view_names),
         poses=None if part.poses is None else type(part.poses).__name__,
-        constants={name: v for name, v in _fields(part.poses).items() if not isinstance(v, Tensor)},
+        constants={name: v for name, v in _pose_fields(part).items() if not isinstance(v, Tensor)},
     )
     write_json(folder / SET_FILE, dataclasses.asdict(facts), sync=True)
 
@@ -134,10 +134,9 @@ def write_set(folder: Path, layout: str, dataset: ViewDataset) -> int:
     count = dataset.num_objects
     step = max(1, SHARD_BYTES * count // max(1, dataset.images.nbytes))
     for number, start in enumerate(range(0, count, step)):
-        objects = slice(start, min(start + step, count))
-        part = dataset.select(np.flatnonzero((dataset.object_ids >= start) & (dataset.object_ids < objects.stop)))
+        part = dataset.select(np.flatnonzero(dataset.object_ids // step == number))
         names = [name for name in ("voxels", "points", "object_names") if getattr(dataset, name) is not None]
-        own = {name: getattr(dataset, name)[objects] for name in names}
+        own = {name: getattr(dataset, name)[start : start + step] for name in names}
         write_shard(folder, number, dataclasses.replace(part, object_ids=part.object_ids - start, **own))
     finish_set(folder, layout, number + 1, dataset)
     return number + 1
@@ -188,7 +187,9 @@ def load(
         return dataset
     findings.objects = dataset.num_objects
     for array in (a for part in parts for name in _ARRAYS if (a := getattr(part, name)) is not None):
-        findings.attempt(_read_rows, array)
+        for rows in np.array_split(np.arange(len(array)), len(array) // _ROWS_AT_ONCE + 1):
+            if findings.attempt(array.__getitem__, rows) is None:
+                break
     if warning := dataset.check_masks():
         findings.warn(where, warning)
     return None
@@ -210,12 +211,13 @@ def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDa
                 category=category,
                 split=split,
                 poses=poses,
+                view_ids=tables["view_ids"],
                 view_names=tuple(facts.view_names),
+                object_ids=tables["object_ids"],
                 object_names=tuple(names),
                 convention=READERS[facts.layout].PROPERTIES.convention,
                 inverted=READERS[facts.layout].PROPERTIES.inverted,
                 stored_sizes=tables["sides"],
-                **{name: tables[name] for name in ("view_ids", "object_ids")},
                 **{"voxels": None} | arrays,
             )
             if dataset.image_size != facts.image_size:
@@ -246,24 +248,19 @@ def _read_tables(path: Path, file: BinaryIO) -> tuple[list[str], dict[str, np.nd
             file.seek(begin)
             tables[name] = np.fromfile(file, dtype, count).reshape(shape)
     if _crc(metadata["objects"], tables) != metadata["crc"]:
-        raise ValueError("its content has changed since it was written: another CRC-32")
+        raise ValueError(CHANGED)
     arrays = {}
     for name, (begin, (count, *row_shape), dtype) in positions.items():
-        checksums = tables.pop(f"{name}.checksums")
-        if checksums.shape != (count,):
-            raise ValueError(f"{name} has {count} rows, but {checksums.shape} checksums")
-        ends = np.array([0, count])
-        arrays[name] = DiskArray(((path, begin),), ends, checksums, tuple(row_shape), dtype, np.arange(count))
+        rows = np.zeros(len(tables[f"{name}.checksums"]), ROW)
+        rows["row"], rows["crc"] = np.arange(len(rows)), tables[f"{name}.checksums"]
+        if len(rows) != count:
+            raise ValueError(f"{name} has {count} rows, but {len(rows)} checksums")
+        arrays[name] = DiskArray(((path, begin),), rows, tuple(row_shape), dtype)
     return metadata["objects"], tables, arrays
 
 
-def _fields(poses: Poses | None) -> dict[str, Tensor | float]:
-    return {} if poses is None else {field.name: getattr(poses, field.name) for field in dataclasses.fields(poses)}
-
-
-def _read_rows(array: DiskArray) -> None:
-    for start in range(0, len(array), _ROWS_AT_ONCE):
-        array[np.arange(start, min(start + _ROWS_AT_ONCE, len(array)))]
+def _pose_fields(part: ViewDataset) -> dict[str, Tensor | float]:
+    return {} if part.poses is None else vars(part.poses)
 
 
 def _crc(objects: list[str] | tuple[str, ...], tables: dict[str, np.ndarray]) -> int:

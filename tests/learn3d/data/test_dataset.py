@@ -71,10 +71,10 @@ def test_separate_masks_replace_the_fourth_channel() -> None:
     ("change", "message"),
     [
         ({"images": np.zeros((12, 4, 64, 64))}, r"images must be uint8 \[M, 4, S, S\], got float64"),
-        ({"images": np.zeros((12, 4, 32, 32), np.uint8)}, r"masks must be \[M, 64, 64\], got \[12, 32, 32\]"),
-        ({"view_ids": np.zeros(5, np.int64)}, r"expected 12 images and 3 objects, got \{'view_ids': 5\}"),
-        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"12 images and 3 objects, got \{'voxels': 2\}"),
-        ({"voxels": np.zeros((3, 16, 16, 16), bool)}, r"voxels must be \[N, 32, 32, 32\]"),
+        ({"images": np.zeros((12, 4, 32, 32), np.uint8)}, "images of 32 pixels need masks of 64, got None"),
+        ({"masks": np.zeros((12, 32, 32), np.uint8)}, r"masks .* must be \[12, 64, 64\], got \[12, 32, 32\]"),
+        ({"view_ids": np.zeros(5, np.int64)}, r"view_ids of 12 images of 3 objects must be \[12\], got \[5\]"),
+        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"voxels .* must be \[3, 32, 32, 32\], got \[2, 32, 32, 32\]"),
         ({"view_ids": np.full(12, 2)}, r"view_ids must lie in 0 .. 1, got 2 .. 2"),
         ({"object_ids": np.full(12, -1)}, r"object_ids must lie in 0 .. 2, got -1 .. -1"),
     ],
@@ -100,7 +100,7 @@ def test_several_categories_become_one_set_with_classes() -> None:
     with pytest.raises(ValueError, match="jar and cup differ in view classes"):
         concatenate([cups, dataclasses.replace(jars, view_names=("a", "b"))])
     turned = dataclasses.replace(jars, poses=RotationPoses(torch.eye(3).expand(6, 3, 3)))
-    with pytest.raises(ValueError, match="cameras of different kinds"):
+    with pytest.raises(ValueError, match="poses of different kinds"):
         concatenate([cups, turned])
 
 
@@ -121,8 +121,6 @@ def test_classes_are_drawn_uniformly_whatever_their_size() -> None:
     both = concatenate([continuous(40, 4), continuous(1, 2, "jar", seed=1)])
     drawn = both.batch(sample_indices(both, "classes", 400, seed=0, step=1)).class_ids
     assert 150 < int((drawn == 1).sum()) < 250
-    with pytest.raises(ValueError, match="sampling must be views, pairs, groups, classes, got 'all'"):
-        sample_indices(both, "all", 4, seed=0, step=1)
 
 
 @pytest.mark.parametrize(

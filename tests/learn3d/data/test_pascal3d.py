@@ -212,7 +212,7 @@ def test_flip_image_leaves_mask_and_pose(folder: Path) -> None:
 
 def test_impossible_crops_are_refused(folder: Path) -> None:
     batch = pascal3d.load(folder, "aeroplane", "train").batch(torch.arange(2))
-    with pytest.raises(ValueError, match=r"crop must be the first augmentation, got flip, crop"):
+    with pytest.raises(ValueError, match=r"crop must be the first augmentation, .* got flip, crop"):
         augment(batch, ["flip", "crop"], 0, 1, inverted=True)
     with pytest.raises(ValueError, match="only the layout pascal3d without shards"):
         augment(dataclasses.replace(batch, crops=None), ["crop"], 0, 1, inverted=True)
