@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, SkipValidation
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import VIEWS_OF_OBJECT, Augmentation, Sampling
 from learn3d.files import limits
-from learn3d.files.reading import parse_json, read_bytes
+from learn3d.files.reading import read_json
 from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule
 from learn3d.presets import PRESETS, Preset, full_name
 from learn3d.settings import Count, FilePath, Items, Rare, Step, checked
@@ -147,15 +147,11 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
 def load_config(path: Path) -> TrainConfig:
     """Read the config.json of a run. Raises ValueError if it is missing or damaged."""
     try:
-        content = read_bytes(path, limits.CONFIG_BYTES, "the options of a run")
+        values = read_json(path, limits.CONFIG_BYTES, "the options of a run")
     except FileNotFoundError:
         raise ValueError(
             f"{path} is missing: is this the folder of a run? To start a new run, leave out --resume."
         ) from None
-    try:
-        values = parse_json(content)
-    except ValueError as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from None
     return config_from_dict(values, source=str(path))
 
 

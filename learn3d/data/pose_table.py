@@ -80,9 +80,9 @@ class PoseTable:
     def read(cls, path: Path | str) -> PoseTable:
         """Read an untrusted table. Raises DamagedFile and MissingFile."""
         names = [field.name for field in dataclasses.fields(cls)]
-        arrays = read(npz.read_table, Path(path), names, wanted=_WANTED)
+        arrays = read(npz.read_several, Path(path), names, wanted=_WANTED)
         try:
-            return cls(**arrays)
+            return cls(*arrays)
         except ValueError as error:
             raise DamagedFile(Path(path), f"{error}; expected {_WANTED}") from None
 

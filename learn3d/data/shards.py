@@ -39,7 +39,7 @@ from learn3d.data.disk_array import CHANGED, MAX_BYTES, ROW, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.data.readers import READERS
 from learn3d.files import limits
-from learn3d.files.reading import STRICT, DamagedFile, Findings, open_file, parse_json, read_bytes
+from learn3d.files.reading import STRICT, DamagedFile, Findings, open_file, parse_json, read_json
 from learn3d.files.writing import replacing, write_json
 from learn3d.settings import checked
 
@@ -163,9 +163,9 @@ def load(
     findings are not strict, it checks all arrays, too, and returns None.
     """
     where = split_folder(folder, category, split)
-    content = read_bytes(where / SET_FILE, limits.JSON_BYTES, "the description of shards as JSON")
+    content = read_json(where / SET_FILE, limits.JSON_BYTES, "the description of shards")
     try:
-        facts = SetFile(**parse_json(content))
+        facts = SetFile(**content)
     except (ValueError, TypeError) as error:
         raise DamagedFile(where / SET_FILE, f"is no description of shards ({error}); {_MAKE_AGAIN}") from None
     if facts.layout != layout or image_size not in (None, facts.image_size):

@@ -18,7 +18,7 @@ from learn3d.experiments.measurement import MEASURES, Result, figures
 from learn3d.experiments.plan import PlannedRun, Request, command_line, select_rows
 from learn3d.experiments.tables import CATEGORIES, MEAN, TABLES, Row
 from learn3d.files import limits
-from learn3d.files.reading import parse_json, read_bytes
+from learn3d.files.reading import read_json
 
 RESAMPLES = 2000
 
@@ -184,7 +184,7 @@ def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Ce
         if not all(folder in results for folder in folders):
             continue
         errors_file = run.config.poses.with_suffix(".json")
-        errors = parse_json(read_bytes(errors_file, limits.JSON_BYTES, "the errors of a table of poses as JSON"))
+        errors = read_json(errors_file, limits.JSON_BYTES, "the errors of a table of poses")
         ious = [results[folder].voxel_iou for folder in folders]
         values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
         by_category.setdefault(run.config.category, []).append((str(run.config.seed), values))

@@ -18,7 +18,7 @@ from learn3d.experiments.measurement import Result, measure
 from learn3d.experiments.plan import PlannedRun, Request, plan_runs
 from learn3d.experiments.tables import TABLES, VARIANTS
 from learn3d.files import limits, writing
-from learn3d.files.reading import parse_json, read_bytes
+from learn3d.files.reading import read_bytes, read_json
 from learn3d.poses.estimate import NEAR_DEG, PoseOptions
 from learn3d.poses.views import CameraOptions, compare, estimate_views, load_views
 from learn3d.runs import checkpoint
@@ -60,7 +60,7 @@ def _measure_updated_poses(config: TrainConfig) -> None:
     best = azimuths.gather(1, weights.argmax(1, keepdim=True))[:, 0]
     right = wrap_deg(best - torch.as_tensor(known.poses.azimuth_deg)).abs() <= NEAR_DEG
     path = config.poses.with_suffix(".json")
-    errors = parse_json(read_bytes(path, limits.JSON_BYTES, "the errors of a table of poses as JSON"))
+    errors = read_json(path, limits.JSON_BYTES, "the errors of a table of poses")
     writing.write_json(path, errors | {"updated_accuracy": float(right.double().mean())})
 
 

@@ -12,7 +12,7 @@ import os
 import pickle
 import warnings
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,62 +34,47 @@ def read(path: Path, key: str, max_bytes: int | None = None) -> np.ndarray:
 
     max_bytes: largest size; None if unknown, then large arrays with a suspicious compression ratio are refused.
     """
-    info = _member(path, key, max_bytes)
-    with _archive(path).open(info) as file:
-        shape, fortran, dtype = _header(file)
-        count, there = math.prod(shape), info.file_size - file.tell()
-        if dtype.kind not in "biuf" or count * dtype.itemsize != there:
-            raise ValueError(f"{key!r} must be numbers that take {there} bytes, got {dtype} {shape}")
-        sandbox.allow(seconds=there / _BYTES_PER_SECOND)
-        array, at = sandbox.empty((count,), dtype), 0
-        content = array.view(np.uint8)
-        while piece := file.read(2**20):  # zipfile compares the checksum at the end
-            content[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
-            at += len(piece)
+    file, size = _open(path, key, max_bytes)
+    shape, fortran, dtype = _header(file)
+    count, there = math.prod(shape), size - file.tell()
+    if dtype.kind not in "biuf" or count * dtype.itemsize != there:
+        raise ValueError(f"{key!r} must be numbers that take {there} bytes, got {dtype} {shape}")
+    sandbox.allow(seconds=there / _BYTES_PER_SECOND)
+    array, at = sandbox.empty((count,), dtype), 0
+    content = array.view(np.uint8)
+    while piece := file.read(2**20):  # zipfile compares the checksum at the end
+        content[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
+        at += len(piece)
     if dtype.kind == "b" and content.max(initial=0) > 1:  # NumPy and torch compute wrong results with them
         raise ValueError(f"the bools of {key!r} have values other than 0 and 1")
     return array.reshape(shape, order="F" if fortran else "C")
 
 
-def read_existing(path: Path, names: Iterable[str], max_bytes: int) -> dict[str, np.ndarray]:
-    """The arrays among `names` that the file has, each of at most `max_bytes` bytes."""
-    existing = set(keys(path))
-    return {name: read(path, name, max_bytes) for name in names if name in existing}
+def read_several(path: Path, names: Sequence[str], max_bytes: int | None = None) -> list[np.ndarray]:
+    """The arrays `names`, each as `read` reads it."""
+    return [read(path, name, max_bytes) for name in names]
 
 
-def read_table(path: Path, names: list[str]) -> dict[str, np.ndarray]:
-    """All arrays of a file. Raises ValueError if their names are not `names`."""
-    if sorted(existing := keys(path)) != sorted(names):
-        raise ValueError(f"has the arrays {', '.join(existing)[:200]}; expected {', '.join(names)}")
-    return {name: read(path, name) for name in names}
+def read_ragged(path: Path, key: str, others: dict[str, int]) -> list[Any]:
+    """The object array `key` of uint8 arrays, and others with as many items (name -> largest bytes of an item).
 
-
-def read_with_items(path: Path, key: str, others: dict[str, int]) -> list[Any]:
-    """`read_ragged` of the array `key`, then arrays with as many items. others: name -> largest bytes of an item."""
-    first = read_ragged(path, key)
-    count = len(first[1] if isinstance(first, tuple) else first)
-    return [first, *(read(path, name, count * size) for name, size in others.items())]
-
-
-def read_ragged(path: Path, key: str) -> np.ndarray | tuple[np.ndarray, list[tuple[int, ...]]]:
-    """An array of numbers; or, of an object array of uint8 arrays, all their bytes concatenated, and their shapes."""
-    info = _member(path, key)
-    with _archive(path).open(info) as file:
-        if not _header(file)[2].hasobject:
-            return read(path, key)
-        sandbox.allow(3 * info.file_size, 2 * info.file_size / _BYTES_PER_SECOND)
-        items = _Arrays(file, encoding="bytes").load()
+    The first result is a pair: the bytes of all its arrays, concatenated, and their shapes.
+    """
+    file, size = _open(path, key)
+    _header(file)
+    sandbox.allow(3 * size, 2 * size / _BYTES_PER_SECOND)
+    items = _Arrays(file, encoding="bytes").load()
     if type(items) is not np.ndarray or items.dtype != object or items.ndim != 1:
         raise ValueError(f"{key!r} must be a list of arrays")
-    for k, item in enumerate(items):
-        if type(item) is not np.ndarray or item.dtype != np.uint8:
-            raise ValueError(f"{key}[{k}] must be an array of uint8, got {getattr(item, 'dtype', type(item).__name__)}")
-    size = sum(item.nbytes for item in items)
-    if size > info.file_size:  # the pickle refers to the same array many times
+    if wrong := [k for k, item in enumerate(items) if type(item) is not np.ndarray or item.dtype != np.uint8]:
+        raise ValueError(f"{key}[{wrong[0]}] must be an array of uint8")
+    total = sum(item.nbytes for item in items)
+    if total > size:  # the pickle refers to the same array many times
         raise ValueError(f"the arrays of {key!r} take more bytes than the file has")
-    flat = sandbox.empty((size,), np.uint8)
+    flat = sandbox.empty((total,), np.uint8)
     np.concatenate([np.empty(0, np.uint8), *(item.reshape(-1) for item in items)], out=flat)
-    return flat, [item.shape for item in items]
+    shapes = [item.shape for item in items]
+    return [(flat, shapes), *(read(path, name, len(items) * each) for name, each in others.items())]
 
 
 def _make_array(kind: type, shape: Any, code: Any) -> np.ndarray:
@@ -114,24 +99,23 @@ class _Arrays(pickle.Unpickler):
 
 def _archive(path: Path) -> zipfile.ZipFile:
     status = os.stat(path)
-    return _open(path, status.st_ino, status.st_mtime_ns, status.st_size)
+    return _cached(path, status.st_ino, status.st_mtime_ns, status.st_size)
 
 
 @functools.lru_cache(maxsize=1)  # a mesh pack is read array by array; its file status is the key for changes
-def _open(path: Path, *_: int) -> zipfile.ZipFile:
+def _cached(path: Path, *_: int) -> zipfile.ZipFile:
     return zipfile.ZipFile(open_file(path, limits.ARRAY_BYTES, "an npz file"))
 
 
-def _member(path: Path, key: str, max_bytes: int | None = None) -> zipfile.ZipInfo:
-    """The npy file of the array `key`. Raises ValueError if its unpacked size exceeds the limit."""
+def _open(path: Path, key: str, max_bytes: int | None = None) -> tuple[BinaryIO, int]:
+    """The npy file of the array `key`, and its size. Raises ValueError if that exceeds the limit."""
     info = _archive(path).getinfo(f"{key}.npy")
     if max_bytes is None:
         max_bytes = min(limits.ARRAY_BYTES, max(limits.SMALL_BYTES, limits.EXPANSION * info.compress_size))
     if info.file_size > max_bytes + 1000:  # the header has 128 bytes
-        times = info.file_size / max(1, info.compress_size)
-        found = f"would unpack to {info.file_size} bytes, {times:.0f} times its size"
-        raise ValueError(f"{key!r} {found}; the limit is {max_bytes}")
-    return info
+        found = f"{info.file_size} bytes, {info.file_size / max(1, info.compress_size):.0f} times its size"
+        raise ValueError(f"{key!r} would unpack to {found}; the limit is {max_bytes}")
+    return _archive(path).open(info), info.file_size
 
 
 def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype]:

@@ -1,15 +1,11 @@
 """Opens and reads untrusted files, and collects their faults.
 
 A fault is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError), whose message names the file.
-
-A reader calls `Findings.attempt` for each step. With strict findings the first fault is raised. Otherwise all faults
-are recorded, so the same code loads and checks a data set.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
 import stat
 from collections.abc import Callable
@@ -50,7 +46,9 @@ class Problem:
 
 @dataclass
 class Findings:
-    """Collects the faults of a data set."""
+    """Collects the faults of a data set. With strict findings the first fault is raised; so the same code loads and
+    checks a data set.
+    """
 
     strict: bool = False  # True: raise the first error, ignore warnings
     problems: list[Problem] = field(default_factory=list)
@@ -94,19 +92,13 @@ def open_file(path: Path | str, max_bytes: int, wanted: str) -> BinaryIO:
     except (OSError, ValueError) as error:
         raise DamagedFile(path, f"cannot be read ({error}); expected {wanted}") from error
     status = os.fstat(file.fileno())
-    if stat.S_ISREG(status.st_mode) and status.st_size <= max_bytes:
-        return file
-    file.close()
-    fault = f"has {status.st_size} bytes; the limit is {max_bytes}"
+    fault = f"has {status.st_size} bytes; the limit is {max_bytes}" if status.st_size > max_bytes else ""
     if not stat.S_ISREG(status.st_mode):
         fault = "cannot be read: it is not a regular file"
-    raise DamagedFile(path, f"{fault}; expected {wanted}")
-
-
-def check_file(path: Path | str, max_bytes: int, wanted: str) -> int:
-    """The size of a file in bytes. Raises as `open_file`."""
-    with open_file(path, max_bytes, wanted) as file:
-        return os.fstat(file.fileno()).st_size
+    if fault:
+        file.close()
+        raise DamagedFile(path, f"{fault}; expected {wanted}")
+    return file
 
 
 def read_bytes(path: Path | str, max_bytes: int, wanted: str) -> bytes:
@@ -124,16 +116,18 @@ def read_text(path: Path | str, max_bytes: int, wanted: str, *, encoding: str = 
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
-    """The value of a JSON text. Raises ValueError if it is invalid, or has NaN or infinities and `finite` is True."""
-
-    def number(word: str) -> float:
-        if not math.isfinite(value := float(word)):
-            raise ValueError(f"{word[:30]} is not a finite number")
-        return value
-
+def read_json(path: Path | str, max_bytes: int, wanted: str) -> Any:
+    """The value of a JSON file. Raises as `open_file`, and DamagedFile for other content."""
+    content = read_bytes(path, max_bytes, wanted)
     try:
-        kinds = {"parse_constant": number, "parse_float": number} if finite else {}
-        return json.loads(text, **kinds)
+        return parse_json(content)
+    except ValueError as error:
+        raise DamagedFile(Path(path), f"is not valid JSON ({error}); expected {wanted}. {FETCH_AGAIN}") from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text. Raises ValueError if it is invalid."""
+    try:
+        return json.loads(text)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None

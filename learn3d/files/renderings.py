@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, open_file, read_text
@@ -28,74 +29,73 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
     with open_file(path, limits.IMAGE_FILE_BYTES, "an image") as file:
         try:
             image = Image.open(file, formats=formats)
-            pixels = image.width * image.height
-            if max(image.size) <= max_side and pixels <= limits.IMAGE_PIXELS:
-                sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
-                image.load()
-                return image
-            fault = f"is {image.width}x{image.height} pixels; at most {max_side} a side and {limits.IMAGE_PIXELS} in "
-            fault += "all are read: make it smaller"
-        except UnidentifiedImageError:
-            fault = f"cannot be decoded as an image in the format {', '.join(formats)}; convert it from other formats"
-        except MemoryError:
+            pixels, most = image.width * image.height, limits.IMAGE_PIXELS
+            if max(image.size) > max_side or pixels > most:
+                size = f"{image.width}x{image.height} pixels"
+                raise DamagedFile(path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller")
+            sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
+            image.load()
+            return image
+        except (DamagedFile, MemoryError):
             raise
         except Exception as error:  # Pillow raises various errors for damaged files
-            fault = f"cannot be decoded as an image ({sandbox.reason(error)}). {FETCH_AGAIN}"
-    raise DamagedFile(path, fault)
+            kinds = f"an image in the format {', '.join(formats)}"
+            raise DamagedFile(path, f"cannot be decoded as {kinds} ({sandbox.reason(error)}). {FETCH_AGAIN}") from error
 
 
 MASK_SIZE = 64
-View = tuple[np.ndarray, np.ndarray, int]
+View = tuple[np.ndarray, np.ndarray, int]  # image uint8 [4, S, S], mask uint8 [64, 64], largest value of the mask
 
 
 def read_with_alpha(path: Path, size: int) -> View:
     """A square rendering, reduced to `size`: colours over white, and its alpha channel as the mask."""
-    image = _read_square(path, size)
-    color, alpha = split_alpha(image)
+    color, alpha = _read_square(path, size)
     if alpha is None:
-        raise DamagedFile(path, f"has the channels {image.mode}; expected RGBA, whose alpha is the mask")
-    return *shrink(_planes(color, alpha), size), int(alpha.max())
+        raise DamagedFile(path, "has no alpha channel; expected RGBA, whose alpha is the mask")
+    return _view(color, alpha, size)
 
 
 def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
     """A square rendering, reduced to `size`. Mask: depth below 250 in 8 bits, or alpha if there is no depth file."""
-    image = _read_square(path, size)
-    color, mask = split_alpha(image)
+    color, mask = _read_square(path, size)
     if depth_path.exists():
         depth = open_image(depth_path, RENDERINGS, limits.RENDER_SIDE)
-        if depth.size != image.size:
-            sizes = [f"{i.width}x{i.height} pixels" for i in (depth, image)]
-            raise DamagedFile(depth_path, f"is {sizes[0]}, but {path.name} is {sizes[1]}")
+        if depth.size != (len(color),) * 2:
+            raise DamagedFile(depth_path, f"is {_kind(depth)}, but {path.name} has {len(color)} pixels a side")
         is_16_bit = depth.mode.startswith("I")  # then the high byte counts
         grey = np.asarray(depth) >> 8 if is_16_bit else np.asarray(depth.convert("L"))
         mask = np.where(grey < 250, 255, 0).astype(np.uint8)
     elif mask is None:
         raise MissingFile(depth_path, f"is missing, and {path.name} has no alpha channel; expected the depth image")
-    return *shrink(_planes(color, mask), size), int(mask.max())
+    return _view(color, mask, size)
 
 
 def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
     """A rendering and its mask, both size x size; colours are inverted, as in Kato's files."""
-    color, mask = (_read_exactly(each, size) for each in (path, mask_path))
-    return np.dstack([255 - color, mask[..., 0]]).transpose(2, 0, 1), mask[..., 0], int(mask.max())
+    images = []
+    for each in (path, mask_path):
+        image = open_image(each, RENDERINGS, limits.RENDER_SIDE)
+        if image.size != (size, size) or image.mode.startswith("I"):
+            raise DamagedFile(each, f"is {_kind(image)}; expected {size}x{size} of 8 bits")
+        images.append(split_alpha(image)[0])
+    mask = images[1][..., 0]
+    return np.dstack([255 - images[0], mask]).transpose(2, 0, 1), mask, int(mask.max())
 
 
-def _read_exactly(path: Path, size: int) -> np.ndarray:
-    image = open_image(path, RENDERINGS, limits.RENDER_SIDE)
-    if image.size != (size, size) or image.mode.startswith("I"):
-        found = f"{image.width}x{image.height} pixels of the format {image.mode}"
-        raise DamagedFile(path, f"is {found}; expected {size}x{size} of 8 bits")
-    return split_alpha(image)[0]
-
-
-def _read_square(path: Path, size: int) -> Image.Image:
+def _read_square(path: Path, size: int) -> tuple[np.ndarray, np.ndarray | None]:
     image, least = open_image(path, RENDERINGS, limits.RENDER_SIDE), max(size, MASK_SIZE)
-    if image.width != image.height or image.width < least:
-        found = f"{image.width}x{image.height} pixels"
-        raise DamagedFile(path, f"is {found}; expected a square image of at least {least}x{least}")
-    if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-        raise DamagedFile(path, f"has the pixel format {image.mode}; expected 8-bit grey, RGB or RGBA")
-    return image
+    if image.width != image.height or image.width < least or image.mode.startswith(("I", "F", "C")):
+        raise DamagedFile(path, f"is {_kind(image)}; expected a square image of at least {least}x{least}, 8 bits")
+    return split_alpha(image)
+
+
+def _kind(image: Image.Image) -> str:
+    return f"{image.width}x{image.height} pixels of the format {image.mode}"
+
+
+def _view(color: np.ndarray, mask: np.ndarray, size: int) -> View:
+    planes = np.stack([*color.transpose(2, 0, 1), mask]).astype(np.float32)
+    return *shrink(planes, size), int(mask.max())
 
 
 def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
@@ -109,12 +109,6 @@ def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     white = Image.new("RGB", image.size, (255, 255, 255))
     white.paste(image, mask=alpha)
     return np.asarray(white), np.asarray(alpha)
-
-
-def _planes(color: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    planes = np.empty((4, *mask.shape), np.float32)
-    planes[:3], planes[3] = color.transpose(2, 0, 1), mask
-    return planes
 
 
 def shrink(planes: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -145,17 +139,8 @@ def _area_weights(source: int, size: int) -> np.ndarray:
 
 def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     """The first rows and columns of a table of numbers in a text file: float64 [rows, columns], all finite."""
-    text = read_text(path, limits.TABLE_BYTES, wanted)
-    lines = [line.split() for line in text.splitlines() if line.strip()]
-    if len(lines) < rows:
-        raise DamagedFile(path, f"has {len(lines)} rows, {rows} are needed; expected {wanted}. {FETCH_AGAIN}")
-    table = np.full((rows, columns), np.nan)
-    for k, line in enumerate(lines[:rows]):
-        try:
-            table[k] = [float(word) for word in line[:columns]]
-            sound = len(line) >= columns and np.isfinite(table[k]).all()
-        except ValueError:
-            sound = False
-        if not sound:
-            raise DamagedFile(path, f"row {k} is {' '.join(line)!r}; expected {wanted}, all finite")
+    text = io.StringIO(read_text(path, limits.TABLE_BYTES, wanted))
+    table = np.loadtxt(text, comments=None, usecols=range(columns), max_rows=rows, ndmin=2)
+    if (found := np.isfinite(table).all(axis=1).sum()) < rows:
+        raise ValueError(f"{found} rows of finite numbers, {rows} are needed")
     return table

@@ -1,9 +1,9 @@
 """A sandbox for untrusted files: worker processes that may crash, hang or run out of memory.
 
 `read` and `read_all` run functions in workers, with limits of memory (on Linux), processor time and elapsed time. They
-start on demand, one for each core, and read many files each. An exception, a crash, and too much memory or time become
-a `DamagedFile` or `MissingFile`, whose message names the file. A dead worker is replaced. This module imports neither
-torch nor scipy, so that a worker starts in a tenth of a second. It needs a POSIX system.
+start on demand, one for each core, and read many files each. A failure becomes a `DamagedFile` or `MissingFile` with
+the name of the file, and a dead worker is replaced. This module imports neither torch nor scipy, so that a worker
+starts in a tenth of a second. It needs a POSIX system.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile
 
 MEMORY = 256 * 2**20  # bytes that a call may allocate; large arrays made by `empty` do not count
 SECONDS = 5.0  # processor time of a call
-_TIMEOUT = 600.0  # seconds from the start of a group of calls to its results; disks can be slow
 _GROWTH = 256 * 2**20  # a worker that keeps more bytes after its calls is replaced
 _LARGE = 2**20  # size in bytes from which `empty` uses shared memory
 _LINUX = sys.platform == "linux"
@@ -50,6 +49,7 @@ class Call:
     wanted: str = "an intact file"  # description of the file, for messages
     memory: int = MEMORY  # limit in bytes, without the result
     seconds: float = SECONDS  # limit of processor time
+    timeout: float = 600.0  # limit of elapsed seconds; disks can be slow
 
 
 def read(function: Callable[..., Any], path: Path | str, *arguments: Any, **options: Any) -> Any:
@@ -79,11 +79,8 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
             elif tasks and tasks[0].results is not None:
                 yield tasks.popleft().results
             elif busy:
-                for connection in wait(busy, 1.0):
+                for connection in wait(busy):
                     busy[connection].receive()
-                for task in busy.values():
-                    if task.results is None and time.monotonic() > task.deadline:
-                        task.receive()
             else:
                 return
     finally:  # after an interruption some workers are still busy
@@ -101,17 +98,13 @@ class _Task:
     """A group of calls in a worker."""
 
     def __init__(self, calls: list[Call]) -> None:
-        self.calls, self.deadline = calls, time.monotonic() + _TIMEOUT
-        self.results: list[Any] | None = None
-        self.worker = _idle_worker()
+        self.calls, self.results, self.worker = calls, None, _idle_worker()
         with contextlib.suppress(OSError):  # if the worker has died, `receive` finds out
             self.worker.connection.send((os.getcwd(), calls))
 
     def receive(self) -> None:
-        """Receive the results of the worker; if it has died or is late, find the file at fault."""
+        """Receive the results of the worker; if it has died, find the file at fault."""
         try:
-            if not self.worker.connection.poll():
-                raise TimeoutError
             self.results, grown = self.worker.receive()
             self.worker.end() if grown else _idle.append(self.worker)
         except (EOFError, OSError, pickle.UnpicklingError):
@@ -120,12 +113,12 @@ class _Task:
             self.results = [self._fault(status)] if single else [next(read_all([[call]]))[0] for call in self.calls]
 
     def _fault(self, status: int) -> DamagedFile:
-        call, fault = self.calls[0], f"reading it crashed its process (status {status})"
-        if status == -signal.SIGXCPU:
-            fault = f"reading it takes more than {call.seconds:g} seconds of processor time"
-        elif time.monotonic() > self.deadline:
-            fault = f"reading it was stopped after {_TIMEOUT:g} seconds"
-        return DamagedFile(call.path, f"{fault}; expected {call.wanted}. {FETCH_AGAIN}")
+        (call,) = self.calls
+        fault = {
+            -signal.SIGXCPU: f"takes more than {call.seconds:g} seconds of processor time",
+            -signal.SIGALRM: f"was stopped after {call.timeout:g} seconds",
+        }.get(status, f"crashed its process (status {status})")
+        return DamagedFile(call.path, f"reading it {fault}; expected {call.wanted}. {FETCH_AGAIN}")
 
 
 class _Worker:
@@ -209,6 +202,7 @@ def _serve(end: int) -> None:
             os.chdir(folder)
             results, sent = [_attempt(call) for call in calls], []
             _limit(math.inf, math.inf)
+            signal.setitimer(signal.ITIMER_REAL, 0)
 
             def in_band(buffer: pickle.PickleBuffer, sent: list[tuple[int, int]] = sent) -> bool:
                 content = np.frombuffer(buffer.raw(), np.uint8)
@@ -229,6 +223,7 @@ def _serve(end: int) -> None:
 def _attempt(call: Call) -> Any:
     """The result of the call, or the fault of its file as a DamagedFile or MissingFile."""
     _limit(_memory() + call.memory, time.process_time() + call.seconds)
+    signal.setitimer(signal.ITIMER_REAL, call.timeout)  # SIGALRM ends the process
     try:
         return call.function(call.path, *call.arguments)
     except (DamagedFile, MissingFile) as error:
@@ -253,7 +248,7 @@ def _limit(memory: float, seconds: float) -> None:
     global _limits
     _limits = memory, seconds
     # Only Linux counts malloc's large blocks in RLIMIT_DATA.
-    for kind, value in {resource.RLIMIT_CPU: seconds, **({resource.RLIMIT_DATA: memory} if _LINUX else {})}.items():
+    for kind, value in ((resource.RLIMIT_CPU, seconds), (resource.RLIMIT_DATA, memory if _LINUX else math.inf)):
         hard = resource.getrlimit(kind)[1]
         most = math.inf if hard == resource.RLIM_INFINITY else hard
         resource.setrlimit(kind, (hard if value >= most else math.ceil(value), hard))
@@ -261,7 +256,4 @@ def _limit(memory: float, seconds: float) -> None:
 
 def _memory() -> int:
     """Bytes of private memory of this process; 0 on other systems than Linux."""
-    if not _LINUX:
-        return 0
-    with open("/proc/self/statm", "rb", buffering=0) as file:
-        return int(file.read().split()[5]) * mmap.PAGESIZE
+    return int(Path("/proc/self/statm").read_text().split()[5]) * mmap.PAGESIZE if _LINUX else 0

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from learn3d.files import npz, sandbox
-from learn3d.files.geometry import EXTENSIONS, RawMesh, read_mesh
+from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
 from learn3d.shapes import CATEGORIES, numbered_shape
 
 MAX_FACES = 1_000_000

@@ -14,7 +14,7 @@ import torch
 from learn3d.data.categories import synset_of
 from learn3d.data.dataset import SPLITS
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
-from learn3d.files.reading import parse_json, read_bytes
+from learn3d.files.reading import read_json
 from learn3d.files.writing import publishing, write_json
 from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.render import DatasetReport, Item, contact_row, render_meshes, report_files, split_items
@@ -96,7 +96,7 @@ def _prepare(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]])
     names = sorted((item.number, item.name) for items in splits.values() for item in items)
     crc = zlib.crc32("\n".join(name for _, name in names).encode())
     settings = config.to_dict() | {"list of meshes": f"{len(names)}, CRC-32 {crc:08x}"}
-    before = parse_json(read_bytes(path, 2**20, "the settings of shards")) if path.is_file() else settings
+    before = read_json(path, 2**20, "the settings of shards") if path.is_file() else settings
     if different := sorted(k for k in {*settings, *before} if settings.get(k) != before.get(k)):
         raise ValueError(
             f"{folder} has shards that were made with another {', '.join(different)}; repeat those settings, give "
@@ -109,7 +109,7 @@ def _finish(
     config: DatasetConfig, folder: Path, splits: dict[str, list[Item]], shards: Sequence[Path]
 ) -> DatasetReport:
     """Mark the splits as complete, and write the report."""
-    lists = [parse_json(read_bytes(path.with_suffix(LIST), 2**28, "the list of a shard's meshes")) for path in shards]
+    lists = [read_json(path.with_suffix(LIST), 2**28, "the list of a shard's meshes") for path in shards]
     report = DatasetReport(config, [mesh for found in lists for mesh in found])
     rows, writer = {}, WRITERS[config.layout](folder, config.category)
     for split in report.counts:

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.files import sandbox, weights
+from learn3d.files import formats, sandbox
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -119,8 +119,8 @@ def load_pretrained(encoder: nn.Module, path: Path | str) -> None:
     (naming the first that is missing, unknown or wrong).
     """
     path = Path(path)
-    limits = {"memory": weights.MEMORY, "seconds": weights.SECONDS}
-    read = sandbox.read(weights.read_state_dict, path, wanted="weights of torchvision's resnet18", **limits)
+    wanted = "weights of torchvision's resnet18"
+    read = sandbox.read(formats.read_state_dict, path, wanted=wanted, **formats.WEIGHTS_LIMITS)
     given = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
     own = encoder.state_dict()
     counters = {name for name in own if name.endswith("num_batches_tracked")}  # not in files of older versions

@@ -122,7 +122,7 @@ def read_metrics(folder: Path) -> Log:
     curves: Log = {}
     for number, line in enumerate(lines, start=1):
         try:
-            record = parse_json(line, finite=False)
+            record = parse_json(line)
             step, split = record.pop("step"), str(record.pop("split"))
             if type(step) is not int or not 0 <= step <= limits.ITERATIONS:
                 raise ValueError("no step")

@@ -24,7 +24,7 @@ from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_c
 from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
 from learn3d.experiments.experiment import read_result
-from learn3d.files import sandbox, weights
+from learn3d.files import formats, sandbox
 from learn3d.make_data import meshes
 from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.pages.report import read_metrics
@@ -151,7 +151,7 @@ def weights_target(tmp: Path) -> Target:
 
     def read(folder: Path) -> None:
         for name in ("a.pth", "b.pth"):
-            sandbox.read(weights.read_state_dict, folder / name, memory=weights.MEMORY)
+            sandbox.read(formats.read_state_dict, folder / name, **formats.WEIGHTS_LIMITS)
 
     return Target(tmp, {"a.pth": m.damage_zip(), "b.pth": m.damage}, read)
 

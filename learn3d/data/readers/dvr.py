@@ -54,7 +54,7 @@ def load(
         images, masks = ([root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)] for part in ("image", "mask"))
         return ObjectFiles(
             root / name,
-            Call(npz.read_existing, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
+            Call(npz.read_several, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
             Call(npz.read, root / name / "pointcloud.npz", ("points", limits.OBJECT_BYTES), _CLOUD),
             [Call(renderings.read_with_mask, i, (m, IMAGE_SIZE)) for i, m in zip(images, masks, strict=True)],
         )
@@ -79,7 +79,7 @@ def _lists(root: Path) -> dict[str, Path]:
     return {split: path for split, path in paths.items() if path.is_file()}
 
 
-def _build(files: ObjectFiles, cameras: dict[str, np.ndarray], points: np.ndarray) -> tuple[None, np.ndarray]:
+def _build(files: ObjectFiles, cameras: list[np.ndarray], points: np.ndarray) -> tuple[None, np.ndarray]:
     to_object = _fit_world(files.cameras.path, cameras)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DamagedFile(files.shape.path, f"has the shape {list(points.shape)}; expected {_CLOUD}")
@@ -89,12 +89,11 @@ def _build(files: ObjectFiles, cameras: dict[str, np.ndarray], points: np.ndarra
     return None, (points @ to_object.T).astype(np.float32)
 
 
-def _fit_world(path: Path, cameras: dict[str, np.ndarray]) -> np.ndarray:
+def _fit_world(path: Path, cameras: list[np.ndarray]) -> np.ndarray:
     """Orthogonal matrix [3, 3] from the cameras' world to the object frame. DamagedFile if they are not Kato's."""
-    matrices = [cameras.get(name, np.zeros(0)) for name in _MATRICES]
-    if wrong := [name for name, matrix in zip(_MATRICES, matrices, strict=True) if matrix.shape != (4, 4)]:
+    if wrong := [name for name, matrix in zip(_MATRICES, cameras, strict=True) if matrix.shape != (4, 4)]:
         raise DamagedFile(path, f"has no {wrong[0]} of 4x4 numbers; expected {_CAMERAS}")
-    matrices = np.stack(matrices)[:, :3].astype(np.float64)
+    matrices = np.stack(cameras)[:, :3].astype(np.float64)
     rotations = matrices[:, :, :3]
     skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     if not (skew <= 1e-3).all() or not np.isfinite(matrices).all():

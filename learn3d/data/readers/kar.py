@@ -31,8 +31,8 @@ from learn3d.data.categories import synset_of
 from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelConvention
 from learn3d.data.dataset import SPLITS, ViewDataset
 from learn3d.data.readers.renderings import ObjectFiles, check_lists, check_poses, join_objects, read_objects
-from learn3d.files import geometry, limits, renderings
-from learn3d.files.reading import FETCH_AGAIN, STRICT, DamagedFile, Findings, parse_json, read_bytes
+from learn3d.files import formats, limits, renderings
+from learn3d.files.reading import STRICT, DamagedFile, Findings, read_bytes, read_json
 from learn3d.files.sandbox import Call
 
 #: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.
@@ -84,7 +84,7 @@ def load(
         return ObjectFiles(
             root / name,
             Call(renderings.read_table, root / name / "view.txt", (views, 4, _TABLE), _TABLE),
-            Call(geometry.read_matlab, grid, ("Volume", VOXEL_SIZE)),
+            Call(formats.read_matlab, grid, ("Volume", VOXEL_SIZE)),
             [Call(renderings.read_with_depth, path, (depth, image_size), "a rendering") for path, depth in paths],
         )
 
@@ -104,11 +104,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     """Read splits.json of a folder: synset -> split -> ids. Raises MissingFile and DamagedFile."""
     path = folder / "splits.json"
-    content = read_bytes(path, limits.JSON_BYTES, _LISTS)
-    try:
-        lists = parse_json(content)
-    except ValueError as error:
-        raise DamagedFile(path, f"cannot be read as JSON ({error}); expected {_LISTS}. {FETCH_AGAIN}") from error
+    lists = read_json(path, limits.JSON_BYTES, _LISTS)
     for entry in lists.values() if isinstance(lists, dict) else [None]:
         named = [entry.get(split, []) for split in SPLITS] if isinstance(entry, dict) else [None]
         if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named):

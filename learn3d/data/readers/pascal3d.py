@@ -74,7 +74,7 @@ def load(
     """
     paths = _paths(folder, category, split)
     sizes = {key: 8 * int(np.prod(shape)) for key, shape in _SHAPES.items()}
-    found = read_all([Call(npz.read_with_items, path, ("images", sizes), _WANTED)] for path in paths)
+    found = read_all([Call(npz.read_ragged, path, ("images", sizes), _WANTED)] for path in paths)
     files = [findings.attempt(_parse, path, result, findings) for path, (result,) in zip(paths, found, strict=True)]
     findings.objects = sum(len(file.images) for file in files if file is not None)
     if not findings.strict:
@@ -155,11 +155,9 @@ def _paths(folder: Path | str, category: str, split: str) -> list[Path]:
 
 def _parse(path: Path, found: Any, findings: Findings) -> _File:
     """Check the arrays of a file."""
-    images, *arrays = STRICT.take(found)
-    if isinstance(images, tuple):  # concatenated images and their shapes, see `npz.read_ragged`
-        flat, shapes = images
-        parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]) if shapes else []
-        images = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+    (flat, shapes), *arrays = STRICT.take(found)
+    parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]) if shapes else []
+    images = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
     for (key, shape), array in zip(_SHAPES.items(), arrays, strict=True):
         if array.shape != (len(images), *shape) or (key == "images_ref" and array.dtype != np.uint8):
             wanted, got = f"{list(shape)} for each of {len(images)} images", f"{array.dtype} {list(array.shape)}"
@@ -174,7 +172,7 @@ def _parse(path: Path, found: Any, findings: Findings) -> _File:
         findings.warn(path, f"images_ref[{k}] has an empty mask")
     for k in np.flatnonzero(~voxels.astype(bool).any(axis=(1, 2, 3))):
         findings.warn(path, f"voxels[{k}] is empty")
-    return _File(list(images), references, boxes.astype(np.float64), rotations.astype(np.float64), voxels > 0)
+    return _File(images, references, boxes.astype(np.float64), rotations.astype(np.float64), voxels > 0)
 
 
 def _check_image(path: Path, k: int, image: np.ndarray, box: np.ndarray) -> None:

@@ -29,7 +29,7 @@ from learn3d.data.categories import synset_of
 from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelConvention
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers.renderings import ObjectFiles, category_folder, check_poses, join_objects, read_objects
-from learn3d.files import geometry, renderings
+from learn3d.files import formats, renderings
 from learn3d.files.reading import STRICT, DamagedFile, Findings
 from learn3d.files.sandbox import Call
 
@@ -74,7 +74,7 @@ def load(
         return ObjectFiles(
             images,
             Call(renderings.read_table, images / "rendering_metadata.txt", (NUM_RENDERS, 5, _TABLE), _TABLE),
-            Call(geometry.read_binvox, voxels, (VOXEL_SIZE,), "a voxel grid in the binvox format"),
+            Call(formats.read_binvox, voxels, (VOXEL_SIZE,), "a voxel grid in the binvox format"),
             [Call(renderings.read_with_alpha, images / f"{k:02d}.png", (image_size,)) for k in range(NUM_RENDERS)],
         )
 
@@ -87,7 +87,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     return {path.name: SPLITS for path in sorted(Path(folder).glob("ShapeNetRendering/*/"))}
 
 
-def _build(files: ObjectFiles, table: np.ndarray, grid: geometry.Binvox) -> tuple[np.ndarray, np.ndarray]:
+def _build(files: ObjectFiles, table: np.ndarray, grid: formats.Binvox) -> tuple[np.ndarray, np.ndarray]:
     azimuth, elevation, _, ratio, _ = table.T
     poses = check_poses(files.cameras.path, np.stack([-azimuth, elevation, DISTANCE * ratio], axis=1), _TABLE)
     poses[:, 2] /= grid.scale

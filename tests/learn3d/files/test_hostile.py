@@ -23,7 +23,7 @@ from python2_pickles import npy
 
 import nmr.neural_renderer as nr
 from learn3d.data.framing import read_photo
-from learn3d.files import geometry, npz, renderings, sandbox
+from learn3d.files import formats, npz, renderings, sandbox
 
 SECONDS, BYTES = 10.0, 700e6
 if sys.gettrace() is not None:  # the coverage of lines is measured, which slows Python down
@@ -61,7 +61,7 @@ def bounded() -> Iterator[None]:
 
 
 def read_mat(path: Path) -> np.ndarray:
-    return sandbox.read(geometry.read_matlab, path, "Volume", 32)
+    return sandbox.read(formats.read_matlab, path, "Volume", 32)
 
 
 def read_image(path: Path, seconds: float = sandbox.SECONDS) -> object:
@@ -73,7 +73,7 @@ def read_npz(path: Path) -> object:
 
 
 def read_ragged(path: Path) -> object:
-    return sandbox.read(npz.read_ragged, path, "images")
+    return sandbox.read(npz.read_ragged, path, "images", {})
 
 
 def mat(path: Path) -> bytes:
@@ -177,9 +177,9 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str
     "a.npz": (npz_bomb, read_npz, "times its size"),
     "lists.npz": (pickle_of_many_lists, read_ragged, "memory|processor time"),
     "zips.npz": (zips_within_zips, read_npz, "no item"),
-    "a.ply": (write_text(PLY), geometry.read_mesh, "cannot be read"),
-    "a.off": (write_text("OFF\n2000000000 2000000000 0\n0 0 0\n"), geometry.read_mesh, "cannot be read"),
-    "a.glb": (glb_of_a_great_array, geometry.read_mesh, "cannot be read"),
+    "a.ply": (write_text(PLY), formats.read_mesh, "cannot be read"),
+    "a.off": (write_text("OFF\n2000000000 2000000000 0\n0 0 0\n"), formats.read_mesh, "cannot be read"),
+    "a.glb": (glb_of_a_great_array, formats.read_mesh, "cannot be read"),
 }
 
 
@@ -206,7 +206,7 @@ def test_matlab_elements_of_wrong_types(tmp_path: Path) -> None:
             assert read_mat(path).shape == (32, 32, 32)
 
 
-@pytest.mark.parametrize("read", [nr.load_obj, geometry.read_mesh])
+@pytest.mark.parametrize("read", [nr.load_obj, formats.read_mesh])
 def test_a_polygon_of_two_million_corners(tmp_path: Path, read: Callable[[Path], object]) -> None:
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + "1 " * 1_950_000 + "\n")

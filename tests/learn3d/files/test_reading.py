@@ -9,16 +9,15 @@ from pathlib import Path
 import pytest
 
 from learn3d.files import npz, sandbox, writing
-from learn3d.files.geometry import read_binvox, read_matlab, read_mesh
-from learn3d.files.reading import check_file, parse_json, read_bytes, read_text
+from learn3d.files.formats import read_binvox, read_matlab, read_mesh, read_state_dict
+from learn3d.files.reading import parse_json, read_bytes, read_json, read_text
 from learn3d.files.renderings import PHOTOGRAPHS, open_image
-from learn3d.files.weights import read_state_dict
 
 
 def test_only_regular_files_below_a_limit_are_read(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes("ä\r\nb\rc\n".encode())
-    assert check_file(path, 8, "a text") == 8 and read_text(path, 8, "a text") == "ä\nb\nc\n"
+    assert read_text(path, 8, "a text") == "ä\nb\nc\n"
     with pytest.raises(ValueError, match=r"a\.txt: has 8 bytes; the limit is 6; expected a text"):
         read_bytes(path, 6, "a text")
     with pytest.raises(FileNotFoundError, match=r"b\.txt: is missing; expected a text"):
@@ -51,24 +50,21 @@ def test_pipes_are_not_waited_for_and_devices_not_read(tmp_path: Path, kind: str
             READERS[kind](tmp_path / name)
 
 
-def test_json():
+def test_json(tmp_path):
     assert parse_json(b'{"a": [1, 2.5, null, true, "]]]]\\"[["]}') == {"a": [1, 2.5, None, True, ']]]]"[[']}
     assert parse_json("[" * 32 + "]" * 32)
-    assert parse_json("[NaN, 1e999]", finite=False)[1] == float("inf")
     cases = {
         "[" * 1_000_000: "nested too deeply",
         '{"a":' * 100_000: "nested too deeply",
-        "[NaN]": "NaN is not a finite number",
-        "[-Infinity]": "-Infinity is not a finite number",
-        "1e999": "1e999 is not a finite number",
         "9" * 5000: "digits",
         "{": "Expecting",
     }
     for text, message in cases.items():
         with pytest.raises(ValueError, match=message):
             parse_json(text)
-    with pytest.raises(ValueError, match="utf-8"):
-        parse_json(b'"\xff"')
+    (tmp_path / "a.json").write_bytes(b'"\xff"')
+    with pytest.raises(ValueError, match=r"a\.json: is not valid JSON \(.*utf-8.*\); expected a list\. Perhaps"):
+        read_json(tmp_path / "a.json", 8, "a list")
 
 
 def test_files_are_replaced_whole(tmp_path) -> None:

@@ -1,9 +1,10 @@
-"""Reads untrusted meshes and voxel grids in the sandbox."""
+"""Reads untrusted meshes, voxel grids and pretrained weights in the sandbox."""
 
 from __future__ import annotations
 
 import io
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, open_file, read_bytes
+from learn3d.files.reading import DamagedFile, MissingFile, open_file, read_bytes
 
+WEIGHTS_LIMITS = {"memory": 2**30, "seconds": 30.0}  # of `read_state_dict`, for importing torch
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # trimesh reads these without further packages
 _MEMORY_PER_BYTE = 30  # trimesh takes about 20 times the size of a text file
 _BYTES_PER_SECOND = 1e6  # trimesh is about twice as fast
@@ -99,20 +101,29 @@ class Binvox(NamedTuple):
 
 def read_binvox(path: Path, size: int) -> Binvox:
     """Read a grid of size^3 cells: a text header, then runs of (value, count) bytes; y runs fastest, then z, then x."""
-    wanted = f"a binvox file of {size}x{size}x{size} cells: the lines dim, translate, scale, data, then pairs of bytes"
-    head, _, runs = read_bytes(path, limits.VOLUME_BYTES, wanted).partition(b"\ndata\n")
+    head, _, runs = read_bytes(path, limits.VOLUME_BYTES, "a binvox file").partition(b"\ndata\n")
     header = {words[0]: words[1:] for line in head.split(b"\n") if (words := line.split())}
-    try:
-        translate, (scale,) = np.array(header[b"translate"], np.float64), np.array(header[b"scale"], np.float64)
-        if header[b"dim"] != [b"%d" % size] * 3 or translate.shape != (3,):
-            raise ValueError
-    except (KeyError, ValueError):
-        raise DamagedFile(path, f"has another header; expected {wanted}") from None
-    low, high = limits.DISTANCE
-    if not (np.abs(translate) <= high).all() or not low <= scale <= high:
-        raise DamagedFile(path, f"has translate {translate} and scale {scale}; expected {low:g} .. {high:g}")
-    pairs = np.frombuffer(runs[: len(runs) // 2 * 2], np.uint8).reshape(-1, 2)
-    if (total := int(pairs[:, 1].sum(dtype=np.int64))) != size**3:
-        raise DamagedFile(path, f"its runs fill {total} cells; expected {size**3}. {FETCH_AGAIN}")
+    scale, (low, high) = float(header[b"scale"][0]), limits.DISTANCE
+    if header[b"dim"] != [b"%d" % size] * 3 or not low <= scale <= high:
+        raise ValueError(f"it has dim {header[b'dim']} and scale {scale}, wanted {size} and {low:g} .. {high:g}")
+    pairs = np.frombuffer(runs, np.uint8)[: len(runs) // 2 * 2].reshape(-1, 2)
     grid = np.repeat(pairs[:, 0] != 0, pairs[:, 1]).reshape(size, size, size)  # axes x, z, y
-    return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), float(scale))
+    return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), scale)
+
+
+def read_state_dict(path: Path) -> dict[str, np.ndarray]:
+    """Read the tensors of a state dict (.safetensors or from torch.save); half precision becomes float32.
+
+    No code in the file is executed (weights_only). Raises DamagedFile if it is not a state dict.
+    """
+    import torch
+    from safetensors.torch import load_file
+
+    with open_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18") as file:
+        sandbox.allow(4 * os.fstat(file.fileno()).st_size)
+    is_torch = path.suffix != ".safetensors"
+    weights = torch.load(path, map_location="cpu", weights_only=True) if is_torch else load_file(path)
+    if not isinstance(weights, dict) or not all(isinstance(value, torch.Tensor) for value in weights.values()):
+        raise DamagedFile(path, f"must hold a state dict (names -> tensors), got {type(weights).__name__}")
+    halves = (torch.float16, torch.bfloat16)
+    return {str(n): (t.float() if t.dtype in halves else t).detach().numpy() for n, t in weights.items()}
