@@ -6,7 +6,6 @@ bootstrap, intervals over seeds by Student's t.
 
 from __future__ import annotations
 
-import functools
 import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,13 +13,31 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from learn3d.experiments.measurement import MEASURES, Result, figures
+from learn3d.experiments.measurement import HEADERS, Result, figures
 from learn3d.experiments.plan import PlannedRun, Request, command_line, select_rows
-from learn3d.experiments.tables import CATEGORIES, MEAN, TABLES, Row
+from learn3d.experiments.tables import CATEGORIES, MEAN, TABLES
 from learn3d.files import limits
 from learn3d.files.reading import read_json
 
 RESAMPLES = 2000
+Cells = list[list[str]]
+Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
+
+LABELS = {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19", "mmd": "mmd"}
+NOTES = (
+    "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
+    "again). ±: 95 % intervals over seeds (Student's t).\n\nThe paper's figures are for reference: they are on its own "
+    "data, with its own length of training. In parentheses: its mean over other categories than those here."
+)
+_POSE_ERRORS = {  # fields of the JSON file beside a table of poses, and the columns
+    "accuracy": "Acc@30",
+    "updated_accuracy": "after training",
+    "half_turn_accuracy": "up to half a turn",
+    "median_deg": "median error, degrees",
+    "flips": "flips",
+    "objects_flipped": "objects flipped",
+    "confidence": "mean confidence",
+}
 
 
 def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *, seed: int = 0) -> np.ndarray:
@@ -47,17 +64,6 @@ def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
     return tuple(np.quantile(known, [0.025, 0.975]).tolist()) if len(known) else None
 
 
-Cells = list[list[str]]
-Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
-
-LABELS = {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19", "mmd": "mmd"}
-NOTES = (
-    "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
-    "again). ±: 95 % intervals over seeds (Student's t).\n\nThe paper's figures are for reference: they are on its own "
-    "data, with its own length of training. In parentheses: its mean over other categories than those here."
-)
-
-
 def make_report(
     request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]
 ) -> tuple[dict[str, Cells], str]:
@@ -68,57 +74,51 @@ def make_report(
     table = TABLES[request.table]
     done = [run for run in runs if run.folder in results]
     measured: dict[tuple[str | None, str], dict[int, Result]] = {}
+    trained = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
+    commands = {}
     for run in done:
-        by_seed = measured.setdefault((run.variant, run.config.category), {})
-        by_seed[run.config.seed] = results[run.folder]
-    categories = list(dict.fromkeys(run.config.category for run in runs))
-    columns = {name: [name] for name in categories} | {MEAN: categories}
-    baseline = table.rows[table.baseline].variant
-    measures = ["mmd"] if table.measure == "mmd" else ["voxel_iou", "voxel_iou_kato19"]
-    main, differences = [["method", "", *columns]], [["method", *columns]]
-    for label, row in select_rows(request).items():
-        sides, baselines = (
-            [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
-            for variant in (row.variant, baseline)
-        )
-        if row.figures:
-            main.append([label, f"paper ({row.about})", *(_format_printed(row, c, categories) for c in columns)])
-        if row.variant:
-            main += [[label, f"here ({LABELS[m]})", *(_compare(m, side) for side in sides)] for m in measures]
-        if row.variant and row.variant != baseline:
-            differences.append([label, *map(functools.partial(_compare, table.measure), sides, baselines)])
-    headers = [header for header, _ in MEASURES.values()]
-    trained = [["run", "networks", "iterations", "batch", "images", *headers, "minutes", "commit"]]
-    for run in done:
-        result = results[run.folder]
-        counts = [f"step {result.step}", str(result.iterations), str(run.config.batch_size), str(result.images)]
+        result, config = results[run.folder], run.config
+        measured.setdefault((run.variant, config.category), {})[config.seed] = result
+        counts = [f"step {result.step}", str(result.iterations), str(config.batch_size), str(result.images)]
         minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
         trained.append([run.name, *counts, *figures(vars(result)), minutes, result.commit])
-    commands = (
-        command_line(
-            run.config,
-            data="DATA",
-            category="CATEGORY",
-            seed="SEED",
-            output=f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED",
-            **({"poses": "OUTPUT/poses/CATEGORY-seedSEED.npz"} if run.config.poses else {}),
-        )
-        for run in done
-    )
+        words = {"data": "DATA", "category": "CATEGORY", "seed": "SEED"}
+        words["output"] = f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED"
+        if config.poses:
+            words["poses"] = "OUTPUT/poses/CATEGORY-seedSEED.npz"
+        commands[command_line(config, **words)] = None
+    categories = list(dict.fromkeys(run.config.category for run in runs))
+    columns = {name: [name] for name in categories} | {MEAN: categories}
+    measures = ["mmd"] if table.measure == "mmd" else ["voxel_iou", "voxel_iou_kato19"]
+
+    def sides(variant: str | None) -> list[Side]:
+        return [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
+
+    baseline = table.rows[table.baseline].variant
+    main, differences = [["method", "", *columns]], [["method", *columns]]
+    for label, row in select_rows(request).items():
+        if row.printed:
+            main.append(
+                [label, f"paper ({row.about})", *(_format_printed(row.printed, c, categories) for c in columns)]
+            )
+        if row.variant:
+            main += [[label, f"here ({LABELS[m]})", *(_compare(m, s) for s in sides(row.variant))] for m in measures]
+        if row.variant and row.variant != baseline:
+            pairs = zip(sides(row.variant), sides(baseline), strict=True)
+            differences.append([label, *(_compare(table.measure, *pair) for pair in pairs)])
+    tables = {"main": main, "differences": differences, "runs": trained}
     missing = [run.name for run in runs if run not in done]
     parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
     parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
-    tables = {"main": main, "differences": differences, "runs": trained}
-    if poses := _pose_rows(runs, results):
+    if len(poses := _pose_rows(runs, results)) > 1:
         tables["poses"] = poses
         parts += ["Estimated azimuths of all images, and voxel IoU (kato18) of the trainings:", _markdown(poses)]
-    parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *dict.fromkeys(commands), "```"])]
+    parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *commands, "```"])]
     return tables, "\n\n".join(parts) + "\n"
 
 
-def _format_printed(row: Row, column: str, categories: Sequence[str]) -> str:
+def _format_printed(printed: Mapping[str, float], column: str, categories: Sequence[str]) -> str:
     """The paper's figure for a column. Its mean is over the same categories as ours, else in parentheses."""
-    printed = row.printed
     if column == MEAN and set(categories) != (set(printed) - {MEAN} or set(CATEGORIES)):
         if all(name in printed for name in categories):
             return f"{np.mean([printed[name] for name in categories]):.3f}"
@@ -163,40 +163,29 @@ def _resample(measure: str, side: Side) -> np.ndarray:
     return resampled_means(sums, counts)
 
 
-_POSE_ERRORS = {  # fields of the JSON file beside a table of poses, and the columns
-    "accuracy": "Acc@30",
-    "updated_accuracy": "after training",
-    "half_turn_accuracy": "up to half a turn",
-    "median_deg": "median error, degrees",
-    "flips": "flips",
-    "objects_flipped": "objects flipped",
-    "confidence": "mean confidence",
-}
-_POSES_HEADER = ["category", "seed", *_POSE_ERRORS.values(), "IoU, known poses", "IoU, estimated poses", "ratio"]
+def read_pose_errors(poses: Path) -> dict[str, float]:
+    """The JSON file beside a table of estimated poses."""
+    return read_json(poses.with_suffix(".json"), limits.JSON_BYTES, "the errors of a table of poses")
 
 
 def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Cells:
-    """Errors of the estimated poses of each run, and its IoU beside that of the run on known poses; [] without any."""
-    known = {(r.config.category, r.config.seed): r.folder for r in runs if r.config.poses is None}
-    by_category: dict[str, list[tuple[str, Sequence[float]]]] = {}
-    for run in (run for run in runs if run.config.poses is not None):
-        folders = known.get((run.config.category, run.config.seed)), run.folder
-        if not all(folder in results for folder in folders):
-            continue
-        errors_file = run.config.poses.with_suffix(".json")
-        errors = read_json(errors_file, limits.JSON_BYTES, "the errors of a table of poses")
-        ious = [results[folder].voxel_iou for folder in folders]
-        values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
-        by_category.setdefault(run.config.category, []).append((str(run.config.seed), values))
-    rows = []
-    for category, of_seeds in by_category.items():
-        mean = [("mean", np.mean([values for _, values in of_seeds], axis=0))] if len(of_seeds) > 1 else []
-        rows += [[category, name, *_format_poses(values)] for name, values in of_seeds + mean]
-    return [_POSES_HEADER, *rows] if rows else []
-
-
-def _format_poses(values: Sequence[float]) -> list[str]:
-    return [f"{value:.1f}" if place == 3 else f"{value:.3f}" for place, value in enumerate(values)]
+    """A header; errors of the estimated poses of each run, and its IoU beside that of the run on known poses."""
+    known = {(r.config.category, r.config.seed): results.get(r.folder) for r in runs if r.config.poses is None}
+    by_category: dict[str, dict[str, Sequence[float]]] = {}
+    for run in runs:
+        config, both = run.config, (known.get((run.config.category, run.config.seed)), results.get(run.folder))
+        if config.poses is not None and None not in both:
+            errors, ious = read_pose_errors(config.poses), [result.voxel_iou for result in both]
+            values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
+            by_category.setdefault(config.category, {})[str(config.seed)] = values
+    rows = [["category", "seed", *_POSE_ERRORS.values(), "IoU, known poses", "IoU, estimated poses", "ratio"]]
+    for category, by_seed in by_category.items():
+        if len(by_seed) > 1:
+            by_seed["mean"] = np.mean(list(by_seed.values()), axis=0)
+        for seed, values in by_seed.items():
+            cells = [f"{value:.1f}" if place == 3 else f"{value:.3f}" for place, value in enumerate(values)]
+            rows.append([category, seed, *cells])
+    return rows
 
 
 def _markdown(table: Cells) -> str:

@@ -13,12 +13,12 @@ from learn3d.config import TrainConfig, differences, load_config
 from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import wrap_deg
 from learn3d.device import resolve_precision
-from learn3d.experiments.comparison import make_report
-from learn3d.experiments.measurement import Result, measure
+from learn3d.experiments.comparison import make_report, read_pose_errors
+from learn3d.experiments.measurement import Result, evaluate_runs
 from learn3d.experiments.plan import PlannedRun, Request, plan_runs
 from learn3d.experiments.tables import TABLES, VARIANTS
 from learn3d.files import limits, writing
-from learn3d.files.reading import read_bytes, read_json
+from learn3d.files.reading import read_bytes
 from learn3d.poses.estimate import NEAR_DEG, PoseOptions
 from learn3d.poses.views import CameraOptions, compare, estimate_views, load_views
 from learn3d.runs import checkpoint
@@ -59,25 +59,26 @@ def _measure_updated_poses(config: TrainConfig) -> None:
     azimuths = estimated.candidates.poses.azimuth_deg.view(weights.shape)
     best = azimuths.gather(1, weights.argmax(1, keepdim=True))[:, 0]
     right = wrap_deg(best - torch.as_tensor(known.poses.azimuth_deg)).abs() <= NEAR_DEG
-    path = config.poses.with_suffix(".json")
-    errors = read_json(path, limits.JSON_BYTES, "the errors of a table of poses")
-    writing.write_json(path, errors | {"updated_accuracy": float(right.double().mean())})
+    errors = read_pose_errors(config.poses) | {"updated_accuracy": float(right.double().mean())}
+    writing.write_json(config.poses.with_suffix(".json"), errors)
 
 
 def train_and_test(run: PlannedRun) -> bool:
     """Estimate poses if the run needs them, train, measure and write test.json; False if a signal stopped the training.
 
-    An existing run continues; `train` checks that it has the same options and data. Raises as `train` and `measure` do.
+    An existing run continues; `train` checks that it has the same options and data. Raises as `train` and
+    `evaluate_runs` do.
     """
-    if run.config.poses is not None:
-        estimate_poses(run.config)
+    config = run.config
+    if config.poses is not None:
+        estimate_poses(config)
     resume = run_folder.is_run(run.folder)
-    if not train(run.config, resume=resume, overwrite=not resume).finished:  # the folder exists: log.txt is in it
+    if not train(config, resume=resume, overwrite=not resume).finished:  # the folder exists: log.txt is in it
         return False
-    file = checkpoint.find(run.folder, VARIANTS[run.variant].checkpoint)
-    if run.config.poses is not None:
-        _measure_updated_poses(run.config)
-    result = measure(file, data=run.config.data, device=run.config.device)
+    if config.poses is not None:
+        _measure_updated_poses(config)
+    which = VARIANTS[run.variant].checkpoint
+    (result,) = evaluate_runs([run.folder], which=which, data=config.data, device=config.device)
     writing.write_json(run.folder / RESULT_FILE, result.model_dump())
     print(f"tested: voxel IoU {result.voxel_iou:.4f} (kato18)", flush=True)
     return True

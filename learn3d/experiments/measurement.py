@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-import numpy as np
+import torch
 from pydantic import BaseModel, Field
 
 from learn3d.data.dataset import ViewDataset
@@ -15,7 +15,7 @@ from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, NO_MMD, SURFACE
 from learn3d.experiments.plan import command_line
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
-from learn3d.settings import MOST, Step
+from learn3d.settings import MOST, Step, split_names
 from learn3d.terminal import align
 
 #: For each measure its header in tables and its definition. Measures are means over images, then over categories.
@@ -43,6 +43,7 @@ MEASURES = {
     ),
     "mmd_paper": ("printed MMD", "the same by the formula that the paper prints: one kernel, square root"),
 }
+HEADERS = [header for header, _ in MEASURES.values()]
 
 Number = Annotated[float, Field(ge=-MOST, le=MOST)] | None
 Amount = Annotated[int, Field(ge=0, le=10**9)]
@@ -91,94 +92,80 @@ class Result(BaseModel, strict=True):
         return commit[:9] + "-dirty" * commit.endswith("-dirty")
 
 
-def measure(
-    file: Path,
-    *,
-    data: Path | None = None,
-    category: str | None = None,
-    split: str = "test",
-    layout: Layout | None = None,
-    precision: Literal["bf16", "fp32"] = "fp32",
-    device: str = "cpu",
-    report_progress: Callable[[str], None] = lambda text: None,
-) -> Result:
-    """Measure a checkpoint on all images of a split; `data` and `category` default to those of the training.
-
-    A model that learnt from estimated poses is measured with them only on its own data (`data` is None).
-    """
-    method, config, metadata = checkpoint.load_method(file, device=device, precision=precision)
-    label, category = PRESETS[config.preset].label, category or config.category
-    report_progress(f"{file}: {label} ({config.preset}) on {category}, {split}")
-    dataset = checkpoint.load_data(config, split, data=data, category=category, layout=layout)
-    evaluation = evaluate(method, dataset, detailed=True)
-    means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
-    if means["hollow"]:
-        report_progress(f"warning: {means['hollow']:.1%} of the meshes reach beyond the voxel grid and count as hollow")
-    if means["mmd"] is None:
-        report_progress(f"warning: {NO_MMD}")
-    return Result(
-        checkpoint=str(file),
-        method=label,
-        preset=config.preset,
-        category=category,
-        data=str((data or config.data).resolve()),
-        command=command_line(config),
-        iterations=config.iterations,
-        step=metadata.progress.step,
-        seed=config.seed,
-        seconds=metadata.progress.seconds,
-        versions=metadata.versions,
-        images=len(evaluation.view_ids),
-        objects=_means_by_object(evaluation, dataset) if dataset.voxels is not None else [],
-        **means,
-    )
-
-
-def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[ObjectMeans]:
-    values = np.stack([evaluation.values[name].numpy() for name in ("voxel_iou", "voxel_iou_kato19")], axis=1)
-    objects = []
-    for number in np.unique(evaluation.object_ids):
-        own = values[evaluation.object_ids.numpy() == number]
-        own = own[~np.isnan(own[:, 0])]
-        means = (round(float(mean), 5) for mean in own.mean(0)) if len(own) else (None, None)
-        objects.append(ObjectMeans(dataset.object_names[number], len(own), *means))
-    return objects
-
-
 def evaluate_runs(
     paths: Sequence[Path],
     *,
     data: Path | None = None,
     category: str | None = None,
+    split: str = "test",
     which: Literal["last", "best"] = "last",
-    **options: Any,
+    layout: Layout | None = None,
+    device: str = "cpu",
+    report_progress: Callable[[str], None] = lambda text: None,
 ) -> list[Result]:
     """Measure run folders (their checkpoint `which`) or checkpoint files, on each of their categories by itself.
 
-    options: those of `measure`. Raises ValueError or OSError before anything is measured if a checkpoint or a data
-    folder is missing.
+    `data` and `category` default to those of the training. A model that learnt from estimated poses is measured with
+    them only on its own data (`data` is None). Raises ValueError or OSError before anything is measured if a checkpoint
+    or a data folder is missing.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to evaluate")
-    found = {file: checkpoint.load_metadata(file).config for path in paths for file in [checkpoint.find(path, which)]}
-    for config in found.values():
-        require_folder(data or config.data)
-    return [
-        measure(file, data=data, category=name.strip(), **options)
-        for file, config in found.items()
-        for name in (category or config.category).split(",")
-    ]
+    files = dict.fromkeys(checkpoint.find(path, which) for path in paths)
+    for file in files:
+        require_folder(data or checkpoint.load_metadata(file).config.data)
+    results = []
+    for file in files:
+        method, config, metadata = checkpoint.load_method(file, device=device)
+        label = PRESETS[config.preset].label
+        for name in split_names(category or config.category):
+            report_progress(f"{file}: {label} ({config.preset}) on {name}, {split}")
+            dataset = checkpoint.load_data(config, split, data=data, category=name, layout=layout)
+            evaluation = evaluate(method, dataset, detailed=True)
+            means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
+            if means["hollow"]:
+                beyond = "of the meshes reach beyond the voxel grid and count as hollow"
+                report_progress(f"warning: {means['hollow']:.1%} {beyond}")
+            if means["mmd"] is None:
+                report_progress(f"warning: {NO_MMD}")
+            result = Result(
+                checkpoint=str(file),
+                method=label,
+                preset=config.preset,
+                category=name,
+                data=str((data or config.data).resolve()),
+                command=command_line(config),
+                iterations=config.iterations,
+                step=metadata.progress.step,
+                seed=config.seed,
+                seconds=metadata.progress.seconds,
+                versions=metadata.versions,
+                images=len(evaluation.view_ids),
+                objects=_means_by_object(evaluation, dataset) if dataset.voxels is not None else [],
+                **means,
+            )
+            results.append(result)
+    return results
+
+
+def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[ObjectMeans]:
+    values = torch.stack([evaluation.values[name] for name in ("voxel_iou", "voxel_iou_kato19")], dim=1)
+    objects = []
+    for number in evaluation.object_ids.unique():
+        own = values[(evaluation.object_ids == number) & ~values[:, 0].isnan()].numpy()
+        means = (round(float(mean), 5) for mean in own.mean(0)) if len(own) else (None, None)
+        objects.append(ObjectMeans(dataset.object_names[number], len(own), *means))
+    return objects
 
 
 def describe_measures() -> str:
     """One line for each measure: its header and definition."""
-    width = max(len(header) for header, _ in MEASURES.values())
-    return "\n".join(f"  {header:{width}}  {definition}" for header, definition in MEASURES.values())
+    return align([("", *measure) for measure in MEASURES.values()])
 
 
 def format_table(results: Sequence[Result]) -> str:
     """The results as a text table: a line per result, then the mean over categories of each method."""
-    rows = [("class", "method", "seed", "iterations", "images", *(header for header, _ in MEASURES.values()))]
+    rows = [("class", "method", "seed", "iterations", "images", *HEADERS)]
     for r in results:
         about = (r.category, f"{r.method} ({r.preset})", str(r.seed), str(r.step), str(r.images))
         rows.append((*about, *figures(vars(r))))
@@ -189,7 +176,7 @@ def format_table(results: Sequence[Result]) -> str:
 
 
 def figures(values: dict[str, Any]) -> list[str]:
-    """All measures with four digits, as cells of a table."""
+    """All measures with four digits, as cells below `HEADERS`."""
     return ["-" if values[name] is None else f"{values[name]:.4f}" for name in MEASURES]
 
 

@@ -8,11 +8,11 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from learn3d.config import TrainConfig
 from learn3d.data.layouts import LAYOUTS, Layout
-from learn3d.experiments.tables import TABLES, VARIANTS, Row
+from learn3d.experiments.tables import BATCH_DIVISOR, TABLES, VARIANTS, Row
 from learn3d.presets import PRESETS
 from learn3d.settings import Rare, split_names
 from learn3d.terminal import unknown_name
@@ -56,11 +56,6 @@ class Request:
     report_only: bool = False
     """Train nothing: report the runs that are complete."""
 
-    @property
-    def categories(self) -> tuple[str, ...]:
-        """The names in `category`."""
-        return tuple(dict.fromkeys(split_names(self.category)))
-
     def __post_init__(self) -> None:
         if self.table not in TABLES:
             raise ValueError(f"{unknown_name('table', self.table, TABLES)} (see --list)")
@@ -68,21 +63,18 @@ class Request:
             raise ValueError(f"jobs and seeds must be at least 1, got {self.jobs} and {self.seeds}")
 
 
-@dataclass(frozen=True)
-class PlannedRun:
+class PlannedRun(NamedTuple):
     """A training run and its test. Tables that need the same run share its folder."""
 
     variant: str
     config: TrainConfig
 
     @property
-    def folder(self) -> Path:
-        """OUTPUT/runs/<category>/<variant>-seed<k>."""
+    def folder(self) -> Path:  # OUTPUT/runs/<category>/<variant>-seed<k>
         return self.config.output
 
     @property
     def name(self) -> str:
-        """<category>/<variant>-seed<k>."""
         return f"{self.config.category}/{self.folder.name}"
 
 
@@ -113,19 +105,19 @@ def plan_runs(request: Request) -> list[PlannedRun]:
     variants = [row.variant for row in select_rows(request).values() if row.variant]
     changes = _parse_changes(variants, request.set)
     return [
-        PlannedRun(name, _configure(request, name, changes[name], layout=layout, category=category, seed=seed))
-        for category in request.categories or table.categories
+        PlannedRun(name, _configure(request, name, changes[name], layout, category, seed))
+        for category in dict.fromkeys(split_names(request.category) or table.categories)
         for name in variants
         for seed in range(request.seeds or table.seeds)
     ]
 
 
 def _configure(
-    request: Request, name: str, given: dict[str, Any], *, layout: Layout, category: str, seed: int
+    request: Request, name: str, given: dict[str, Any], layout: Layout, category: str, seed: int
 ) -> TrainConfig:
     variant = VARIANTS[name]
-    preset, length_of = PRESETS[variant.preset], PRESETS[variant.length_of or variant.preset]
-    changes, divisor = dict(variant.changes) | given, variant.batch_divisor
+    preset, length_of = PRESETS[variant.preset], PRESETS[variant.small_batches_of or variant.preset]
+    changes, divisor = dict(variant.changes) | given, BATCH_DIVISOR if variant.small_batches_of else 1
     iterations = (request.iterations or length_of.iterations) * divisor
     batch_size = request.batch_size or length_of.batch_size
     if batch_size % divisor:
@@ -172,7 +164,7 @@ def _parse_changes(variants: Sequence[str], texts: Sequence[str]) -> dict[str, d
 def _parse_value(text: str, is_list: bool = False) -> Any:
     """A value as in JSON (0.5, true, null), else the text itself; a list is written as "a,b"."""
     if is_list:
-        return tuple(_parse_value(part) for part in text.strip("[]").split(",") if part)
+        return tuple(map(_parse_value, filter(None, text.strip("[]").split(","))))
     try:
         return json.loads(text)
     except ValueError:

@@ -297,7 +297,7 @@ def test_a_run_is_measured_with_its_poses_on_its_own_data(
 
     monkeypatch.setattr(measurement, "evaluate", look)
     for data in (None, tiny_folder):
-        measurement.measure(run_folder / "last.safetensors", data=data, category="airplane", split="val")
+        measurement.evaluate_runs([run_folder], data=data, category="airplane", split="val")
     assert measured == [True, False]
 
 

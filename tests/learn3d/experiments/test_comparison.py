@@ -15,7 +15,7 @@ from learn3d.experiments import comparison
 from learn3d.experiments.comparison import percentile_interval, resampled_means
 from learn3d.experiments.experiment import describe_tables, run_experiment
 from learn3d.experiments.plan import plan_runs
-from learn3d.experiments.tables import MEAN, TABLES, VARIANTS
+from learn3d.experiments.tables import MEAN, TABLES, VARIANTS, read_rows
 from learn3d.presets import PRESETS
 
 NUMBER = r"-?\+?\d\.\d{3}"
@@ -24,7 +24,7 @@ NUMBER = r"-?\+?\d\.\d{3}"
 def test_printed_means_agree_with_the_printed_rows() -> None:
     count = 0
     for label, row in [item for table in TABLES.values() for item in table.rows.items()]:
-        if len(printed := row.printed) > 1 and MEAN in printed:
+        if len(printed := dict(row.printed)) > 1 and MEAN in printed:
             mean = printed.pop(MEAN)
             assert np.mean(list(printed.values())) == pytest.approx(mean, abs=0.001), label
             count += 1
@@ -34,10 +34,11 @@ def test_printed_means_agree_with_the_printed_rows() -> None:
 def test_rows_name_variants_and_baselines() -> None:
     used = {row.variant for table in TABLES.values() for row in table.rows.values() if row.variant}
     assert used == set(VARIANTS), "every variant is a row of a table"
+    assert read_rows().keys() == TABLES.keys(), "every line of tables.csv belongs to a table"
     assert {variant.preset for variant in VARIANTS.values()} <= set(PRESETS)
     for table in TABLES.values():
         assert table.baseline in table.rows
-        assert all(row.variant or row.figures for row in table.rows.values())
+        assert all(row.variant or row.printed for row in table.rows.values())
     assert TABLES["kar"].rows["Proposed"].variant in {row.variant for row in TABLES["bins"].rows.values()}
     assert "  w/o prior: without-prior, preset peng2020-kato, lambda_prior=0" in describe_tables()
     assert "  CSDM: quoted" in describe_tables()

@@ -195,7 +195,7 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, read_report) 
     np.savez(tmp_path / "02691156_train_images.npz", np.full((3, 24, 4, 64, 64), 200, np.uint8))
     for name in ("train_voxels", "val_images", "val_voxels"):
         shutil.copy(tiny_folder / f"02691156_{name}.npz", tmp_path)
-    moved = dataclasses.replace(run, config=dataclasses.replace(run.config, data=tmp_path))
+    moved = run._replace(config=dataclasses.replace(run.config, data=tmp_path))
     with pytest.raises(ValueError, match="other training data"):
         train_and_test(moved)
 
@@ -230,7 +230,7 @@ def test_a_run_goes_on_or_starts(finished_run, tiny_folder, request_for, tmp_pat
         return Summary(config.output, 5, False, 0.0, 0, 0.0, 0.0)
 
     monkeypatch.setattr(experiment, "train", train)
-    monkeypatch.setattr(experiment, "measure", lambda *_, **__: pytest.fail("a stopped run is not measured"))
+    monkeypatch.setattr(experiment, "evaluate_runs", lambda *_, **__: pytest.fail("a stopped run is not measured"))
     assert not train_and_test(run)
     shutil.copytree(finished_run, run.folder)
     assert not train_and_test(run)
