@@ -7,7 +7,6 @@
   bench.py w4: w1 with depth instead of silhouettes
   bench.py colors: w1 in colour, with one thread: white, vertex colours, texture images, lights
   bench.py voxels: voxel IoU of 1000 predictions
-  bench.py peers: one thread of ours beside deodr, PyTorch3D, Open3D and Mesa, as a table in Markdown
 
 Prints the median and the fastest of the repeats in milliseconds; repeats alternate between the programs. Freed memory
 is kept, as in training (learn3d/device.py). w1 to w4 are measured with deodr as well, if it is installed.
@@ -15,32 +14,50 @@ is kept, as in training (learn3d/device.py). w1 to w4 are measured with deodr as
 
 from __future__ import annotations
 
-import sys
+import importlib.util
+import math
+import os
+import platform
 import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import get_context
+from statistics import median
+from typing import Literal
 
-import bench_peers as peers
 import torch
 import tyro
-from bench_work import Program, Timing, colored_spheres, deformed_spheres, report
+from deodr_images import FAR, deodr
+from torch import Tensor
 
 import nmr
 from learn3d.device import keep_freed_memory
-from learn3d.terminal import unknown_name, without_traceback
 
+#: Options of `spheres` for each workload.
+WORKLOADS = {
+    "w1": {"subdivisions": 3, "size": 64},
+    "w2": {"batch": 1, "subdivisions": 6, "size": 512, "anti_aliasing": False},
+    "w3": {"batch": 1, "subdivisions": 3, "size": 1024, "anti_aliasing": False},
+    "w4": {"subdivisions": 3, "size": 64, "output": "depth"},
+}
+#: Kinds of colours of the output "rgb".
 COLORS = {
     "white": "white",
     "vertex": "vertex colours",
     "uv": "texture images of 128x128",
     "uv-lights": "texture images of 128x128 and lights",
 }
+TEXELS = 128  # along each side of a texture image
+Timing = tuple[float, float]  # seconds: forward pass, total
+Program = Callable[[], Timing]
 
 
 @dataclass(frozen=True)
 class Options:
-    workload: tyro.conf.Positional[str] = "w1"
+    workload: tyro.conf.Positional[Literal["all", "w1", "w2", "w3", "w4", "colors", "voxels"]] = "w1"
     """Name of the workload, from the list above."""
     batch: int = 64
     """Meshes of w1, w4 and colors."""
@@ -50,68 +67,181 @@ class Options:
     """Timed runs of each program."""
 
 
-def with_threads(threads: int, program: Program) -> Timing:
+@dataclass(frozen=True)
+class Work:
+    """Meshes [B, V, 3] in world space with a camera each, and the images to be drawn of them."""
+
+    vertices: Tensor
+    faces: Tensor
+    camera: nmr.LookAt
+    size: int
+    output: str = "alpha"  # output of nmr.render
+    anti_aliasing: bool = True
+    colors: str = "white"
+    values: Tensor | None = None  # colours of vertices [B, V, 3] or texture images [B, 128, 128, 3]
+    target: Tensor | None = None  # images that the loss compares with
+
+    def __str__(self) -> str:
+        size = f"{self.size}x{self.size}" + " anti-aliased" * self.anti_aliasing
+        return f"{self.output}, {len(self.vertices)} meshes of {len(self.faces)} faces, {size}"
+
+    def draw(self, vertices: Tensor, values: Tensor | None = None) -> Tensor:
+        """The images that nmr draws of these vertices, in these colours."""
+        options, values = {}, self.values if values is None else values
+        if self.colors == "vertex":
+            options["colors"] = nmr.VertexColors(values)
+        elif self.colors != "white":
+            options["colors"] = nmr.UVTexture(values, sphere_uv(nmr.icosphere(3)[0]))
+            options["lights"] = nmr.Lights() if self.colors == "uv-lights" else None
+        options |= {"outputs": (self.output,), "image_size": self.size, "anti_aliasing": self.anti_aliasing}
+        return getattr(nmr.render(vertices, self.faces, self.camera, **options), self.output)
+
+    def go_back(self, images: Tensor) -> None:
+        """Backward pass of 1 - soft IoU of silhouettes, or of the mean squared difference of other images."""
+        if self.output == "alpha":
+            nmr.losses.soft_iou_loss(images, self.target).backward()
+        else:
+            (images - self.target).square().mean().backward()
+
+    def part(self, which: slice) -> Work:
+        """The workload with these meshes of the batch alone."""
+        camera = nmr.LookAt(self.camera.eye[which], half_fov_deg=self.camera.half_fov_deg)
+        return replace(self, vertices=self.vertices[which], camera=camera, target=self.target[which])
+
+
+def spheres(batch: int, subdivisions: int, size: int, colors: str = "white", **more: object) -> Work:
+    """Icospheres scaled by 0.2 .. 0.6 along each axis, with noise, seen from random azimuths.
+
+    The targets are images of the next mesh of the batch, or of an ellipsoid in a batch of one.
+    """
+    g = torch.Generator().manual_seed(0)
+    sphere, faces = nmr.icosphere(subdivisions)
+    scale = 0.4 + 0.8 * torch.rand(batch, 1, 3, generator=g)
+    noise = 0.03 * torch.randn(batch, len(sphere), 3, generator=g) * min(1.0, 2.0 ** (3 - subdivisions))
+    azimuth = 360 * torch.rand(batch, generator=g, dtype=torch.float64)
+    camera = nmr.LookAt.from_angles(2.732, 30.0, azimuth, half_fov_deg=15.0)
+    vertices, values = 0.5 * (sphere * scale + noise), None
+    if colors != "white":
+        shape = (len(sphere),) if colors == "vertex" else (TEXELS, TEXELS)
+        values = torch.rand(batch, *shape, 3, generator=torch.Generator().manual_seed(1))
+    others = vertices.roll(1, 0) if batch > 1 else vertices * torch.tensor([1.1, 0.7, 0.9])
+    work = Work(vertices, faces, camera, size, colors=colors, values=values, **more)
+    return replace(work, target=work.draw(others))
+
+
+def sphere_uv(vertices: Tensor) -> Tensor:
+    """Longitude and latitude [V, 2], both in [0, 1], of points on the unit sphere [V, 3]."""
+    longitude = torch.atan2(vertices[:, 0], vertices[:, 2]) / (2 * math.pi) + 0.5
+    return torch.stack([longitude, torch.asin(vertices[:, 1].clamp(-1, 1)) / math.pi + 0.5], dim=1)
+
+
+def time_passes(
+    threads: int, draw: Callable[..., Tensor], then: Callable[[Tensor], object], *leaves: Tensor, gradients: bool = True
+) -> Timing:
+    """Time drawing, and drawing with what comes `then`: the backward pass if the leaves have `gradients`."""
     torch.set_num_threads(threads)
-    return program()
+    leaves = [leaf.clone().requires_grad_(gradients) for leaf in leaves]
+    start = time.perf_counter()
+    images = draw(*leaves)
+    forward = time.perf_counter()
+    then(images)
+    return forward - start, time.perf_counter() - start
 
 
 def bench_render(name: str, options: Options) -> None:
     """Time nmr, and deodr if it is installed."""
-    if name in ("w1", "w4"):
-        work = deformed_spheres(options.batch, 3, 64, outputs=("depth" if name == "w4" else "alpha",))
-    else:
-        subdivisions, size = {"w2": (6, 512), "w3": (3, 1024)}[name]
-        work = deformed_spheres(1, subdivisions, size, anti_aliasing=False)
-    run = partial(work.run, work.targets())
-    programs = {f"nmr, {n} threads": partial(with_threads, n, run) for n in dict.fromkeys((options.threads, 1))}
+    work = spheres(**{"batch": options.batch} | WORKLOADS[name])
+    counts = dict.fromkeys((options.threads, 1))
+    programs = {f"nmr, {n} threads": partial(time_passes, n, work.draw, work.go_back, work.vertices) for n in counts}
     with ExitStack() as stack:
-        if peers.has_deodr():
-            programs |= peers.deodr_programs(work, work.targets(), options.threads, stack)
+        if importlib.util.find_spec("deodr"):
+            programs |= deodr_programs(work, options.threads, stack)
         report(f"{name}: {work}, forward + backward", programs, options.repeats)
+
+
+def deodr_programs(work: Work, processes: int, stack: ExitStack) -> dict[str, Program]:
+    """deodr in one process, and in several that share the batch if it is large enough. `stack` ends the processes.
+
+    Stops if nmr draws other images, as the comparison would mean nothing. Edges may differ: the median counts.
+    """
+    theirs = deodr(work.faces, work.camera, work.size, work.output)(work.vertices)
+    background, ours = FAR if work.output == "depth" else 0.0, work.draw(work.vertices)
+    difference = (ours - theirs)[(ours != background) | (theirs != background)].abs().median()
+    if not difference < 5e-3:
+        raise SystemExit(f"nmr and deodr draw different images (median difference {float(difference):.1e})")
+    programs: dict[str, Program] = {"deodr, 1 process": partial(run_deodr, work)}
+    if 1 < processes <= len(work.vertices):
+        pool = stack.enter_context(ProcessPoolExecutor(processes, get_context("spawn")))
+        parts = [work.part(slice(which, None, processes)) for which in range(processes)]
+
+        def run_parts() -> Timing:  # the slowest process counts
+            return tuple(map(max, zip(*pool.map(run_deodr, parts), strict=True)))
+
+        programs[f"deodr, {processes} processes"] = run_parts
+    return programs
+
+
+def run_deodr(work: Work) -> Timing:
+    return time_passes(1, deodr(work.faces, work.camera, work.size, work.output), work.go_back, work.vertices)
 
 
 def bench_colors(options: Options) -> None:
     """Time one thread, without and with gradients of the colours."""
     for kind, about in COLORS.items():
-        work = colored_spheres(kind, options.batch)
-        learned = [False] if work.values is None else [False, True]
-        runs = {learn: partial(work.run, work.targets(), learn) for learn in learned}
-        names = {False: "nmr, 1 thread", True: "nmr, 1 thread, gradients of colours"}
-        programs = {names[learn]: partial(with_threads, 1, run) for learn, run in runs.items()}
+        work = spheres(options.batch, 3, 64, output="rgb", colors=kind)
+        run = partial(time_passes, 1, work.draw, work.go_back, work.vertices)
+        programs = {"nmr, 1 thread": run}
+        if work.values is not None:
+            programs["nmr, 1 thread, gradients of colours"] = partial(run, work.values)
         report(f"colors: {work}, {about}, forward + backward", programs, options.repeats)
 
 
 def bench_voxels(options: Options) -> None:
     """Time the voxelizer (forward) and the voxelizer with the IoU (total)."""
-    spheres = deformed_spheres(1000, 3, 64)
-    vertices = spheres.vertices * (31 / 32) + 0.5
+    work = spheres(1000, 3, 64)
+    vertices = work.vertices * (31 / 32) + 0.5
 
-    def run() -> Timing:
-        start = time.perf_counter()
-        voxels = nmr.voxelize(vertices, spheres.faces)
-        forward = time.perf_counter()
+    def compare(voxels: Tensor) -> None:
         nmr.metrics.voxel_iou(voxels, voxels.roll(1, 0))
-        return forward - start, time.perf_counter() - start
 
-    programs = {f"nmr, {options.threads} threads": partial(with_threads, options.threads, run)}
-    report("voxels: voxel IoU of 1000 meshes of 1280 faces at 32^3", programs, min(options.repeats, 5))
-
-
-BENCHES = {name: partial(bench_render, name) for name in ("w1", "w2", "w3", "w4")}
-BENCHES |= {"colors": bench_colors, "voxels": bench_voxels, "peers": lambda options: peers.print_table(options.repeats)}
+    draw = partial(nmr.voxelize, faces=work.faces)
+    run = partial(time_passes, options.threads, draw, compare, vertices, gradients=False)
+    title = "voxels: voxel IoU of 1000 meshes of 1280 faces at 32^3"
+    report(title, {f"nmr, {options.threads} threads": run}, min(options.repeats, 5))
 
 
-@without_traceback()
-def main() -> int:
+def report(title: str, programs: dict[str, Program], repeats: int) -> None:
+    """Print the milliseconds of each program: median of the forward pass, median and minimum of the total.
+
+    The load of the machine is far above 0 if it was busy. Repeats alternate between the programs. Each turn begins with
+    a call that is not timed, because the caches are full of another program's data.
+    """
+    times: dict[str, list[Timing]] = {name: [] for name in programs}
+    for _ in range(repeats):
+        for name, program in programs.items():
+            program()
+            times[name].append(program())
+    load = os.getloadavg()[0]
+    print(f"\n{title}\n{repeats} repeats, torch {torch.__version__}, {platform.machine()}, load {load:.1f}")
+    print(f"{'program':<40}" + "".join(f"{name:>12}" for name in ("forward", "total", "fastest", "x first")))
+    first = None
+    for name, timings in times.items():
+        forward, total = ([1e3 * second for second in column] for column in zip(*timings, strict=True))
+        first = first or median(total)
+        numbers = (median(forward), median(total), min(total), median(total) / first)
+        print(f"{name:<40}" + "".join(f"{number:>12.2f}" for number in numbers), flush=True)
+
+
+BENCHES = {name: partial(bench_render, name) for name in WORKLOADS} | {"colors": bench_colors, "voxels": bench_voxels}
+
+
+def main() -> None:
     options = tyro.cli(Options, description=__doc__)
-    if options.workload not in ("all", *BENCHES):
-        raise ValueError(unknown_name("workload", options.workload, ["all", *BENCHES]))
     keep_freed_memory()
     for name, bench in BENCHES.items():
         if options.workload in ("all", name):
             bench(options)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
