@@ -114,27 +114,11 @@ arm64 aarch64-linux-gnu-g++
 VARIANTS
 }
 
-check_coverage() { # arguments of pytest
+check_coverage() {
     find build/native -name '*.gcda' -delete
     build_and_run coverage g++ "-O0 -g --coverage"
-    # A copy of the package, so that the Python tests run with the instrumented kernels and bindings.
-    local package=build/native/coverage-package root=$PWD
-    rm -rf $package/nmr
-    mkdir -p $package
-    cp -r nmr $package/nmr
-    rm -f $package/nmr/_C*
-    compile . $package/build all -DCMAKE_CXX_FLAGS="-O0 -g --coverage" -DNMR_MULTIVERSION=OFF \
-        -Dpybind11_DIR="$("$python" -m pybind11 --cmakedir)" -DCMAKE_LIBRARY_OUTPUT_DIRECTORY="$PWD/$package/nmr"
-    # Run pytest in that folder, so that it imports this package. Tests that start an isolated interpreter would not, and are left out.
-    export COVERAGE_FILE=$root/build/native/coverage-python
-    (cd $package && "$python" -m pytest -q --rootdir="$root" -c "$root/pyproject.toml" "$root/tests/nmr" --cov=nmr --cov-branch \
-        --cov-report= -k "not one_openmp_runtime and not running_out_of_memory" "$@")
-    "$python" -m coverage report --skip-covered --include="*/nmr/*"
-    local gcovr=("$python" -m gcovr --root . --merge-lines --add-tracefile build/native/coverage.json)
     "$python" -m gcovr --root . --filter csrc/ --exclude-throw-branches --exclude-unreachable-branches \
-        --merge-mode-functions=separate build/native/coverage $package/build --json build/native/coverage.json
-    "${gcovr[@]}" --txt
-    "${gcovr[@]}" --txt-metric branch --txt --print-summary
+        --merge-mode-functions=separate build/native/coverage --txt --print-summary
 }
 
 mkdir -p build/native

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
-import runpy
 import shutil
 import subprocess
 from pathlib import Path
@@ -12,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text, box, catalogue, deb, entry, fetch
 
 from learn3d.make_data.debian import packages
@@ -251,21 +248,3 @@ def test_obj_text() -> None:
     for text in ("v 0 0\nv 1 2 3", "v 0 0 0\nf 1 2 4", "v 0 0 0\nf 1 1 -9", "f 1 2 x"):
         with pytest.raises(ValueError, match=r"inhomogeneous|refers to a missing vertex|invalid literal"):
             read_obj(text)
-
-
-@pytest.mark.skipif(shutil.which("dpkg-deb") is None, reason="needs dpkg-deb")
-def test_icons_of_furniture_are_drawn_beside_their_meshes(tmp_path: Path) -> None:
-    icon = Image.new("RGBA", (48, 48))
-    icon.paste((160, 40, 30, 255), (8, 20, 40, 40))
-    icon.save(png := io.BytesIO(), "png")
-    entries = [entry(f"Sofa {n}", "sofa", icon=f"/i/{n}.png") for n in range(4)] + [
-        entry("Cup", "cup", icon="/i/0.png")
-    ]
-    sh3f = catalogue(entries, {f"i/{n}.png": png.getvalue() for n in range(4)})
-    deb(tmp_path, "sweethome3d-furniture", {"usr/Test.sh3f": sh3f})
-    script = runpy.run_path(str(Path(__file__).parents[4] / "tools" / "draw_icons.py"))
-    found = script["icons"](next(tmp_path.glob("*.deb")))
-    assert [category for _, category, _ in found] == ["sofa"] * 4 and found == sorted(found, key=lambda each: each[0])
-    half = found[0][0] % 2
-    script["main"](tmp_path, half=half, count=1, side=64)
-    assert np.asarray(Image.open(tmp_path / f"half-{half}.png")).std() > 5
