@@ -8,9 +8,9 @@
 #   count         instructions of the kernels under callgrind, compared with tests/csrc/instructions.json; --store: new bounds
 #   count-base    the same without AVX
 #   variants      whether every available compiler and instruction set gives the same bits
-#   coverage      coverage of csrc/ and nmr/ by the C++ and Python tests (lines and branches)
+#   coverage      coverage of csrc/ by the C++ tests (lines and branches)
 # Exit status 77: a tool that the check needs is missing; a message names it. PYTHON: an interpreter that has cmeel-eigen
-# (for coverage also the test extra); default .venv/bin/python.
+# and gcovr; default .venv/bin/python.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -26,18 +26,15 @@ want() { # programs that the check needs
     done
 }
 
-compile() { # source folder, build folder, targets, cmake arguments
-    local log=$2.log generator=()
-    command -v ninja >/dev/null && generator=(-G Ninja)
-    # shellcheck disable=SC2086
-    cmake -S "$1" -B "$2" "${generator[@]}" -DCMAKE_BUILD_TYPE=None -DPython_EXECUTABLE="$python" "${@:4}" >"$log" 2>&1 &&
-        cmake --build "$2" --parallel "${JOBS:-2}" --target $3 >>"$log" 2>&1 ||
-        { grep -E -A8 "error|Error|FAILED" "$log" | head -60; echo "the whole log: $log"; exit 1; }
-}
-
 build() { # name, compiler, flags, targets, further cmake arguments
-    [ "$1" != arm64 ] || set -- "$@" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64
-    compile tests/csrc "build/native/$1" "$4" -DCMAKE_CXX_COMPILER="$2" -DCMAKE_CXX_FLAGS="$3" "${@:5}"
+    local folder=build/native/$1 generator=()
+    command -v ninja >/dev/null && generator=(-G Ninja)
+    [[ $2 != aarch64* ]] || set -- "$@" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64
+    # shellcheck disable=SC2086
+    cmake -S tests/csrc -B "$folder" "${generator[@]}" -DCMAKE_BUILD_TYPE=None -DPython_EXECUTABLE="$python" \
+        -DCMAKE_CXX_COMPILER="$2" -DCMAKE_CXX_FLAGS="$3" "${@:5}" >"$folder.log" 2>&1 &&
+        cmake --build "$folder" --parallel "${JOBS:-2}" --target $4 >>"$folder.log" 2>&1 ||
+        { grep -E -A8 "error|Error|FAILED" "$folder.log" | head -60; echo "the whole log: $folder.log"; exit 1; }
 }
 
 build_and_run() { # name, compiler, flags, further cmake arguments
@@ -82,36 +79,21 @@ count() { # instruction set, options of count.py
 check_count() { count x86-64-v3 "$@"; }
 check_count-base() { count x86-64 "$@"; }
 
-check_variants() {
-    local name compiler flags more run first=
-    while read -r name compiler flags; do
-        more=(-DNMR_MULTIVERSION=OFF) run=()
-        case $name in
-        dispatch) more=(-DNMR_MULTIVERSION=ON) ;;
-        arm64) run=(qemu-aarch64 -L /usr/aarch64-linux-gnu) ;;
-        esac
-        type "$compiler" "${run[@]:0:1}" >/dev/null 2>&1 || { echo "$name: not installed, left out"; continue; }
-        case $flags in
-        *v4*) grep -q avx512vl /proc/cpuinfo || { echo "$name: no AVX-512 here, left out"; continue; } ;;
-        *march*) [ "$(uname -m)" = x86_64 ] || continue ;;
-        esac
-        build "$name" "$compiler" "-O3 $flags" workload "${more[@]}"
+check_variants() { # on x86-64
+    local variant name compiler flags run first=
+    for variant in g++ "g++ -DNMR_NO_VECTOR_TYPES" "g++ -DNMR_MULTIVERSION" "g++ -march=x86-64-v3" "g++ -march=x86-64-v4" \
+        clang++ "clang++ -march=x86-64-v3" "clang++ -march=x86-64-v4" aarch64-linux-gnu-g++; do
+        read -r compiler flags <<<"$variant"
+        name=${variant// /_} run=()
+        [[ $compiler != aarch64* ]] || run=(qemu-aarch64 -L /usr/aarch64-linux-gnu)
+        type "$compiler" "${run[@]:0:1}" >/dev/null 2>&1 || { echo "$variant: not installed, left out"; continue; }
+        [[ $flags != *v4 ]] || grep -q avx512vl /proc/cpuinfo || { echo "$variant: no AVX-512 here, left out"; continue; }
+        build "$name" "$compiler" "-O3 $flags" workload
         "${run[@]}" "build/native/$name/workload" 2 >"build/native/$name.txt"
         first=${first:-$name}
-        [ "$first" != "$name" ] || cat "build/native/$name.txt"
-        diff "build/native/$first.txt" "build/native/$name.txt" || { echo "$name: DIFFERENT"; exit 1; }
-        echo "$name: the same bits"
-    done <<'VARIANTS'
-baseline g++
-loops g++ -DNMR_NO_VECTOR_TYPES
-dispatch g++
-avx2 g++ -march=x86-64-v3
-avx512 g++ -march=x86-64-v4
-clang clang++
-clang-avx2 clang++ -march=x86-64-v3
-clang-avx512 clang++ -march=x86-64-v4
-arm64 aarch64-linux-gnu-g++
-VARIANTS
+        diff "build/native/$first.txt" "build/native/$name.txt" || { echo "$variant: DIFFERENT"; exit 1; }
+        echo "$variant: the same bits"
+    done
 }
 
 check_coverage() {
@@ -123,5 +105,5 @@ check_coverage() {
 
 mkdir -p build/native
 check=check_${1:-none}
-declare -F "$check" >/dev/null || { sed -n '2,17s/^# \{0,1\}//p' "$0"; exit 2; }
+declare -F "$check" >/dev/null || { sed -n '2,13s/^# \{0,1\}//p' "$0"; exit 2; }
 "$check" "${@:2}"

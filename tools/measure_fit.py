@@ -25,34 +25,27 @@ COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,
 def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = None, images: int = 20) -> None:
     """Print a line for each category: means over `images` test images, spread evenly over objects and views.
 
-    Columns: IoU of mask and silhouette of the predicted shape, the fitted one and the template (zeros without
-    templates), their voxel IoUs (kato18), the share of images whose azimuth is right within 20 degrees, whose template
-    has the right category, and with a warning.
+    Columns: IoU of mask and silhouette of the predicted shape, the fitted one and the template, their voxel IoUs
+    (kato18), the share of images whose azimuth is right within 20 degrees, whose template has the right category, and
+    with a warning. The model (default: the package's) must have templates.
     """
     model = load_model(run)
     print(f"{'':12}", *(f"{column:>20}" for column in COLUMNS))
     for name in category.split(","):
-        dataset = load_dataset(layout, data, name, "test")
-        rows = []
+        dataset, rows = load_dataset(layout, data, name, "test"), []
         for index in np.linspace(0, len(dataset) - 1, images).round().astype(int):
             batch = dataset.batch(torch.tensor([index]))
             (image,), mask = batch.images, centre(batch.masks[:, None])[0, 0]
             predicted = predict(model.method, image, mask)
-            shapes = [Fit(predicted.vertices[0], model.method.faces, predicted.view, predicted.iou)]
-            shapes.append(fit(model.method, predicted, mask))
-            kind, warning = recognize(model, image)
-            if model.templates is not None:
-                found = fit_template(model.method, model.templates, model.categories, predicted, mask)
-                shapes.append(found[0])
-                kind = found[1]
-            outlines, voxels = np.zeros(3), np.zeros(3)
-            for column, shape in enumerate(shapes):
-                vertices = fit_to_box(shape.vertices.numpy()) if column == 2 else shape.vertices.numpy()
-                grid = dataset.voxelize(torch.from_numpy(vertices)[None].clamp(-0.499, 0.499), shape.faces)
-                outlines[column], voxels[column] = shape.iou, float(nmr.metrics.voxel_iou(grid, batch.voxels))
-            error_deg = wrap_deg(shapes[-1].view.azimuth_deg - azimuths_deg(batch.poses))
-            right = float(error_deg.abs()) < 20, kind == name, warning is not None
-            rows.append((*outlines, *voxels, *right))
+            template, kind = fit_template(model.method, model.templates, model.categories, predicted, mask)
+            boxed = template._replace(vertices=torch.from_numpy(fit_to_box(template.vertices.numpy())))
+            first = Fit(predicted.vertices[0], model.method.faces, predicted.view, predicted.iou)
+            shapes = (first, fit(model.method, predicted, mask), boxed)
+            grids = [dataset.voxelize(shape.vertices[None].clamp(-0.499, 0.499), shape.faces) for shape in shapes]
+            voxels = [float(nmr.metrics.voxel_iou(grid, batch.voxels)) for grid in grids]
+            error_deg = wrap_deg(template.view.azimuth_deg - azimuths_deg(batch.poses))
+            right = float(error_deg.abs()) < 20, kind == name, recognize(model, image)[1] is not None
+            rows.append((*(shape.iou for shape in shapes), *voxels, *right))
         print(f"{name:12}", *(f"{value:20.3f}" for value in np.mean(rows, axis=0)), flush=True)
 
 

@@ -2,20 +2,16 @@
 # From a fresh clone to reconstructed meshes: installs, makes data, trains two models for a few minutes, measures them, reconstructs.
 # Usage: bash tools/quickstart.sh [CATEGORY] (airplane, chair, ...; default airplane). Settings: STEPS, OBJECTS, OUT (environment).
 set -euo pipefail
-here=$PWD
+out=$(realpath -m "${OUT:-$(dirname "${BASH_SOURCE[0]}")/../quickstart}")
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . tools/setup.sh
 
 category=${1:-airplane}
 steps=${STEPS:-1600} # steps of 32 images; Vanilla-AE takes a quarter of the steps, of 128 images, as published
 objects=${OBJECTS:-250}
-out=$PWD/quickstart
-[ -z "${OUT:-}" ] || case $OUT in /*) out=$OUT ;; *) out=$here/$OUT ;; esac
-trap 'echo; echo "stopped; the finished part is in $out"; exit 130' INT
+learn3d=$PWD/.venv/bin/learn3d
 
 setup report
-learn3d=$PWD/.venv/bin/learn3d
-mkdir -p "$out" || fail "cannot make the folder $out"
 
 step "Turning six pictures into meshes in colour, with the model that comes with the package"
 .venv/bin/python docs/examples/draw_small_model.py --output "$out/pictures"
@@ -45,10 +41,6 @@ cat <<TEXT
 Look at:
   $out/pictures/small-model.png    pictures, and the meshes in colour made of them (beside it .glb files)
   $out/report.html    in a browser: both methods on test objects, with meshes to turn by hand
-
-Also there:
-  the data           $(ls "$out"/data/*_contact.png)
-  while it learned   $out/plus/pictures/   (rows: input, target, rendering, new views; beside it $out/vanilla/pictures/)
-  reconstructions    $out/meshes/          (a mesh, a turntable GIF and a strip of views for each image)
-  the figures        $out/evaluation.json
+  $out/plus/pictures    while it learned: input, target, rendering, new views
+  $out/meshes    a mesh, a turntable GIF and a strip of views for each of the four images
 TEXT

@@ -17,7 +17,7 @@ step "Style"
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 step "Tests"
-check_room "${TMPDIR:-/tmp}" $room ", or set TMPDIR to a folder on another disk"
+check_room "${TMPDIR:-/tmp}" $room
 # The script pytest, not python -m pytest, which would import the source folder in place of the installed package.
 # One thread per process: threads that wait for each other on shared cores take many times as long. The tests of a file
 # stay together, as they share trained runs and compiled programs. Files go in the order of their names.

@@ -46,23 +46,25 @@ def main(*given: str) -> int:
     name, *arguments = [*given, *sys.argv[1:]] or ["--help"]
     if name in ("-h", "--help", "--help-all"):
         say(HELP.format(commands="\n".join(f"  {command:19}  {text}" for command, (*_, text) in COMMANDS.items())))
-        return 0
-    if name == "--version":
+    elif name == "--version":
         say(metadata.version("nmr-learn3d"))
-        return 0
-    if name == "--completion":
-        return print_completion(*(arguments or ["bash"]))
-    if name not in COMMANDS:
+    elif name == "--completion":
+        print_completion(*arguments[:1])
+    elif name in COMMANDS:
+        try:
+            return _load(name).parse(name, arguments).run() or 0
+        except ModuleNotFoundError as error:
+            if (error.name or "").partition(".")[0] in ("", "learn3d", "nmr"):
+                raise
+            extra = COMMANDS[name][1]
+            install = f"pip install '.[{extra}]' in a clone, 'FILE.whl[{extra}]' of a wheel"
+            note(
+                f"error: learn3d {name} needs the package {error.name}, which is not installed; install all: {install}"
+            )
+            return 1
+    else:
         raise ValueError(unknown_name("command", name, COMMANDS))
-    try:
-        return _load(name).parse(name, arguments).run() or 0
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] in ("", "learn3d", "nmr"):
-            raise
-        extra = COMMANDS[name][1]
-        install = f"pip install '.[{extra}]' in a clone, 'FILE.whl[{extra}]' of a wheel"
-        note(f"error: learn3d {name} needs the package {error.name}, which is not installed; install all: {install}")
-        return 1
+    return 0
 
 
 def _load(name: str) -> Any:
@@ -71,12 +73,12 @@ def _load(name: str) -> Any:
     return getattr(importlib.import_module(f"learn3d.commands.{module}"), kind)
 
 
-def print_completion(shell: str, *others: str) -> int:
+def print_completion(shell: str = "bash") -> None:
     """Print the shell script of tab completion. Commands whose packages are not installed are left out."""
     import tyro
 
-    if shell not in ("bash", "zsh", "tcsh") or others:
-        raise ValueError(f"--completion takes bash, zsh or tcsh, got {' '.join((shell, *others))!r}")
+    if shell not in ("bash", "zsh"):
+        raise ValueError(f"--completion takes bash or zsh, got {shell!r}")
     kinds = []
     for name in COMMANDS:
         with contextlib.suppress(ModuleNotFoundError):
@@ -84,4 +86,3 @@ def print_completion(shell: str, *others: str) -> int:
             kinds.append(Annotated[kind.flat(kind.defaults([])), tyro.conf.subcommand(name)])
     with contextlib.suppress(SystemExit):
         tyro.cli(Union[tuple(kinds)], prog="learn3d", args=["--tyro-print-completion", shell])  # noqa: UP007
-    return 0

@@ -10,24 +10,27 @@ import dataclasses
 import inspect
 import typing
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import docstring_parser
 import tyro
-from typing_extensions import Self  # in typing from Python 3.11 on
+from typing_extensions import Self, dataclass_transform  # in typing from Python 3.11 on
 
 from learn3d.settings import RARE
 
 Split: TypeAlias = Literal["train", "val", "test"]
 Which: TypeAlias = Annotated[Literal["last", "best"], tyro.conf.arg(name="checkpoint")]
 Runs = tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")]]
+DataFolder = tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
 
 
-@dataclass(frozen=True)
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 class Command:
-    """Base class of all commands."""
+    """Base class of all commands; they become frozen dataclasses."""
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
     @classmethod
     def about(cls, everything: bool) -> str:
@@ -48,9 +51,9 @@ class Command:
         if brief and any(rare for *_, rare in _options(cls, defaults)):
             about += f"\n\nlearn3d {name} --help-all shows more options."
         # tyro parses into a flat dataclass without checks, because it would catch the ValueError of a refused value.
-        flat = cls.flat(defaults, brief)
         words = ["--help"] if everything else arguments
-        return _build(cls, defaults, vars(tyro.cli(flat, args=words, prog=f"learn3d {name}", description=about)))
+        flat = tyro.cli(cls.flat(defaults, brief), args=words, prog=f"learn3d {name}", description=about)
+        return _build(cls, defaults, vars(flat))
 
     @classmethod
     def flat(cls, defaults: Mapping[str, Any], brief: bool = False) -> type:
@@ -63,8 +66,17 @@ class Command:
         """Do the work; returns the exit status if that is not 0."""
         raise NotImplementedError
 
+    def given(self, *names: str) -> dict[str, Any]:
+        """Those of the options that differ from their defaults, by name."""
+        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(type(self), name)}
 
-@dataclass(frozen=True, kw_only=True)
+    def refuse(self, kind: str, *names: str) -> None:
+        """Raise ValueError if options are given that do not go with others (`kind`)."""
+        if wrong := self.given(*names):
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in wrong)
+            raise ValueError(f"{options} does not go with {kind}; leave it out")
+
+
 class OnDataset(Command):
     """Options of commands that apply trained networks to a data set."""
 
@@ -78,10 +90,9 @@ class OnDataset(Command):
     """Checkpoint of a run: the last one, or the one with the best validation IoU (of silhouettes at novel views, if the
     data have several views of an object)."""
 
-    @property
-    def source(self) -> dict[str, Any]:
-        """The options above by name."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(OnDataset)}
+    def pick(self, *names: str) -> dict[str, Any]:
+        """The options above by name, and others."""
+        return {name: getattr(self, name) for name in ("data", "category", "split", "which", *names)}
 
 
 def _options(
@@ -91,7 +102,9 @@ def _options(
 
     The values of an `instance` have precedence over the defaults of its fields.
     """
-    hints, texts = typing.get_type_hints(kind, include_extras=True), _texts(kind)
+    hints = typing.get_type_hints(kind, include_extras=True)
+    bases = [docstring_parser.parse_from_object(base).params for base in reversed(kind.__mro__[:-1])]
+    texts = {text.arg_name: " ".join((text.description or "").split()) for texts in bases for text in texts}
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         value = getattr(instance, field.name, defaults.get(field.name, field.default))
@@ -107,8 +120,7 @@ def _options(
             hint = tyro.conf.FlagCreatePairsOff[hint]
         shown = {"help_behavior_hint": ""} if explained or value is False or value in ((), "") else {}
         hint = Annotated[hint, tyro.conf.arg(help=text, **shown)]
-        default = {} if value is dataclasses.MISSING else {"default": value}
-        yield field.name, hint, dataclasses.field(**default), is_rare
+        yield field.name, hint, dataclasses.field(default=value), is_rare
 
 
 def _build(kind: type, defaults: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
@@ -124,9 +136,3 @@ def _inner(hint: Any, value: Any) -> type | None:
     """The dataclass that a field holds; None for other types."""
     kind = type(value) if dataclasses.is_dataclass(value) else hint
     return kind if dataclasses.is_dataclass(kind) else None
-
-
-def _texts(kind: type) -> dict[str, str]:
-    """The strings below the fields of a dataclass and of its base classes, without line breaks."""
-    bases = [docstring_parser.parse_from_object(base).params for base in reversed(kind.__mro__[:-1])]
-    return {text.arg_name: " ".join((text.description or "").split()) for texts in bases for text in texts}

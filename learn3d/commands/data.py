@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tqdm import tqdm
 
-from learn3d.commands.command import Command, Split
+from learn3d.commands.command import Command, DataFolder, Split
 from learn3d.data import shards
 from learn3d.data.categories import synset_of
 from learn3d.data.checking import check_folder
@@ -21,6 +20,8 @@ from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
 from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.debian.models import FetchConfig, fetch_debian_models
+from learn3d.make_data.render import make_dataset
+from learn3d.make_data.sharded import make_shards
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.sheet import LEGEND, draw_sheet
@@ -29,7 +30,6 @@ from learn3d.settings import Count, split_names
 from learn3d.terminal import is_watched, note, say
 
 
-@dataclass(frozen=True)
 class MakeDataset(Command):
     """Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of a published one.
 
@@ -42,16 +42,12 @@ class MakeDataset(Command):
     config: DatasetConfig
 
     def run(self) -> int:
-        from learn3d.make_data.render import make_dataset
-        from learn3d.make_data.sharded import make_shards
-
         if self.config.shards:
             return make_shards(self.config)
         say(make_dataset(self.config, progress=is_watched()).text())
         return 0
 
 
-@dataclass(frozen=True)
 class FetchDebianModels(Command):
     """Extract airplanes, chairs, tables, cabinets, sofas and lamps from Debian packages into a folder of PLY meshes.
 
@@ -66,7 +62,6 @@ class FetchDebianModels(Command):
         say(f"written to {self.config.output}")
 
 
-@dataclass(frozen=True)
 class CheckDataset(Command):
     """Read every file of a data set and list all faults: missing, truncated, empty or inconsistent files.
 
@@ -76,7 +71,7 @@ class CheckDataset(Command):
     The exit status is 1 if there are errors, with which training or evaluation would fail, and 0 otherwise.
     """
 
-    folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    folder: DataFolder
     """Folder of the data set."""
     layout: Layout = "kato"
     """Arrangement of its files, see docs/data-sets.md."""
@@ -101,7 +96,6 @@ class CheckDataset(Command):
         return 1 if errors else 0
 
 
-@dataclass(frozen=True)
 class ConvertDataset(Command):
     """Convert a data set that is larger than memory into shards, which training reads piece by piece.
 
@@ -139,20 +133,15 @@ class ConvertDataset(Command):
                 folder = shards.split_folder(self.output, category, split)
                 if shards.holds(self.output, category, split):
                     say(f"{folder}: exists; remove it to convert it again")
-                else:
-                    self._convert(category, split, folder)
-
-    def _convert(self, category: str, split: str, folder: Path) -> None:
-        options = {"image_size": self.image_size} if "image_size" in LAYOUTS[self.layout].options else {}
-        if split == "train":
-            options["views_per_object"] = self.views_per_object
-        dataset = load_dataset(self.layout, self.data, category, split, **options)
-        shards.remove(folder)  # an unfinished conversion
-        count = shards.write_set(folder, self.layout, dataset)
-        say(f"{folder}: {len(dataset)} images of {dataset.num_objects} objects in {count} shards")
+                    continue
+                options = {"image_size": self.image_size} if "image_size" in LAYOUTS[self.layout].options else {}
+                options["views_per_object"] = self.views_per_object if split == "train" else None
+                dataset = load_dataset(self.layout, self.data, category, split, **options)
+                shards.remove(folder)  # an unfinished conversion
+                count = shards.write_set(folder, self.layout, dataset)
+                say(f"{folder}: {len(dataset)} images of {dataset.num_objects} objects in {count} shards")
 
 
-@dataclass(frozen=True, kw_only=True)
 class EstimatePoses(Command):
     """Estimate the pose of each image of a data set from the masks alone, for `learn3d train --poses`.
 
@@ -164,7 +153,7 @@ class EstimatePoses(Command):
     Azimuth 0 is a side that the estimate chooses.
     """
 
-    data: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
+    data: DataFolder
     """Folder of the data set."""
     category: str
     """Categories, separated by commas, which share the prototypes."""

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from learn3d.commands.command import Command, OnDataset, Runs, Which
+from learn3d.experiments.measurement import class_means, describe_measures, evaluate_runs, format_table
 from learn3d.files.writing import check_target, write_json
+from learn3d.reconstruction import cut_out_pictures, load_model, reconstruct_dataset, reconstruct_files
+from learn3d.runs.export import export
 from learn3d.terminal import note, say
 
 
-@dataclass(frozen=True, kw_only=True)
 class Evaluate(OnDataset):
     """Measure trained models on a test set: voxel IoU of each category and its mean, and more.
 
@@ -32,18 +33,13 @@ class Evaluate(OnDataset):
 
     @classmethod
     def about(cls, everything: bool) -> str:
-        from learn3d.experiments.measurement import describe_measures
-
         columns = "Columns of the table (means over the images, then over the categories; - if there is no value):"
         return f"{super().about(everything)}\n\n{columns}\n{describe_measures()}"
 
     def run(self) -> None:
-        from learn3d.experiments.measurement import class_means, evaluate_runs, format_table
-
         if self.json is not None:
             check_target(self.json, "--json")
-        options = {"layout": self.layout, "device": self.device, **self.source}
-        results = evaluate_runs(self.runs, report_progress=note, **options)
+        results = evaluate_runs(self.runs, report_progress=note, **self.pick("layout", "device"))
         say(format_table(results))
         if self.json is not None:
             protocol = {"split": self.split, "checkpoint": self.which}
@@ -51,7 +47,6 @@ class Evaluate(OnDataset):
             write_json(self.json, {"protocol": protocol, "results": values, "means": class_means(results)})
 
 
-@dataclass(frozen=True, kw_only=True)
 class Reconstruct(OnDataset):
     """Turn images into meshes, each with a turntable animation and a strip of views.
 
@@ -87,35 +82,23 @@ class Reconstruct(OnDataset):
     """Format of the mesh files."""
 
     def run(self) -> None:
-        self._check()
-        from learn3d.reconstruction import reconstruct_dataset, reconstruct_files
-
-        check_target(self.output, "--output", folder=True)
-        if self.data is not None:
-            options = {"indices": self.indices, "refined": bool(self.refine), **self.source}
-            paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
-        else:
-            options = {name: getattr(self, name) for name in ("crop", "plain_background", "box", "which")}
-            options["refined"] = self.refine is not False
-            files = (self.model, self.output, self.images, self.masks)
-            paths = reconstruct_files(*files, mesh_format=self.format, **options)
-        say("\n".join(map(str, paths)))
-
-    def _check(self) -> None:
-        """Raise ValueError if options contradict each other."""
         if bool(self.images) == (self.data is not None):
             raise ValueError("give either image files, or --data with --indices")
         if self.box is not None and (len(self.images) > 1 or self.masks or self.plain_background):
             raise ValueError("--box is for one photograph, without --masks and --plain-background")
-        kind, others = "image files", ("category", "split", "indices")
+        own = ("masks", "plain_background", "box", "crop")  # options for image files
+        self.refuse(*(("--data", *own) if self.data else ("image files", "category", "split", "indices")))
+        check_target(self.output, "--output", folder=True)
         if self.data is not None:
-            kind, others = "--data", ("masks", "plain_background", "box", "crop")
-        if wrong := [name for name in others if getattr(self, name) != getattr(Reconstruct, name)]:
-            options = ", ".join(f"--{name.replace('_', '-')}" for name in wrong)
-            raise ValueError(f"{options} does not go with {kind}; leave it out")
+            options = self.pick("indices") | {"refined": bool(self.refine)}
+            paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
+        else:
+            options = {name: getattr(self, name) for name in ("images", "which", *own)}
+            options["refined"] = self.refine is not False
+            paths = reconstruct_files(self.model, self.output, mesh_format=self.format, **options)
+        say("\n".join(map(str, paths)))
 
 
-@dataclass(frozen=True)
 class Export(Command):
     """Write the networks of a run into one small file: in half precision, without the parts for training alone.
 
@@ -134,16 +117,12 @@ class Export(Command):
     (default: it warns of pictures that are far from all training images)."""
 
     def run(self) -> None:
-        from learn3d.reconstruction import cut_out_pictures, load_model
-        from learn3d.runs.export import export
-
         check_target(self.output, "--output")
         others = None if self.others is None else cut_out_pictures(load_model(self.source, self.which), self.others)
         size = export(self.source, self.output, which=self.which, others=others)
         say(f"{self.output} ({size / 1e6:.1f} MB)")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Figures(OnDataset):
     """Draw the paper's figures from trained runs.
 
@@ -177,16 +156,13 @@ class Figures(OnDataset):
         from learn3d.figures.runs import open_runs
 
         check_target(self.output.parent, "--output", folder=True)
-        allowed = {"grid": ("images", "indices", "truth"), "interpolation": ("images", "indices")}
-        own = {name: getattr(self, name) for name in allowed["grid"] if getattr(self, name) != getattr(Figures, name)}
-        if wrong := [f"--{name}" for name in own if name not in allowed.get(self.figure, ())]:
-            raise ValueError(f"the figure {self.figure} has no {', '.join(wrong)}; leave it out")
-        runs = open_runs(self.runs, labels=self.labels, report_progress=note, **self.source)
-        paths = getattr(paper, f"save_{self.figure}")(runs, self.output, **own)
+        refused = {"grid": (), "interpolation": ("truth",), "tsne": ("images", "indices", "truth")}[self.figure]
+        self.refuse(f"the figure {self.figure}", *refused)
+        runs = open_runs(self.runs, report_progress=note, **self.pick("labels"))
+        paths = getattr(paper, f"save_{self.figure}")(runs, self.output, **self.given("images", "indices", "truth"))
         say("\n".join(map(str, paths)))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Report(OnDataset):
     """Write one HTML file about trained runs: options, curves, test IoU, and shapes that one can turn.
 
@@ -211,12 +187,11 @@ class Report(OnDataset):
         from learn3d.pages.report import write_report
 
         check_target(self.output, "--output")
-        shown = {"labels": self.labels, "objects": self.objects, "indices": self.indices}
-        size = write_report(self.runs, self.output, report_progress=note, **shown, **self.source)
+        options = self.pick("labels", "objects", "indices")
+        size = write_report(self.runs, self.output, report_progress=note, **options)
         say(f"{self.output} ({size / 1e6:.1f} MB)")
 
 
-@dataclass(frozen=True)
 class Demo(Command):
     """Open a page in the browser that turns pictures into meshes.
 

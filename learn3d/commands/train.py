@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,16 +19,6 @@ from learn3d.terminal import INTERRUPTED, say
 from learn3d.training import train
 
 
-@dataclass(frozen=True)
-class _Origin:
-    """The options that decide the other options and their defaults."""
-
-    preset: str | None = None
-    resume: bool = False
-    output: Path | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class Train(Command):
     """Train a model that turns one image into a 3D shape.
 
@@ -54,17 +44,20 @@ class Train(Command):
     @classmethod
     def defaults(cls, arguments: Sequence[str]) -> Mapping[str, Any]:
         """The options of the saved run with --resume, else those of the preset."""
-        given = [word for word in arguments if word not in ("-h", "--help", "--help-all")]
-        origin, _ = tyro.cli(_Origin, args=given, return_unknown_args=True, add_help=False)
-        preset = None if origin.preset is None else full_name(origin.preset)
-        if not origin.resume or len(given) < len(arguments):
+        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        parser.add_argument("--preset", nargs="?")
+        parser.add_argument("--output", nargs="?", type=Path)
+        parser.add_argument("--resume", action="store_true")
+        given, others = parser.parse_known_args(arguments)
+        preset = full_name(given.preset) if given.preset else None
+        if not given.resume or {"-h", "--help", "--help-all"} & set(others):
             chosen = PRESETS[preset or DEFAULT_PRESET]
             return {name: getattr(chosen, name) for name in FROM_PRESET if name != "warmup_steps"}
-        if origin.output is None:
+        if given.output is None:
             raise ValueError("--resume needs --output: the folder of the run that is to go on")
-        saved = load_config(origin.output / "config.json")
+        saved = load_config(given.output / "config.json")
         if preset not in (None, saved.preset):
-            raise ValueError(f"{origin.output} was started with the preset {saved.preset}, got {preset}")
+            raise ValueError(f"{given.output} was started with the preset {saved.preset}, got {preset}")
         return vars(saved)
 
     def run(self) -> int:
@@ -76,7 +69,6 @@ class Train(Command):
         return 0 if summary.finished else INTERRUPTED
 
 
-@dataclass(frozen=True)
 class Experiment(Request, Command):
     """Make a table of the paper: train its runs, measure them, and report the paper's values beside ours.
 
