@@ -31,7 +31,7 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
     """
     if category not in _RECIPES:
         raise ValueError(f"category must be one of {', '.join(CATEGORIES)}; got {category!r}")
-    draw = Draw(rng)
+    draw = Draw(rng.bit_generator)
     return assemble(draw.pick(_RECIPES[category])(draw))
 
 

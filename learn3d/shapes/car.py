@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from .draw import Draw
-from .parts import Part, bar, box, join, loft, rectangle, revolve, rounded_path, slab, wing
+from .draw import Draw, rectangle, rounded_path
+from .parts import Part, bar, box, crossbar, join, loft, revolve, slab, wing
 
 TYRE = 0.22  # width of the wheels
 
@@ -139,7 +139,7 @@ def _wheels(draw: Draw, body: Body) -> Part:
     rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])
     profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
     wheel = revolve(profile, 16).rotated("z", 90).moved(x, y)
-    pair = wheel.both_sides() + bar((-x, y, 0), (x, y, 0), 0.1)
+    pair = wheel.both_sides() + crossbar((-x, y, 0), 0.1)
     return join(pair.moved(z=body.length / 2 - s) for s in body.axles)
 
 

@@ -6,15 +6,15 @@ from functools import partial
 
 import numpy as np
 
-from .draw import Draw
-from .parts import Part, bar, between, ellipse, post, rectangle, rounded_path, sheet, slab, tube
+from .draw import Draw, Point, ellipse, points, rectangle, rounded_path
+from .parts import Part, bar, between, crossbar, post, sheet, slab, tube
 from .sofa import upholstered
-from .supports import legs, support
+from .supports import cantilever, cross, disc, legs, loops, panels, rocker, star
 
 # Weights of the supports of dining, lounge and bar chairs.
-_DINING = {"legs": 6, "loops": 1, "cantilever": 1, "cross": 0.8, "panels": 0.6, "disc": 0.7, "star": 0.4, "rocker": 0.5}
-_LOUNGE = {"legs": 2.5, "loops": 2, "cantilever": 1, "rocker": 1, "star": 0.6, "panels": 0.7, "cross": 0.7}
-_BAR = {"legs": 3, "disc": 1.5, "loops": 1, "panels": 0.3}
+_DINING = {legs: 6, loops: 1, cantilever: 1, cross: 0.8, panels: 0.6, disc: 0.7, star: 0.4, rocker: 0.5}
+_LOUNGE = {legs: 2.5, loops: 2, cantilever: 1, rocker: 1, star: 0.6, panels: 0.7, cross: 0.7}
+_BAR = {legs: 3, disc: 1.5, loops: 1, panels: 0.3}
 # Weights of the backs of chairs without padding.
 _BACKS = {"ladder": 2, "slats": 2, "spindles": 1, "splat": 1.2, "cross": 0.8, "open": 1.0, "lattice": 0.7, "band": 1.0}
 _BACKS |= {"panel": 1.2, "hoop": 1.2, "solid": 2.0}
@@ -38,15 +38,14 @@ def jointed_chair(draw: Draw, family: str) -> Part:
 
     taper = draw(0.8, 1.0) if draw.maybe(0.4) else 1.0  # narrower at the rear
     outline = ellipse(width, depth, 24, exponent)
-    outline = outline * np.stack([1 + (taper - 1) * (0.5 - outline[:, 1] / depth), np.ones(len(outline))], 1)
+    outline[:, 0] *= 1 + (taper - 1) * (0.5 - outline[:, 1] / depth)
     under = height - thickness
     part = slab(outline, thickness, bevel=(0.35 if cushioned else 0.2) * thickness).moved(y=under)
 
-    weights = {"bar": _BAR, "lounge": _LOUNGE, "dining": _DINING}
-    kind = "star" if family == "office" else draw.pick(weights[family])
+    support = star if family == "office" else draw.pick({"bar": _BAR, "lounge": _LOUNGE, "dining": _DINING}[family])
     spread = 0.5 * 0.35 ** (1 / exponent)  # well inside the outline
     half_x, half_z = spread * width * (0.5 + 0.5 * taper) - 0.03, spread * depth - 0.03
-    part += support(draw, kind, half_x, half_z, under)
+    part += support(draw, half_x, half_z, under)
     if family == "bar" and not draw.maybe(0.8):  # a stool
         return part
 
@@ -56,27 +55,23 @@ def jointed_chair(draw: Draw, family: str) -> Part:
     curve = max(0.0 if angular else depth / 2 - rear_edge, draw(0.0, 0.08) if draw.maybe(0.6) else 0.0)
     back, bulge = _back(draw, family, stile_x, back_height, curve)
     part += back.rotated("x", -recline).moved(y=height - 0.5 * thickness, z=-depth / 2 + 0.03)
-    arm_chance = {"office": 0.6, "lounge": 0.6, "bar": 0.1, "dining": 0.3}[family]
-    if draw.maybe(arm_chance) and back_height > 0.3:
+    if draw.maybe({"office": 0.6, "lounge": 0.6, "bar": 0.1, "dining": 0.3}[family]) and back_height > 0.3:
+        rise = draw(0.17, 0.26)
+        rear = -depth / 2 + 0.03 + (curve + bulge) - np.tan(np.radians(recline)) * rise
         edge = 0.5 * width - 0.02 if angular else max(stile_x, half_x)
-        part += _arm(draw, depth, height, thickness, edge, stile_x, recline, curve + bulge).both_sides()
+        arm = _arm(draw, (stile_x, height + rise, rear), rise, edge, height - 0.6 * thickness, depth)
+        part += arm.both_sides()
     return part
 
 
-def _arm(
-    draw: Draw, depth: float, height: float, thickness: float, edge: float, stile_x: float, lean_deg: float, bow: float
-) -> Part:
-    """The arm at x > 0, from the back to the front. The back leans by lean_deg and bows forward by `bow`."""
-    rise = draw(0.17, 0.26)
-    y = height + rise
-    rear = -depth / 2 + 0.03 + bow - np.tan(np.radians(lean_deg)) * rise
+def _arm(draw: Draw, back: Point, rise: float, edge: float, base: float, depth: float) -> Part:
+    """The arm at x > 0, from a point of the back to the front, `rise` above a seat with its edge at x = edge."""
+    x, y, rear = back
     front = depth * draw(0.15, 0.45)
     foot_z = min(front, depth * 0.3)
     kind = draw.pick({"post": 3, "panel": 0.8, "loop": 1.5, "swoop": 1.5, "cantilever": 0.7})
     size = draw(0.025, 0.05)
-    base = height - 0.6 * thickness
-    rest = rectangle(size * draw(1.0, 2.0), 0.7 * size, segments=1)
-    start = (stile_x, y, rear - 0.01)
+    rest, start = rectangle(size * draw(1.0, 2.0), 0.7 * size, segments=1), (x, y, rear - 0.01)
     if kind == "panel":
         return between((edge - 0.02, base - 0.02, rear), (edge + 0.03, y, front + 0.02), 0.012)
     if kind == "loop":
@@ -96,18 +91,25 @@ def _arm(
 def _back(draw: Draw, family: str, half: float, height: float, curve: float) -> tuple[Part, float]:
     """A back in the plane z = 0, from y = 0 to `height`, between stiles at x = +-half; and the z of its front."""
     top = height + 0.02
-    if draw.maybe({"office": 0.8, "lounge": 0.5}.get(family, 0.12)):
-        thickness = draw(0.05, 0.11)
-        return _padded_back(draw, half, top, curve, thickness, detached=family == "office"), thickness / 2
-    kind = draw.pick(_BACKS)
-    if kind == "solid":
-        return _plate(draw, half, top, curve, draw(0.02, 0.045)), 0.0
-    if kind == "hoop":
-        return _hoop(draw, half, top, curve), 0.0
-    return _framed_back(draw, half, height, curve, kind), 0.0
+    if not draw.maybe({"office": 0.8, "lounge": 0.5}.get(family, 0.12)):
+        kind = draw.pick(_BACKS)
+        if kind == "solid":
+            return _plate(draw, half, top, curve, draw(0.02, 0.045)), 0.0
+        return _hoop(draw, half, top, curve) if kind == "hoop" else _frame(draw, half, height, curve, kind), 0.0
+    thickness = draw(0.05, 0.11)
+    if family == "office" and not draw.maybe(0.3):  # mostly held above the seat by a spine
+        gap = draw(0.12, 0.35) * top
+        back = _plate(draw, draw(0.8, 1.1) * half, top - gap, max(curve, 0.03), thickness).moved(y=gap)
+        path = [(0, -0.06, 0.12), (0, -0.06, -0.07), (0, gap + 0.3 * (top - gap), -0.4 * thickness)]
+        back += tube(rounded_path(path, 0.06), 1.0, rectangle(0.06, 0.02, segments=1), side=(1, 0, 0))
+    elif draw.maybe(0.5):
+        back = _plate(draw, 1.05 * half, top, curve, thickness)
+    else:
+        back = between((-half - 0.03, -0.02, -thickness / 2), (half + 0.03, top, thickness / 2), 0.03)
+    return back, thickness / 2
 
 
-def _framed_back(draw: Draw, half: float, height: float, curve: float, kind: str) -> Part:
+def _frame(draw: Draw, half: float, height: float, curve: float, kind: str) -> Part:
     """Two stiles and a rail on top, filled with boards, slats, spindles, a splat, a cross, a lattice, or open."""
     top, high = height + 0.02, height > 0.3
     stile, board = draw(0.022, 0.045), draw(0.015, 0.028)
@@ -129,7 +131,7 @@ def _framed_back(draw: Draw, half: float, height: float, curve: float, kind: str
     if kind in ("panel", "band"):
         bottom = low if kind == "panel" else 0.55 * height
         x, y = np.meshgrid(np.linspace(-half, half, 9), [bottom, top - 0.5 * rail])
-        return part + sheet(np.stack([x, y, _bow(x, half, curve)], 2), board)
+        return part + sheet(points(x, y, _bow(x, half, curve)), board)
     bottom, upper = -0.01, top - 0.6 * rail
     if draw.maybe(0.5) or kind == "lattice":
         bottom = low
@@ -138,11 +140,11 @@ def _framed_back(draw: Draw, half: float, height: float, curve: float, kind: str
         tall, wide, t = upper + arch * 0.8 - bottom, half * draw(0.25, 0.5), np.linspace(0, 1, 9)[:, None]
         width = wide * (1 + draw(0.1, 0.5) * np.sin(2 * np.pi * (draw(0.6, 1.4) * t + draw(0, 1))))
         x = np.array([[-1.0, -0.5, 0.0, 0.5, 1.0]]) * np.minimum(width, 1.8 * wide)
-        return part + sheet(np.stack([x, bottom + t * tall + 0 * x, 0 * x], 2), board)
+        return part + sheet(points(x, bottom + t * tall, 0.0), board)
     if kind == "cross":
         for side in (-1, 1):
             x = side * np.linspace(-half, half, 7)
-            path = np.stack([x, np.linspace(bottom + 0.01, upper, 7), _bow(x, half, curve)], 1)
+            path = points(x, np.linspace(bottom + 0.01, upper, 7), _bow(x, half, curve))
             part += tube(path, 1.0, rectangle(board, draw(0.02, 0.04), segments=1))
         return part
     count = {"slats": draw.count(2, 7), "spindles": draw.count(4, 8), "lattice": draw.count(2, 4)}[kind]
@@ -165,7 +167,7 @@ def _bow(x: np.ndarray, half: float, curve: float) -> np.ndarray:
 def _rail(half: float, y: float, height: float, thickness: float, curve: float, arch: float = 0.0) -> Part:
     """A horizontal board between the stiles, following the bow of the back, its middle lifted by `arch`."""
     x = np.linspace(-half, half, 9)
-    path = np.stack([x, y + arch * (1 - (x / half) ** 2), _bow(x, half, curve)], 1)
+    path = points(x, y + arch * (1 - (x / half) ** 2), _bow(x, half, curve))
     return tube(path, 1.0, rectangle(thickness, height, segments=1))
 
 
@@ -176,20 +178,8 @@ def _plate(draw: Draw, half: float, top: float, curve: float, thickness: float) 
     v = np.linspace(-1, 1, 11)[None]
     rounding = (1 - np.clip((t - 0.4) / 0.605, 0, 1) ** power) ** (1 / power)
     x = v * half * (1 + flare * t) * np.maximum(rounding, 0.12)
-    y = -0.01 + t * (top + 0.01) + 0 * v
-    return sheet(np.stack([x, y, _bow(x, half, curve) + wave * np.sin(np.pi * t)], 2), thickness)
-
-
-def _padded_back(draw: Draw, half: float, top: float, curve: float, thickness: float, detached: bool) -> Part:
-    """An upholstered back. A `detached` one is mostly held above the seat by a spine."""
-    if not detached or draw.maybe(0.3):
-        if draw.maybe(0.5):
-            return _plate(draw, 1.05 * half, top, curve, thickness)
-        return between((-half - 0.03, -0.02, -thickness / 2), (half + 0.03, top, thickness / 2), 0.03)
-    gap = draw(0.12, 0.35) * top
-    pad = _plate(draw, draw(0.8, 1.1) * half, top - gap, max(curve, 0.03), thickness).moved(y=gap)
-    path = rounded_path([(0, -0.06, 0.12), (0, -0.06, -0.07), (0, gap + 0.3 * (top - gap), -0.4 * thickness)], 0.06)
-    return pad + tube(path, 1.0, rectangle(0.06, 0.02, segments=1), side=(1, 0, 0))
+    z = _bow(x, half, curve) + wave * np.sin(np.pi * t)
+    return sheet(points(x, -0.01 + t * (top + 0.01), z), thickness)
 
 
 def _hoop(draw: Draw, half: float, top: float, curve: float) -> Part:
@@ -198,7 +188,7 @@ def _hoop(draw: Draw, half: float, top: float, curve: float) -> Part:
     straight = draw(0.2, 0.6) * top
     x = np.concatenate([[half], half * np.cos(angle), [-half]])
     y = np.concatenate([[-0.02], straight + (top - straight) * np.sin(angle) ** 0.9, [-0.02]])
-    part = tube(np.stack([x, y, _bow(x, half, curve)], 1), draw(0.018, 0.035) / 2)
+    part = tube(points(x, y, _bow(x, half, curve)), draw(0.018, 0.035) / 2)
     count = draw.count(3, 8) if draw.maybe(0.85) else 0
     for x in np.linspace(-half, half, count + 2)[1:-1]:
         end = straight + (top - straight) * (1 - (x / half) ** 2) ** 0.45
@@ -225,12 +215,12 @@ def shell_chair(draw: Draw) -> Part:
     hip = np.exp(-(((t - 0.5) / 0.25) ** 2))
     lift = (curl * np.abs(v) ** 2.5 + wings * hip * np.abs(v) ** 3) * (1 - 0.7 * ease)
     pull = (curl + wings * hip) * np.abs(v) ** 2.5 * ease
-    part = sheet(np.stack([span * v, y + lift, z + pull], 2), draw(0.018, 0.035)).moved(y=height)
+    part = sheet(points(span * v, y + lift, z + pull), draw(0.018, 0.035)).moved(y=height)
     part += slab(ellipse(0.8 * width, 0.8 * depth, 20, 5), 0.03).moved(y=height - 0.045)
-    kind = draw.pick({"legs": 2, "star": 1, "disc": 1, "loops": 1, "rocker": 0.5})
-    if kind == "legs":
+    support = draw.pick({legs: 2, star: 1, disc: 1, loops: 1, rocker: 0.5})
+    if support is legs:
         return part + legs(draw, 0.34 * width, 0.34 * depth, height - 0.035, plain=True)
-    return part + support(draw, kind, 0.37 * width, 0.38 * depth, height - 0.035)
+    return part + support(draw, 0.37 * width, 0.38 * depth, height - 0.035)
 
 
 def barrel_chair(draw: Draw) -> Part:
@@ -244,7 +234,7 @@ def barrel_chair(draw: Draw) -> Part:
     bottom = -0.06 if gap is None else gap
     y = bottom + np.linspace(0, 1, 4)[:, None] * (top - bottom)
     r = radius - 0.3 * thickness + draw(0.0, 0.12) * np.maximum(y, 0.0)
-    part = sheet(np.stack([r * np.sin(angle), y, -r * np.cos(angle)], 2), thickness).moved(y=height)
+    part = sheet(points(r * np.sin(angle), y, -r * np.cos(angle)), thickness).moved(y=height)
     cushion = draw(0.06, 0.14)
     under = height - cushion
     part += slab(ellipse(2 * radius, 2 * radius, 28, draw.pick((2.0, 2.0, 3.0))), cushion).moved(y=under)
@@ -254,8 +244,8 @@ def barrel_chair(draw: Draw) -> Part:
             part += bar((0.93 * x, height - 0.5 * cushion, 0.93 * z), (0.99 * x, top_y, 0.99 * z), 0.022)
     if draw.maybe(0.2):  # a solid drum down to the floor
         return part + slab(ellipse(1.9 * radius, 1.9 * radius, 28), under + 0.02, 0.02)
-    kind = draw.pick({"legs": 3, "disc": 1, "star": 0.7, "loops": 0.7})
-    return part + support(draw, kind, 0.66 * radius, 0.66 * radius, under)
+    support = draw.pick({legs: 3, disc: 1, star: 0.7, loops: 0.7})
+    return part + support(draw, 0.66 * radius, 0.66 * radius, under)
 
 
 def stool(draw: Draw) -> Part:
@@ -263,8 +253,7 @@ def stool(draw: Draw) -> Part:
     width, height, thickness = draw(0.3, 0.45), draw(0.35, 0.78), draw(0.02, 0.12)
     depth = width * draw(0.7, 1.0) if draw.maybe(0.4) else width
     seat = slab(ellipse(width, depth, 24, draw.pick((2.0, 2.0, 4.0, 8.0))), thickness).moved(y=height - thickness)
-    kind = draw.pick(_BAR)
-    return seat + support(draw, kind, 0.38 * width, 0.38 * depth, height - thickness + 0.005)
+    return seat + draw.pick(_BAR)(draw, 0.38 * width, 0.38 * depth, height - thickness + 0.005)
 
 
 def bench(draw: Draw) -> Part:
@@ -272,7 +261,7 @@ def bench(draw: Draw) -> Part:
     width, depth, height = draw(1.0, 1.7), draw(0.35, 0.5), draw(0.4, 0.47)
     count, thick, gap = draw.count(1, 6), draw(0.02, 0.06), draw(0.005, 0.03)
     step = depth / count
-    part = support(draw, draw.pick({"legs": 3, "panels": 2, "loops": 1}), 0.44 * width, 0.38 * depth, height - 0.02)
+    part = draw.pick({legs: 3, panels: 2, loops: 1})(draw, 0.44 * width, 0.38 * depth, height - 0.02)
     part += between((-0.46 * width, height - 0.04, -depth / 2), (0.46 * width, height, depth / 2))
     for z in np.arange(count) * step - depth / 2:
         part += between((-width / 2, height - 0.01, z + gap), (width / 2, height + thick, z + step - gap))
@@ -282,7 +271,7 @@ def bench(draw: Draw) -> Part:
             part += bar((x, height - 0.02, rear), (x, height + top, rear - lean), 0.05)
         for t in np.linspace(0.35, 0.95, draw.count(1, 3)):
             y, z = height + t * top, rear - t * lean
-            part += bar((-width / 2, y, z), (width / 2, y, z), 0.03, draw(0.06, 0.12))
+            part += crossbar((-width / 2, y, z), 0.03, draw(0.06, 0.12))
     return part
 
 

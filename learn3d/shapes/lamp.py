@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .draw import Draw
-from .parts import Part, bar, ellipse, ellipsoid, join, rectangle, revolve, rounded_path, slab, tube
+from .draw import Draw, ellipse, rectangle, rounded_path
+from .parts import Part, bar, crossbar, ellipsoid, join, revolve, slab, tube
 
 
 def _shell(radius: np.ndarray, y: np.ndarray, sides: int = 20) -> Part:
@@ -27,7 +27,7 @@ def _shade(draw: Draw, radius: float, height: float) -> Part:
     scale = outline[draw.pick({"cone": 4, "drum": 2, "bell": 1.5, "dome": 1.5})]
     shade = _shell(radius * scale, height * t, sides=draw.pick({20: 5, 4: 1}))
     level, reach = 0.85 * height, 0.985 * radius * float(np.interp(0.85, t, scale))  # the wires end inside the wall
-    shade += bar((-reach, level, 0), (reach, level, 0), 0.012) + bar((0, level, -reach), (0, level, reach), 0.012)
+    shade += crossbar((-reach, level, 0), 0.012) + bar((0, level, -reach), (0, level, reach), 0.012)
     shade += ellipsoid((0.07, 0.11, 0.07), (0, 0.62 * height, 0), 10, 6)
     return shade + bar((0, -0.02, 0), (0, 0.88 * height, 0), 0.02)
 

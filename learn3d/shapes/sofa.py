@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from .draw import Draw
-from .parts import Part, bar, between, ellipse, join, sheet, slab
-from .supports import feet, support
+from .draw import Draw, ellipse, points
+from .parts import Part, bar, between, crossbar, join, sheet, slab
+from .supports import feet, legs, loops, panels
 
 
 def _cushions(lower: tuple[float, float, float], upper: tuple[float, float, float], count: int) -> Part:
@@ -33,8 +33,8 @@ def upholstered(draw: Draw, seats: int) -> Part:
         t = np.linspace(0, 1, 6)[:, None]
         reach = draw(0.18, 0.3) * np.sin(np.pi * (0.12 + 0.8 * t)) ** 0.7
         z = rear + back - 0.06 + np.linspace(0, 1, 4)[None] * (reach + 0.06)
-        y = seat + 0.1 + t * (high - seat - 0.1) + 0 * z
-        upright += sheet(np.stack([np.full_like(z, half - 0.03), y, z], 2), draw(0.04, 0.08)).both_sides()
+        y = seat + 0.1 + t * (high - seat - 0.1)
+        upright += sheet(points(half - 0.03, y, z), draw(0.04, 0.08)).both_sides()
     part += upright.rotated("x", -lean, (0, low, rear + back))
     part += feet(draw, half - 0.08, front - 0.09, foot + 0.015)
     kind = draw.pick({"box": 3, "rolled": 2, "low": 1, "none": 0.7})
@@ -85,12 +85,12 @@ def settee(draw: Draw) -> Part:
     half, depth, size = seats * draw(0.26, 0.34), draw(0.62, 0.82), draw(0.03, 0.06)
     seat, high, rest = draw(0.38, 0.46), draw(0.72, 0.95), draw(0.56, 0.66)
     low, front, rear = seat - draw(0.08, 0.15), depth / 2, -depth / 2
-    sofa = support(draw, draw.pick({"legs": 3, "loops": 2, "panels": 1}), half - 0.02, 0.85 * front, low)
+    sofa = draw.pick({legs: 3, loops: 2, panels: 1})(draw, half - 0.02, 0.85 * front, low)
     sofa += between((-half, low - 0.05, rear + 0.03), (half, low + 0.01, front - 0.03), 0.01)
     sofa += _cushions((-half, low, rear + 0.04), (half, seat, front), seats)
     lean, hinge, z = draw(5, 16), (0, low, rear + 0.06), rear + 0.04
     frame = bar((half - 0.03, low - 0.04, z), (half - 0.03, high, z), size, size).both_sides()
-    frame += bar((-half, high - 0.02, z), (half, high - 0.02, z), size, 1.3 * size)
+    frame += crossbar((-half, high - 0.02, z), size, 1.3 * size)
     if draw.maybe(0.55):
         frame += _cushions((-half, seat - 0.04, z), (half, high + 0.03, rear + 0.17), seats)
     else:
@@ -115,7 +115,7 @@ def curved_sofa(draw: Draw) -> Part:
     x = (half - thick / 2) * np.sign(sine) * np.abs(sine) ** draw(0.5, 0.8)  # flatter than a circle's arc
     z = -depth / 2 + thick / 2 + (depth - thick) * forward
     y = foot + np.linspace(0, 1, 4)[:, None] * (high - draw(0, 0.25) * forward - foot)
-    wrap = sheet(np.stack([np.broadcast_to(x, y.shape), y, np.broadcast_to(z, y.shape)], 2), thick)
+    wrap = sheet(points(x, y, z), thick)
     edge = np.linspace(x[0], x[-1], 9)[1:-1]
     front = np.stack([edge, z[0] + draw(-0.1, 0.1) * (1 - (edge / x[0]) ** 2)], 1)
     outline = np.concatenate([front, np.stack([x, z], 1)[::-1]])[::-1]

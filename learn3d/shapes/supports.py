@@ -7,42 +7,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from .draw import Draw
-from .parts import Part, bar, between, ellipse, ellipsoid, join, post, rectangle, revolve, rounded_path, slab, tube
+from .draw import Draw, ellipse, points, rectangle, rounded_path
+from .parts import Part, bar, between, crossbar, ellipsoid, join, post, revolve, slab, tube
 
 
-def leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
-    """The profile [(height, scale)] of a leg, 0 = floor, 1 = top, and whether the leg is turned (round)."""
-    kind = draw.pick({"straight": 2, "tapered": 3, "turned": 1.5, "baluster": 1, "stepped": 0.7})
-    if kind == "straight":
-        profile = [(0, 1), (1, 1)]
-    elif kind == "tapered":
-        profile = [(0, draw(0.45, 0.8)), (draw(0.6, 0.95), 1), (1, 1)]
-    elif kind == "stepped":
-        waist = draw(0.5, 0.75)
-        profile = [(0, 1), (0.1, 1), (0.13, waist), (0.68, waist), (0.72, 1), (1, 1)]
-    elif kind == "turned":
-        a, b = draw(0.2, 0.35), draw(0.55, 0.75)
-        profile = [(0, 0.5), (a - 0.08, 0.7), (a, 1.05), (a + 0.08, 0.65), (b, 1.2), (b + 0.08, 0.7)]
-        profile += [(0.92, 1.1), (1, 1)]
-    else:
-        swell = draw(0.25, 0.5)
-        profile = [(0, 0.55), (0.06, 0.75), (0.1, 0.5), (swell, 1.25), (0.75, 0.7), (0.82, 1.1), (0.88, 0.8), (1, 1)]
-    return profile, kind in ("turned", "baluster")
-
-
-def legs(
-    draw: Draw, half_x: float, half_z: float, height: float, size: float | None = None, plain: bool = False
-) -> Part:
+def legs(draw: Draw, half_x: float, half_z: float, height: float, size: float = 0.0, plain: bool = False) -> Part:
     """Four legs, straight or splayed, perhaps with stretchers and an apron; or bent-wire (hairpin) legs.
 
-    plain: tapered legs without an apron.
+    size 0 is a random one. plain: tapered legs without an apron.
     """
-    size = draw(0.028, 0.055) if size is None else size
+    size = size or draw(0.028, 0.055)
     splay = draw(0.02, 0.16) * height if draw.maybe(0.55) else 0.0
     if draw.maybe(0.1):
-        return _hairpin_legs(half_x, half_z, height, 0.5 * splay)
-    profile, turned = ([(0, 0.6), (1, 1)], True) if plain else leg_profile(draw)
+        foot, level = (half_x + 0.5 * splay, 0.006, half_z + 0.5 * splay), height + 0.01
+        leg = bar(foot, (half_x - 0.1, level, half_z), 0.013) + bar(foot, (half_x, level, half_z - 0.1), 0.013)
+        plate = between((-half_x - 0.01, height - 0.012, -half_z), (half_x + 0.01, height + 0.005, half_z))
+        return leg.four_corners() + plate
+    profile, turned = ([(0, 0.6), (1, 1)], True) if plain else _leg_profile(draw)
     outline = ellipse(size, size, 10) if turned or draw.maybe(0.3) else rectangle(size, size, segments=1)
     splay_rear = splay * draw.pick((0.3, 1.0, 1.6))
     foot = np.array([[half_x + splay, 0, half_z + splay], [half_x + splay, 0, -half_z - splay_rear]])  # front, rear
@@ -50,28 +31,38 @@ def legs(
     part = join(post(f, h + [0, 0.01, 0], outline, profile).both_sides() for f, h in zip(foot, head, strict=True))
 
     stretchers = draw.pick({"none": 3, "H": 1, "box": 1, "sides": 0.7, "X": 0.4})
-    t, thick, mirror = draw(0.15, 0.5), 0.55 * size, np.array([-1.0, 1.0, 1.0])
+    t, thick = draw(0.15, 0.5), 0.55 * size
     front, rear = foot + t * (head - foot)
     if stretchers in ("H", "box", "sides"):
         part += bar(front, rear, thick).both_sides()
     if stretchers == "H":
-        middle = 0.5 * (front + rear)
-        part += bar(middle, middle * mirror, thick)
+        part += crossbar(0.5 * (front + rear), thick)
     if stretchers == "box":
         t = t if draw.maybe(0.5) else min(t + 0.12, 0.6)
-        part += join(bar(end, end * mirror, thick) for end in foot + t * (head - foot))
+        part += join(crossbar(end, thick) for end in foot + t * (head - foot))
     if stretchers == "X":
-        part += bar(front, rear * mirror, thick, thick, side=(0, 1, 0)).both_sides()
+        part += bar(front, rear * [-1, 1, 1], thick, thick, side=(0, 1, 0)).both_sides()
     if draw.maybe(0.45) and splay < 0.1 * height and not plain:
         part += apron(half_x, half_z, height, draw(0.04, 0.09), 0.5 * size)
     return part
 
 
-def _hairpin_legs(half_x: float, half_z: float, height: float, splay: float) -> Part:
-    foot, level = (half_x + splay, 0.006, half_z + splay), height + 0.01
-    leg = bar(foot, (half_x - 0.1, level, half_z), 0.013) + bar(foot, (half_x, level, half_z - 0.1), 0.013)
-    plate = between((-half_x - 0.01, height - 0.012, -half_z), (half_x + 0.01, height + 0.005, half_z))
-    return leg.four_corners() + plate
+def _leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
+    """The profile [(height, scale)] of a leg, 0 = floor, 1 = top, and whether the leg is turned (round)."""
+    kind = draw.pick({"straight": 2, "tapered": 3, "turned": 1.5, "baluster": 1, "stepped": 0.7})
+    if kind == "straight":
+        return [(0, 1), (1, 1)], False
+    if kind == "tapered":
+        return [(0, draw(0.45, 0.8)), (draw(0.6, 0.95), 1), (1, 1)], False
+    if kind == "stepped":
+        waist = draw(0.5, 0.75)
+        return [(0, 1), (0.1, 1), (0.13, waist), (0.68, waist), (0.72, 1), (1, 1)], False
+    if kind == "baluster":
+        swell = [(draw(0.25, 0.5), 1.25), (0.75, 0.7), (0.82, 1.1), (0.88, 0.8)]
+        return [(0, 0.55), (0.06, 0.75), (0.1, 0.5), *swell, (1, 1)], True
+    a, b = draw(0.2, 0.35), draw(0.55, 0.75)
+    turned = [(a - 0.08, 0.7), (a, 1.05), (a + 0.08, 0.65), (b, 1.2), (b + 0.08, 0.7)]
+    return [(0, 0.5), *turned, (0.92, 1.1), (1, 1)], True
 
 
 def apron(half_x: float, half_z: float, top: float, depth: float, thickness: float) -> Part:
@@ -119,26 +110,23 @@ def star(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
 def disc(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     """A column on a flat, domed or trumpet-shaped (tulip) foot."""
     reach = draw(0.8, 1.15) * min(half_x, half_z)
-    thick = draw(0.02, 0.045) * (1 + height)
+    thick, t = draw(0.02, 0.045) * (1 + height), np.linspace(0, 1, 9)
     kind = draw.pick(("disc", "tulip", "dome", "cone"))
     if kind == "disc":
         profile = [(reach, 0), (reach, 0.02), (reach - 0.015, 0.03), (thick, 0.035), (thick, height + 0.01)]
     elif kind == "cone":
         profile = [(reach, 0), (reach, 0.012), (draw(0.6, 1) * thick, height + 0.01)]
     else:
-        t = np.linspace(0, 1, 9)
-        flare = 0.45 * draw(0.5, 1.2) * reach * np.exp(-(1 - t) * 5)
-        radius = thick + (reach - thick) * np.exp(-(9.0 if kind == "dome" else 3.5) * t)
-        radius = radius + (flare if kind == "tulip" else 0)
+        flare = 0.45 * draw(0.5, 1.2) * reach * np.exp(-(1 - t) * 5) * (kind == "tulip")
+        radius = thick + (reach - thick) * np.exp(-(9.0 if kind == "dome" else 3.5) * t) + flare
         profile = [(reach, 0.0), *zip(radius, 0.012 + t * (height - 0.002), strict=True)]
     part = revolve(profile, 20)
     if kind in ("disc", "dome"):
         part += slab(ellipse(1.2 * half_x, 1.2 * half_z, 16), 0.025).moved(y=height - 0.02)
     if height > 0.55 and draw.maybe(0.6):  # a foot ring
-        angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-        x, y, z = 0.75 * reach * np.cos(angle), np.full(20, 0.35 * height), 0.75 * reach * np.sin(angle)
-        part += tube(np.stack([x, y, z], 1), 0.012, closed=True)
-        part += bar((-0.75 * reach, 0.35 * height, 0), (0.75 * reach, 0.35 * height, 0), 0.02)
+        radius, y, angle = 0.75 * reach, 0.35 * height, np.linspace(0, 2 * np.pi, 20, endpoint=False)
+        part += tube(points(radius * np.cos(angle), y, radius * np.sin(angle)), 0.012, closed=True)
+        part += crossbar((-radius, y, 0), 0.02)
     return part
 
 
@@ -152,10 +140,8 @@ def loops(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     section = rectangle(1.5 * size, size, segments=1) if flat else ellipse(size, size, 8)
     path = rounded_path(path, 0.012 if flat else draw(0.02, 0.09), 3, closed=True)
     part = tube(path, 1.0, section, closed=True, side=(1, 0, 0)).both_sides()
-    part += join(bar((-half_x, high, z), (half_x, high, z), size) for z in (0.75 * half_z, -0.75 * half_z))
-    if draw.maybe(0.3):
-        part += bar((-foot_x, low, -rear + 0.03), (foot_x, low, -rear + 0.03), size)
-    return part
+    part += join(crossbar((-half_x, high, z), size) for z in (0.75 * half_z, -0.75 * half_z))
+    return part + (crossbar((-foot_x, low, -rear + 0.03), size) if draw.maybe(0.3) else Part())
 
 
 def cantilever(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
@@ -164,15 +150,14 @@ def cantilever(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     low, high, reach = size / 2, height - 0.3 * size, half_z * draw(0.9, 1.15)
     front = half_z + draw(-0.05, 0.08)
     side = [(half_x, high, -half_z), (half_x, high, half_z), (half_x, low, front), (half_x, low, -reach)]
-    path = rounded_path([*side, *((-x, y, z) for x, y, z in side[::-1])], draw(0.05, 0.1), 4)
-    bars = join(bar((-half_x, high, z), (half_x, high, z), size) for z in (-0.8 * half_z, 0.6 * half_z))
+    path = rounded_path([*side, *((-x, y, z) for x, y, z in side[::-1])], draw(0.05, 0.1))
+    bars = join(crossbar((-half_x, high, z), size) for z in (-0.8 * half_z, 0.6 * half_z))
     return tube(path, size / 2, side=(1, 0, 0)) + bars
 
 
 def cross(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     """Legs that cross like scissors, at the sides (folding chair) or at front and rear, joined by bars."""
-    size, deep = draw(0.022, 0.035), draw(1.2, 1.8)
-    at_sides = draw.maybe(0.6)
+    size, deep, at_sides = draw(0.022, 0.035), draw(1.2, 1.8), draw.maybe(0.6)
     x, z = (half_x, half_z) if at_sides else (half_z, half_x)
     part = Part()
     for s in (-1, 1):
@@ -180,8 +165,8 @@ def cross(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
         foot, head = (outer, 0.012, s * z * 1.1), (outer, height, -s * z)
         part += bar(foot, head, size, deep * size, side=(1, 0, 0)).both_sides()
         for y, along in ((0.12 * height, s * z * 0.84), (height - 0.015, -s * z)):
-            part += bar((-outer, y, along), (outer, y, along), 0.9 * size)
-    part += bar((-x, height / 2, 0), (x, height / 2, 0), 0.9 * size)
+            part += crossbar((-outer, y, along), 0.9 * size)
+    part += crossbar((-x, height / 2, 0), 0.9 * size)
     return part if at_sides else part.rotated("y", 90)
 
 
@@ -201,20 +186,10 @@ def rocker(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
     size, radius, reach = draw(0.025, 0.04), draw(0.8, 1.4), draw(1.35, 1.9) * half_z
     z = np.linspace(reach * 0.95, -reach * 1.15, 13)
     y = radius - np.sqrt(radius**2 - z**2) + size / 2
-    runner = np.stack([np.full(13, half_x + 0.02), y, z], 1)
-    part = tube(runner, 1.0, rectangle(size, 1.2 * size, segments=1), side=(1, 0, 0)).both_sides()
-    for s in (-1, 1):
-        foot = (half_x + 0.02, np.interp(s * half_z * 1.08, z[::-1], y[::-1]), s * half_z * 1.08)
-        head = (half_x, height + 0.01, s * half_z)
-        part += post(foot, head, ellipse(size, size, 8), [(0, 0.8), (1, 1)]).both_sides()
-        rung = (half_x + 0.01, 0.4 * height, foot[2] + 0.4 * (head[2] - foot[2]))
-        part += bar(rung * np.array([-1, 1, 1]), rung, 0.6 * size)
+    x, section = half_x + 0.02, rectangle(size, 1.2 * size, segments=1)
+    part = tube(points(x, y, z), 1.0, section, side=(1, 0, 0)).both_sides()
+    for end in (-half_z, half_z):
+        foot = (x, np.interp(end * 1.08, z[::-1], y[::-1]), end * 1.08)
+        part += post(foot, (half_x, height + 0.01, end), ellipse(size, size, 8), [(0, 0.8), (1, 1)]).both_sides()
+        part += crossbar((-half_x - 0.01, 0.4 * height, foot[2] + 0.4 * (end - foot[2])), 0.6 * size)
     return part
-
-
-_KINDS = {make.__name__: make for make in (legs, star, disc, loops, cantilever, cross, panels, rocker)}
-
-
-def support(draw: Draw, kind: str, half_x: float, half_z: float, height: float) -> Part:
-    """A support of one of the kinds legs, star, disc, loops, cantilever, cross, panels, rocker."""
-    return _KINDS[kind](draw, half_x, half_z, height)

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from .draw import Draw
-from .parts import Part, bar, between, ellipse, inset, join, rectangle, revolve, rounded_path, slab, tube
-from .supports import apron, legs, support
+from .draw import Draw, ellipse, inset, rectangle, rounded_path
+from .parts import Part, bar, between, crossbar, join, revolve, slab, tube
+from .supports import apron, cross, disc, legs, loops, panels, star
 
 
 def _size(draw: Draw) -> tuple[float, float, float]:
@@ -42,9 +42,9 @@ def table_with_legs(draw: Draw) -> Part:
         "superellipse": (ellipse(length, width, 32, 3.5), 0.74),
     }[draw.pick({"rectangle": 4, "rounded": 2, "oval": 1.5, "superellipse": 1})]
     top, under = _top(draw, outline, height)
-    kind = draw.pick({"legs": 4, "loops": 1, "panels": 1, "cross": 0.7})
-    if kind != "legs":
-        return top + support(draw, kind, 0.45 * reach * length, 0.45 * reach * width, under)
+    support = draw.pick({legs: 4, loops: 1, panels: 1, cross: 0.7})
+    if support is not legs:
+        return top + support(draw, 0.45 * reach * length, 0.45 * reach * width, under)
     size = draw(0.035, 0.11) * (0.5 + 0.35 * length)
     half_x, half_z = reach * length / 2 - 0.6 * size, reach * width / 2 - 0.6 * size
     table = top + legs(draw, half_x, half_z, under, size)
@@ -73,9 +73,9 @@ def pedestal_table(draw: Draw) -> Part:
 
 def _pedestal(draw: Draw, reach: float, under: float) -> Part:
     """A disc, a star, an hourglass, a block on a plate, or a column on curved feet; about the y axis."""
-    kind = draw.pick({"disc": 1, "star": 1, "hourglass": 1, "block": 1, "claw": 2})
-    if kind in ("disc", "star"):
-        return support(draw, kind, reach, reach, under)
+    kind = draw.pick({disc: 1, star: 1, "hourglass": 1, "block": 1, "claw": 2})
+    if kind in (disc, star):
+        return kind(draw, reach, reach, under)
     t = np.linspace(0, 1, 13)
     if kind == "hourglass":
         waist = draw(0.2, 0.6)
@@ -115,7 +115,7 @@ def trestle_table(draw: Draw) -> Part:
     if kind == "A":
         half = deep + beam / under * (upper - deep)
         trestle += bar((x, beam, -half), (x, beam, half), 0.8 * size, size)
-    return top + trestle.both_sides() + bar((-x, beam, 0), (x, beam, 0), 0.8 * size, 1.3 * size)
+    return top + trestle.both_sides() + crossbar((-x, beam, 0), 0.8 * size, 1.3 * size)
 
 
 def desk(draw: Draw) -> Part:
