@@ -1,16 +1,7 @@
 #!/usr/bin/env bash
 # Checks the kernels (csrc/) without Python, in separate builds under build/native. Usage: bash tools/check_native.sh CHECK [ARGUMENTS]
-#   tests         the C++ tests, the fuzz target on its stored inputs, and whether each instruction set gives the same bits
-#   asan          the same under AddressSanitizer and UndefinedBehaviorSanitizer (CXX: g++ or clang++)
-#   tsan          the same under ThreadSanitizer, with a small OpenMP replacement that it understands (g++)
-#   fuzz SECONDS  libFuzzer (clang++), which looks for new code; findings: build/native/fuzz/finding-*; inputs: build/native/corpus
-#   keep          adds to tests/csrc/corpus.hex the inputs that reach new code
-#   count         instructions of the kernels under callgrind, compared with tests/csrc/instructions.json; --store: new bounds
-#   count-base    the same without AVX
-#   variants      whether every available compiler and instruction set gives the same bits
-#   coverage      coverage of csrc/ by the C++ tests (lines and branches)
-# Exit status 77: a tool that the check needs is missing; a message names it. PYTHON: an interpreter that has cmeel-eigen
-# and gcovr; default .venv/bin/python.
+# CHECK: tests, asan, tsan, fuzz SECONDS, keep, count, count-base, variants or coverage (docs/contributing.md). Exit status 77: a
+# tool is missing. PYTHON: an interpreter that has cmeel-eigen and gcovr; default .venv/bin/python.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -20,10 +11,8 @@ export OMP_WAIT_POLICY=passive # there may be more threads than cores: do not sp
 sanitize="-O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -DNMR_FRESH_SCRATCH"
 address="$sanitize -fsanitize=address,undefined,float-cast-overflow -D_GLIBCXX_ASSERTIONS"
 
-want() { # programs that the check needs
-    for program; do
-        command -v "$program" >/dev/null || { echo "skipped: the check needs $program, which is not installed"; exit 77; }
-    done
+want() { # program that the check needs
+    command -v "$1" >/dev/null || { echo "skipped: the check needs $1, which is not installed"; exit 77; }
 }
 
 build() { # name, compiler, flags, targets, further cmake arguments
@@ -84,7 +73,7 @@ check_variants() { # on x86-64
     for variant in g++ "g++ -DNMR_NO_VECTOR_TYPES" "g++ -DNMR_MULTIVERSION" "g++ -march=x86-64-v3" "g++ -march=x86-64-v4" \
         clang++ "clang++ -march=x86-64-v3" "clang++ -march=x86-64-v4" aarch64-linux-gnu-g++; do
         read -r compiler flags <<<"$variant"
-        name=${variant// /_} run=()
+        name=${variant//[ =]/_} run=()
         [[ $compiler != aarch64* ]] || run=(qemu-aarch64 -L /usr/aarch64-linux-gnu)
         type "$compiler" "${run[@]:0:1}" >/dev/null 2>&1 || { echo "$variant: not installed, left out"; continue; }
         [[ $flags != *v4 ]] || grep -q avx512vl /proc/cpuinfo || { echo "$variant: no AVX-512 here, left out"; continue; }
@@ -105,5 +94,5 @@ check_coverage() {
 
 mkdir -p build/native
 check=check_${1:-none}
-declare -F "$check" >/dev/null || { sed -n '2,13s/^# \{0,1\}//p' "$0"; exit 2; }
+declare -F "$check" >/dev/null || { sed -n '2,4s/^# \{0,1\}//p' "$0"; exit 2; }
 "$check" "${@:2}"

@@ -27,7 +27,7 @@ DataFolder = tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Command:
-    """Base class of all commands; they become frozen dataclasses."""
+    """Base class of commands, which become frozen dataclasses. `run` does the work and may return an exit status."""
 
     def __init_subclass__(cls) -> None:
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
@@ -61,10 +61,6 @@ class Command:
         options = _options(cls, defaults)
         fields = [(n, tyro.conf.Suppress[hint] if brief and rare else hint, field) for n, hint, field, rare in options]
         return dataclasses.make_dataclass(cls.__name__, fields, kw_only=True)
-
-    def run(self) -> int | None:
-        """Do the work; returns the exit status if that is not 0."""
-        raise NotImplementedError
 
     def given(self, *names: str) -> dict[str, Any]:
         """Those of the options that differ from their defaults, by name."""

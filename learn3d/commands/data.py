@@ -14,7 +14,7 @@ from learn3d.data import shards
 from learn3d.data.categories import synset_of
 from learn3d.data.checking import check_folder
 from learn3d.data.conventions import IMAGE_SIZE
-from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
+from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
@@ -134,9 +134,8 @@ class ConvertDataset(Command):
                 if shards.holds(self.output, category, split):
                     say(f"{folder}: exists; remove it to convert it again")
                     continue
-                options = {"image_size": self.image_size} if "image_size" in LAYOUTS[self.layout].options else {}
-                options["views_per_object"] = self.views_per_object if split == "train" else None
-                dataset = load_dataset(self.layout, self.data, category, split, **options)
+                few = {"views_per_object": self.views_per_object} if split == "train" else {}
+                dataset = load_dataset(self.layout, self.data, category, split, image_size=self.image_size, **few)
                 shards.remove(folder)  # an unfinished conversion
                 count = shards.write_set(folder, self.layout, dataset)
                 say(f"{folder}: {len(dataset)} images of {dataset.num_objects} objects in {count} shards")

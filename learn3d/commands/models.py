@@ -12,7 +12,7 @@ from learn3d.experiments.measurement import class_means, describe_measures, eval
 from learn3d.files.writing import check_target, write_json
 from learn3d.reconstruction import cut_out_pictures, load_model, reconstruct_dataset, reconstruct_files
 from learn3d.runs.export import export
-from learn3d.terminal import note, say
+from learn3d.terminal import say
 
 
 class Evaluate(OnDataset):
@@ -39,7 +39,7 @@ class Evaluate(OnDataset):
     def run(self) -> None:
         if self.json is not None:
             check_target(self.json, "--json")
-        results = evaluate_runs(self.runs, report_progress=note, **self.pick("layout", "device"))
+        results = evaluate_runs(self.runs, **self.pick("layout", "device"))
         say(format_table(results))
         if self.json is not None:
             protocol = {"split": self.split, "checkpoint": self.which}
@@ -158,7 +158,7 @@ class Figures(OnDataset):
         check_target(self.output.parent, "--output", folder=True)
         refused = {"grid": (), "interpolation": ("truth",), "tsne": ("images", "indices", "truth")}[self.figure]
         self.refuse(f"the figure {self.figure}", *refused)
-        runs = open_runs(self.runs, report_progress=note, **self.pick("labels"))
+        runs = open_runs(self.runs, **self.pick("labels"))
         paths = getattr(paper, f"save_{self.figure}")(runs, self.output, **self.given("images", "indices", "truth"))
         say("\n".join(map(str, paths)))
 
@@ -187,8 +187,7 @@ class Report(OnDataset):
         from learn3d.pages.report import write_report
 
         check_target(self.output, "--output")
-        options = self.pick("labels", "objects", "indices")
-        size = write_report(self.runs, self.output, report_progress=note, **options)
+        size = write_report(self.runs, self.output, **self.pick("labels", "objects", "indices"))
         say(f"{self.output} ({size / 1e6:.1f} MB)")
 
 

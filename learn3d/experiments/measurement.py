@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -16,7 +16,7 @@ from learn3d.experiments.plan import command_line
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.settings import MOST, Step, split_names
-from learn3d.terminal import align
+from learn3d.terminal import align, note
 
 #: For each measure its header in tables and its definition. Measures are means over images, then over categories.
 MEASURES = {
@@ -101,7 +101,6 @@ def evaluate_runs(
     which: Literal["last", "best"] = "last",
     layout: Layout | None = None,
     device: str = "cpu",
-    report_progress: Callable[[str], None] = lambda text: None,
 ) -> list[Result]:
     """Measure run folders (their checkpoint `which`) or checkpoint files, on each of their categories by itself.
 
@@ -119,15 +118,14 @@ def evaluate_runs(
         method, config, metadata = checkpoint.load_method(file, device=device)
         label = PRESETS[config.preset].label
         for name in split_names(category or config.category):
-            report_progress(f"{file}: {label} ({config.preset}) on {name}, {split}")
+            note(f"{file}: {label} ({config.preset}) on {name}, {split}")
             dataset = checkpoint.load_data(config, split, data=data, category=name, layout=layout)
             evaluation = evaluate(method, dataset, detailed=True)
             means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
             if means["hollow"]:
-                beyond = "of the meshes reach beyond the voxel grid and count as hollow"
-                report_progress(f"warning: {means['hollow']:.1%} {beyond}")
+                note(f"warning: {means['hollow']:.1%} of the meshes reach beyond the voxel grid and count as hollow")
             if means["mmd"] is None:
-                report_progress(f"warning: {NO_MMD}")
+                note(f"warning: {NO_MMD}")
             result = Result(
                 checkpoint=str(file),
                 method=label,

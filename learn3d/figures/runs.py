@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,6 +14,7 @@ from learn3d.methods import Method
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.runs.checkpoint import Metadata
+from learn3d.terminal import note
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,6 @@ def open_runs(
     category: str | None = None,
     split: str = "test",
     which: Literal["last", "best"] = "last",
-    report_progress: Callable[[str], None] = lambda text: None,
 ) -> list[Run]:
     """Open run folders (their checkpoint `which`) or checkpoint files, each with a split of its data.
 
@@ -45,7 +45,7 @@ def open_runs(
         raise ValueError("give at least one run folder or checkpoint to draw")
     loaded, datasets = [], {}
     for path in paths:
-        report_progress(f"opening {path}")
+        note(f"opening {path}")
         method, config, metadata = checkpoint.load_method(path, which)
         if data is not None or category is not None:  # without the poses and views of the training
             own = {"poses": None, "views_per_object": None}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -30,7 +30,7 @@ from learn3d.methods.surfaces import grid_surface
 from learn3d.pictures.sheets import natural_colors
 from learn3d.pictures.surfaces import Surface, azimuths_deg, eyes
 from learn3d.presets import PRESETS
-from learn3d.terminal import plain
+from learn3d.terminal import note, plain
 
 UNIT = 1e-4  # length of 1 in the stored int16 coordinates, which reach 3.3; objects reach 1
 #: Maps row vectors of the object frame to the page's axes, with z up (y is up in mesh files).
@@ -167,7 +167,6 @@ def write_report(
     which: Literal["last", "best"] = "last",
     objects: int = 12,
     indices: Sequence[int] = (),
-    report_progress: Callable[[str], None] = lambda text: None,
 ) -> int:
     """Measure runs on a split as `learn3d evaluate` does, and write the page; returns its size in bytes.
 
@@ -178,14 +177,13 @@ def write_report(
     """
     if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
         raise ValueError(f"the page can show the shapes of 1 to {MOST_SHOWN} images, got {count}")
-    source = {"data": data, "category": category, "split": split, "which": which}
-    runs = open_runs(paths, labels=labels, report_progress=report_progress, **source)
+    runs = open_runs(paths, labels=labels, data=data, category=category, split=split, which=which)
     _check_same_images(runs, data)
     runs[0].dataset.batch(torch.tensor(indices, dtype=torch.int64))  # raises for wrong indices
     logs = [read_metrics(path) if (Path(path) / "metrics.jsonl").is_file() else {} for path in paths]
     results = []
     for run in runs:
-        report_progress(f"measuring {run.label} on {len(run.dataset)} images")
+        note(f"measuring {run.label} on {len(run.dataset)} images")
         results.append(evaluate(run.method, run.dataset))
     page = _fill(runs, results, logs, objects, indices) | {"split": split, "which": which}
     folder = resources.files("learn3d.pages")

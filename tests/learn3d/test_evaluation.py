@@ -211,9 +211,9 @@ def test_mean_mmd_uses_equally_many_codes_of_each_view(monkeypatch) -> None:
     assert mean_mmd(codes, views)["mmd"] == mean_mmd(torch.cat([codes[:3], codes[5:8]]), torch.arange(6) // 3)["mmd"]
 
 
-def test_evaluate_runs_reports_and_tabulates(finished_run) -> None:
-    said: list[str] = []
-    (result,) = evaluate_runs([finished_run], split="test", report_progress=said.append)
+def test_evaluate_runs_reports_and_tabulates(finished_run, capsys) -> None:
+    (result,) = evaluate_runs([finished_run], split="test")
+    said = capsys.readouterr().err.splitlines()
     assert (result.category, result.method, result.step, result.images) == ("airplane", "Proposed", 4, 24)
     ((_, images, iou, _),) = result.objects
     assert (images, iou) == (24, pytest.approx(result.voxel_iou, abs=1e-5))

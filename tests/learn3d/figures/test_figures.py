@@ -288,7 +288,7 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
     output = ("--output", tmp_path / "x")
     for arguments, message in (
         (("grid", "--runs"), "at least one run folder or checkpoint"),
-        (("tsne", "--truth", "--runs", finished_run), "the figure tsne has no --truth"),
+        (("tsne", "--truth", "--runs", finished_run), "--truth does not go with the figure tsne"),
         (("grid", "--runs", tmp_path / "nowhere"), "nowhere"),
         (("grid", "--runs", finished_run, "--labels", "a", "b"), "there are 1 runs but 2 labels"),
         (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),
