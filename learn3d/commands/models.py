@@ -152,14 +152,15 @@ class Figures(OnDataset):
     """Show the ground-truth voxels in a grid as well."""
 
     def run(self) -> None:
-        from learn3d.figures import paper
+        from learn3d.figures import grids, tsne
         from learn3d.figures.runs import open_runs
 
         check_target(self.output.parent, "--output", folder=True)
         refused = {"grid": (), "interpolation": ("truth",), "tsne": ("images", "indices", "truth")}[self.figure]
         self.refuse(f"the figure {self.figure}", *refused)
         runs = open_runs(self.runs, **self.pick("labels"))
-        paths = getattr(paper, f"save_{self.figure}")(runs, self.output, **self.given("images", "indices", "truth"))
+        save = {"grid": grids.save_grid, "interpolation": grids.save_interpolation, "tsne": tsne.save_tsne}[self.figure]
+        paths = save(runs, self.output, **self.given("images", "indices", "truth"))
         say("\n".join(map(str, paths)))
 
 

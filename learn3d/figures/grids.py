@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,9 +12,11 @@ from torch import Tensor
 import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
+from learn3d.evaluation import spread_samples
+from learn3d.figures.runs import Run
 from learn3d.methods import Method
 from learn3d.methods.surfaces import grid_surface
-from learn3d.pictures.sheets import TILE, magnify, natural_colors, tile
+from learn3d.pictures.sheets import TILE, magnify, natural_colors, save_png, tile
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
 
 TURNS_DEG = (0, 60, 120, 180, 240, 300)  # views of a shape, counted from the input's view
@@ -47,22 +50,16 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
 
 
 @torch.no_grad()
-def comparison_grid(
-    methods: Sequence[tuple[str, Method]],
-    dataset: ViewDataset,
-    samples: Tensor,
-    *,
-    truth: bool = False,
-    title: str = "input",
-) -> np.ndarray:
-    """Reconstructions of the same images by several methods, given as (label, method): uint8 [H,W,3].
+def comparison_grid(runs: Sequence[Run], samples: Tensor, *, truth: bool = False, title: str = "input") -> np.ndarray:
+    """Reconstructions of the same images by runs on one data set: uint8 [H,W,3].
 
-    A group of rows per image: the input, and a row per method with its shape from the input's view and from five more
+    A group of rows per image: the input, and a row per run with its shape from the input's view and from five more
     around the object. `title` is above the inputs. All pictures are magnified by the same factor, as far as the shapes
     allow. With `truth` the first row of a group has the true voxels; raises ValueError if there are none.
     """
+    dataset = runs[0].dataset
     batch = dataset.batch(samples)
-    shown = [(label, method.decode(method.encode(batch.images)).surfaces()) for label, method in methods]
+    shown = [(run.label, run.method.decode(run.method.encode(batch.images)).surfaces()) for run in runs]
     if truth:
         if dataset.voxels is None:
             raise ValueError(f"{dataset.category}, {dataset.split} has no true voxels to show")
@@ -83,14 +80,15 @@ def comparison_grid(
 
 
 @torch.no_grad()
-def interpolate(method: Method, dataset: ViewDataset, samples: Tensor, *, title: str = "input") -> np.ndarray:
-    """Shapes between the reconstructions of images, samples int64 [n]: uint8 [H,W,3].
+def interpolate(run: Run, samples: Tensor, *, title: str = "input") -> np.ndarray:
+    """Shapes between a run's reconstructions of images, samples int64 [n]: uint8 [H,W,3].
 
     The first row has the images, each above its reconstruction, and `title` before them. Below it are a row per view of
     (n - 1) * STEPS + 1 shapes, whose codes are interpolated linearly. Raises ValueError for fewer than two images.
     """
     if len(samples) < 2:
         raise ValueError(f"an interpolation takes at least two images, got {len(samples)}")
+    dataset, method = run.dataset, run.method
     batch, pose = dataset.batch(samples), dataset.poses[samples[:1]]
     codes = method.encode(batch.images)
     weights = torch.arange(STEPS, dtype=codes.dtype, device=codes.device)[:, None] / STEPS
@@ -105,3 +103,51 @@ def interpolate(method: Method, dataset: ViewDataset, samples: Tensor, *, title:
     inputs[::STEPS] = magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom)
     titles = [title, *(f"azimuth {azimuth:g}°" for azimuth in AZIMUTHS_DEG)]
     return tile([inputs, *pictures.swapaxes(0, 1)], row_titles=titles)
+
+
+def save_grid(
+    runs: Sequence[Run], output: Path, *, images: int = 6, indices: Sequence[int] = (), truth: bool = False
+) -> list[Path]:
+    """Save a `comparison_grid` for each data set, below each other, as a PNG.
+
+    images, indices: the samples of each data set, see `choose_samples`.
+    """
+    groups: dict[int, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(id(run.dataset), []).append(run)
+    blocks = []
+    for group in groups.values():
+        dataset = group[0].dataset
+        samples, title = choose_samples(dataset, images, indices), dataset.category if len(groups) > 1 else "input"
+        blocks.append(comparison_grid(group, samples, truth=truth, title=title))
+    return _save(blocks, output)
+
+
+def save_interpolation(
+    runs: Sequence[Run], output: Path, *, images: int = 3, indices: Sequence[int] = ()
+) -> list[Path]:
+    """Save the interpolation of each run, below each other, as a PNG. images, indices: see `choose_samples`."""
+    samples = [choose_samples(run.dataset, images, indices) for run in runs]
+    titles = [run.label for run in runs] if len(runs) > 1 else ["input"]
+    return _save([interpolate(*each, title=title) for *each, title in zip(runs, samples, titles, strict=True)], output)
+
+
+def choose_samples(dataset: ViewDataset, count: int, indices: Sequence[int] = ()) -> Tensor:
+    """The samples `indices`, int64; without them `count` samples, of different objects and views if possible.
+
+    Raises ValueError if the data set has fewer.
+    """
+    if indices:
+        return torch.tensor(indices)
+    if not 1 <= count <= len(dataset):
+        raise ValueError(f"the data set has {len(dataset)} images, {count} were asked for")
+    return spread_samples(dataset.object_ids, dataset.view_ids, count)
+
+
+def _save(blocks: Sequence[np.ndarray], output: Path) -> list[Path]:
+    """Save pictures uint8 [h,w,3] below each other, flush left, ten white rows apart."""
+    width = max(block.shape[1] for block in blocks)
+    padded = [np.pad(b, ((0, 10), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks]
+    output.parent.mkdir(parents=True, exist_ok=True)
+    save_png(path := output.with_suffix(".png"), np.concatenate(padded)[:-10])
+    return [path]

@@ -43,7 +43,7 @@ def open_runs(
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to draw")
-    loaded, datasets = [], {}
+    configs, runs, datasets = [], [], {}
     for path in paths:
         note(f"opening {path}")
         method, config, metadata = checkpoint.load_method(path, which)
@@ -54,9 +54,9 @@ def open_runs(
         key += (config.poses, config.views_per_object)
         if key not in datasets:
             datasets[key] = checkpoint.load_data(config, split)
-        loaded.append((config, method, datasets[key], metadata))
-    names = name_runs([config for config, *_ in loaded], paths, labels)
-    return [Run(name, *rest) for name, (_, *rest) in zip(names, loaded, strict=True)]
+        configs.append(config)
+        runs.append((method, datasets[key], metadata))
+    return [Run(name, *run) for name, run in zip(name_runs(configs, paths, labels), runs, strict=True)]
 
 
 def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()) -> list[str]:

@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from sklearn.dummy import DummyClassifier
 from sklearn.manifold import TSNE
-from sklearn.model_selection import GroupKFold
+from sklearn.model_selection import GroupKFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 
 from learn3d.evaluation import spread_samples
@@ -22,8 +22,7 @@ from learn3d.figures.runs import Run
 from learn3d.files import writing
 from learn3d.pictures.surfaces import azimuths_deg
 
-MOST_CODES = 2000  # images in a map
-FEWEST_CODES = 10  # a map of fewer images means nothing
+MOST_CODES, FEWEST_CODES = 2000, 10  # images in a map; one of fewer means nothing
 _styled = mpl.rc_context(  # a decorator: matplotlib's settings change in the decorated functions alone
     {
         "font.size": 9,
@@ -43,21 +42,21 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
     Above each map is how often the view is predicted from a code; a colour wheel is the legend. Raises ValueError for
     data of fewer than 10 images or without poses.
     """
-    side, columns = 3.2, min(4, len(runs))
+    columns = min(4, len(runs))
     rows = -(-len(runs) // columns)
-    figure = Figure(figsize=(side * columns + 1.6, (side + 0.5) * rows))
-    grid = figure.add_gridspec(rows, columns + 1, width_ratios=[side] * columns + [1.3], wspace=0.1, hspace=0.28)
+    figure = Figure(figsize=(3.2 * columns + 1.6, 3.7 * rows))
+    grid = figure.add_gridspec(rows, columns + 1, width_ratios=[3.2] * columns + [1.3], wspace=0.1, hspace=0.28)
     wheel = ListedColormap(cyclic_colors())
     for index, run in enumerate(runs):
         dataset = run.dataset
-        samples = spread_samples(dataset.object_ids, dataset.view_ids, min(MOST_CODES, len(dataset)))
+        samples = spread_samples(dataset.object_ids, dataset.view_ids, MOST_CODES)
         batches = [run.method.encode(dataset.batch(part).images).float().cpu() for part in samples.split(256)]
         codes, rows = torch.cat(batches).numpy(), samples.numpy()
         points, color = embed(codes), wheel(azimuths_deg(dataset.poses)[samples].numpy() / 360 % 1.0)
         order = np.random.default_rng(0).permutation(len(points))  # so that no view covers all others
         size = float(np.clip(7000 / len(points), 4, 16))
         axes = figure.add_subplot(grid[index // columns, index % columns])
-        axes.scatter(*points[order].T, c=color[order], s=size, linewidths=0, rasterized=len(points) > 3000)
+        axes.scatter(*points[order].T, c=color[order], s=size, linewidths=0)
         axes.set(xticks=[], yticks=[])
         axes.set_title(run.label, fontsize=11, pad=18)
         accuracy = view_accuracy(codes, dataset.view_ids[rows], dataset.object_ids[rows])
@@ -67,8 +66,8 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
         axes.spines[:].set_color("#bbbbbb")
     axes = figure.add_subplot(grid[:, -1], projection="polar")
     edges = np.linspace(0, 2 * np.pi, 361)
-    middles = (edges[1:] + edges[:-1]) / 2
-    axes.pcolormesh(edges, [0.58, 1.0], middles[None], cmap=wheel, vmin=0, vmax=2 * np.pi, rasterized=True)
+    middles = (edges[None, 1:] + edges[None, :-1]) / 2
+    axes.pcolormesh(edges, [0.58, 1.0], middles, cmap=wheel, vmin=0, vmax=2 * np.pi, rasterized=True)
     axes.set_theta_zero_location("S")  # seen from above: the camera of azimuth 0 is below, that of 90 to the right
     axes.set(ylim=(0, 1), yticks=[])
     axes.set_thetagrids([0, 90, 180, 270], ["0°", "90°", "180°", "270°"], fontsize=8)
@@ -100,8 +99,7 @@ def view_accuracy(codes: np.ndarray, view_ids: np.ndarray, object_ids: np.ndarra
     folds = list(GroupKFold(min(5, objects)).split(codes, view_ids, object_ids))
     neighbours = min(5, *(len(train) for train, _ in folds))
     models = KNeighborsClassifier(neighbours), DummyClassifier(strategy="most_frequent")
-    right = [[model.fit(codes[a], view_ids[a]).score(codes[b], view_ids[b]) for a, b in folds] for model in models]
-    return tuple(np.average(shares, weights=[len(b) for _, b in folds]) for shares in right)
+    return tuple(np.mean(cross_val_predict(model, codes, view_ids, cv=folds) == view_ids) for model in models)
 
 
 def cyclic_colors(count: int = 256) -> np.ndarray:
@@ -116,8 +114,9 @@ def cyclic_colors(count: int = 256) -> np.ndarray:
 
 
 @_styled
-def save_figure(figure: Figure, output: Path) -> list[Path]:
-    """Write a figure as .png and as .svg, whichever ending `output` has; returns both paths."""
+def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
+    """Save `draw_tsne` as .png and as .svg, whichever ending `output` has; returns both paths."""
+    figure = draw_tsne(runs)
     output.parent.mkdir(parents=True, exist_ok=True)
     written = [output.with_suffix(".png"), output.with_suffix(".svg")]
     for path, options in zip(written, ({"dpi": 160}, {"metadata": {"Date": None}}), strict=True):

@@ -65,13 +65,6 @@ def natural_colors(images: np.ndarray, *, inverted: bool = True) -> np.ndarray:
     return 255 - colors if inverted else colors
 
 
-def stack(blocks: Sequence[np.ndarray], *, gap: int = 0) -> np.ndarray:
-    """Pictures uint8 [h,w,3] below each other, flush left, with `gap` white rows between them."""
-    width = max(block.shape[1] for block in blocks)
-    padded = [np.pad(b, ((0, gap), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks]
-    return np.concatenate(padded)[: -gap or None]
-
-
 def magnify(pictures: np.ndarray, zoom: float) -> np.ndarray:
     """The central part of pictures uint8 [N,h,w,3]: a share 1 / zoom of each side, in fewer pixels."""
     height, width = pictures.shape[1:3]

@@ -27,7 +27,7 @@ from learn3d.runs import checkpoint
 pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
 
-from learn3d.figures import paper, tsne
+from learn3d.figures import tsne
 from learn3d.pages import report
 
 STEP = TILE + MARGIN
@@ -93,9 +93,10 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set, poses) -> No
 
 @pytest.mark.parametrize("truth", [False, True])
 def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth) -> None:
-    samples, methods = torch.tensor([3, 40]), [("large", Ellipsoids()), ("small", GridEllipsoids(0.5))]
-    grid, batch = comparison_grid(methods, tiny_set, samples, truth=truth), tiny_set.batch(samples)
-    shown = [method.decode(method.encode(batch.images)).surfaces() for _, method in methods]
+    samples, methods = torch.tensor([3, 40]), {"large": Ellipsoids(), "small": GridEllipsoids(0.5)}
+    runs, batch = [Run(name, method, tiny_set) for name, method in methods.items()], tiny_set.batch(samples)
+    grid = comparison_grid(runs, samples, truth=truth)
+    shown = [method.decode(method.encode(batch.images)).surfaces() for method in methods.values()]
     if truth:
         shown.insert(0, Grids(tiny_set.convention.to_object(batch.voxels.float())).surfaces())
     poses = [tiny_set.poses[sample[None]] for sample in samples]
@@ -115,13 +116,13 @@ def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth)
 def test_the_truth_must_be_known(tiny_set) -> None:
     blind = dataclasses.replace(tiny_set, voxels=None)
     with pytest.raises(ValueError, match="airplane, test has no true voxels to show"):
-        comparison_grid([("a", Ellipsoids())], blind, torch.tensor([3]), truth=True)
+        comparison_grid([Run("a", Ellipsoids(), blind)], torch.tensor([3]), truth=True)
 
 
 @pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
 def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_set, method) -> None:
     samples = torch.tensor([3, 30, 60])
-    strip, batch = interpolate(method, tiny_set, samples), tiny_set.batch(samples)
+    strip, batch = interpolate(Run("a", method, tiny_set), samples), tiny_set.batch(samples)
     assert strip.shape[0] == 3 * STEP + MARGIN
     codes = method.encode(batch.images)
     way = torch.stack([torch.lerp(codes[k // 4], codes[min(2, k // 4 + 1)], k % 4 / 4) for k in range(9)])
@@ -135,7 +136,7 @@ def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_s
             assert np.abs(shown.astype(int) - views[row]).mean() < 0.1
         assert (cell(strip, 0, column, top=0, columns=9) < 250).any() == (column % 4 == 0)
     with pytest.raises(ValueError, match="at least two images, got 1"):
-        interpolate(method, tiny_set, samples[:1])
+        interpolate(Run("a", method, tiny_set), samples[:1])
 
 
 def write_metrics(folder: Path, records: list[object], tail: str = "") -> Path:
@@ -235,12 +236,12 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set,
     for position, color in zip(scatter.get_offsets(), scatter.get_facecolors(), strict=True):
         (index,) = np.flatnonzero((points == position).all(axis=1))
         assert np.allclose(color[:3], wheel[int(azimuths[index] / 360 * 256)], atol=1e-6)
-    written = paper.save_tsne(runs, tmp_path / "new" / "maps.svg")
+    written = tsne.save_tsne(runs, tmp_path / "new" / "maps.svg")
     assert written == [tmp_path / "new" / "maps.png", tmp_path / "new" / "maps.svg"]
     assert Image.open(written[0]).size > (800, 400)
     text = written[1].read_text()
     assert all(words in text for words in ("$\\bad$", "view told from the code: ", " % (chance 4 %)", "90°"))
-    paper.save_tsne(runs, tmp_path / "again")
+    tsne.save_tsne(runs, tmp_path / "again")
     assert (tmp_path / "again.svg").read_text() == text
 
 
@@ -256,13 +257,13 @@ def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
 def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:
     chairs = dataclasses.replace(tiny_set, category="chair")
     runs = [Run(label, Ellipsoids(), data) for data in (tiny_set, chairs) for label in ("a", "b")]
-    (one,) = paper.save_grid(runs[:2], tmp_path / "one", images=1)
-    (two,) = paper.save_grid(runs, tmp_path / "2", images=1)
+    (one,) = grids.save_grid(runs[:2], tmp_path / "one", images=1)
+    (two,) = grids.save_grid(runs, tmp_path / "2", images=1)
     assert Image.open(two).height == 2 * Image.open(one).height + 10
-    chosen = paper.choose_samples(tiny_set, 3).numpy()
+    chosen = grids.choose_samples(tiny_set, 3).numpy()
     assert len(set(tiny_set.object_ids[chosen])) == len(set(tiny_set.view_ids[chosen])) == 3
     with pytest.raises(ValueError, match="indices must lie in"):
-        paper.save_grid(runs[:1], tmp_path / "four.png", indices=[72])
+        grids.save_grid(runs[:1], tmp_path / "four.png", indices=[72])
 
 
 @pytest.fixture

@@ -22,7 +22,6 @@ from learn3d.pictures.sheets import (
     natural_colors,
     save_gif,
     save_png,
-    stack,
     tile,
 )
 from learn3d.pictures.studio import BACK_LIGHT, photograph, studio_lights
@@ -189,12 +188,6 @@ def test_a_sheet_has_titles_free_places_and_rules() -> None:
     assert (titled[:HEADER] < 128).any() and (titled[HEADER:, :left] < 128).any()
     rule = titled[HEADER + step + MARGIN // 2]
     assert len(np.unique(rule, axis=0)) == 1 and rule[0, 0] not in (0, 255)
-
-
-def test_pictures_are_put_below_each_other() -> None:
-    low, high = np.zeros((10, 30, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
-    both = stack([low, high], gap=4)
-    assert both.shape == (34, 40, 3) and (both[10:14] == 255).all() and (both[14:] == 0).all()
 
 
 def test_png_and_gif_can_be_read_back(tmp_path, egg) -> None:
