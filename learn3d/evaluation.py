@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 import nmr
-from learn3d.data.batch import Batch
 from learn3d.data.conventions import Definition
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
 from learn3d.methods.surfaces import grid_surface

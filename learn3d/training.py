@@ -20,7 +20,7 @@ from learn3d.runs.log import RunLog, check_log
 from learn3d.runs.state import Run, describe_images
 from learn3d.runs.summary import Summary, describe_run
 from learn3d.runs.threads import ThreadTuner
-from learn3d.terminal import is_watched, stop_on_signal
+from learn3d.terminal import stop_on_signal
 from learn3d.validation import draw, validate
 
 
@@ -43,7 +43,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     with run_folder.lock_folder(folder):
         if not resume:
             run_folder.check_can_start(folder, overwrite)
-        train_set, val_set = load_splits(config, progress=is_watched())
+        train_set, val_set = load_splits(config)
         plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
         info = train_set.info(plane, train_set.solidity() if config.settings.wants_solidity else None)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
@@ -96,9 +96,9 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     return Summary.of(config, progress, started)
 
 
-def load_splits(config: TrainConfig, *, progress: bool = False) -> tuple[ViewDataset, ViewDataset]:
-    """The training and the validation split of a run. progress: show a bar if many files are read."""
+def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
+    """The training and the validation split of a run."""
     options = {"image_size": config.settings.image_size, "view_bins": config.view_bins, "poses": config.poses}
     load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)
-    train_set = load("train", views_per_object=config.views_per_object, progress=progress)
+    train_set = load("train", views_per_object=config.views_per_object)
     return train_set, load(config.val_split)

@@ -12,9 +12,8 @@ from tqdm import tqdm
 from learn3d.commands.command import Command, DataFolder, Split
 from learn3d.data import shards
 from learn3d.data.categories import synset_of
-from learn3d.data.checking import check_folder
 from learn3d.data.conventions import IMAGE_SIZE
-from learn3d.data.layouts import Layout, load_dataset
+from learn3d.data.layouts import Layout, check_folder, load_dataset
 from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
@@ -85,7 +84,7 @@ class CheckDataset(Command):
     def run(self) -> int:
         if self.json is not None:
             check_target(self.json, "--json")
-        report = check_folder(self.layout, self.folder, split_names(self.category), self.split, progress=is_watched())
+        report = check_folder(self.layout, self.folder, split_names(self.category), self.split)
         for split in report.splits:
             for problem in split.problems:
                 say(f"{problem.severity}: {problem.path}: {problem.message}")

@@ -1,7 +1,10 @@
-"""The 13 ShapeNet categories of Kato's data set, and the prefixes of their file names."""
+"""The 13 ShapeNet categories of Kato's data set, the splits, and the names of their files."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+SPLITS = ("train", "val", "test")
 SYNSETS = {
     "airplane": "02691156",
     "bench": "02828884",
@@ -25,8 +28,19 @@ def synset_of(category: str) -> str:
 
     Raises ValueError for an empty name or one that cannot be part of a file name.
     """
-    if not isinstance(category, str) or not category or set(category) & set('/\\:*?"<>|\0') or category.startswith("."):
+    forbidden = set('/\\:*?"<>|\0')
+    if not category or not category.isprintable() or set(category) & forbidden or category.startswith("."):
         raise ValueError(f"category must be a plain name such as 'chair' or a synset id, got {category!r}")
-    if not category.isprintable():
-        raise ValueError(f"category must be a plain name, without control characters, got {category!r}")
     return SYNSETS.get(_OTHER_NAMES.get(category, category), category)
+
+
+def find_splits(folder: Path | str, *patterns: str) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder and the splits of each. patterns: paths such as "*/SPLIT.txt"; * is the category."""
+    found = {}
+    for pattern in patterns:
+        for split in SPLITS:
+            before, after = pattern.replace("SPLIT", split).split("*")
+            for path in Path(folder).glob(f"{before}*{after}"):
+                name = path.relative_to(folder).as_posix().removeprefix(before).removesuffix(after)
+                found.setdefault(name, set()).add(split)
+    return {name: tuple(split for split in SPLITS if split in found[name]) for name in sorted(found)}

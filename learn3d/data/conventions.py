@@ -9,7 +9,7 @@ docs/methods/README.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -83,7 +83,11 @@ class LayoutProperties:
     validation: bool = True  # True if there is a split "val"; otherwise networks are validated on "test"
     angles: bool = True  # True if poses have azimuth and elevation, as cells of view classes need
     stretched: bool = False  # True if images are boxes of photographs with background, stretched to squares
-    options: tuple[str, ...] = ()  # options of `load_dataset`, beside view_bins, that the reader takes
+    options: tuple[str, ...] = ()  # those of image_size and views_per_object that the reader takes
+
+    def about(self, category: str, split: str) -> dict[str, Any]:
+        """The fields of a `ViewDataset` that all data sets of the layout share, and its category and split."""
+        return {"category": category, "split": split, "convention": self.convention, "inverted": self.inverted}
 
 
 def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:

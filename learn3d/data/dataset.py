@@ -1,4 +1,4 @@
-"""A data set of any layout: a flat list of views of objects."""
+"""A data set of any layout, a flat list of views of objects, and the batches of it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from learn3d.data.batch import Batch, PoseCandidates
+import nmr
 from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.framing import Crops
-from learn3d.data.poses import LookAtPoses, Poses
+from learn3d.data.poses import LookAtPoses, PoseCandidates, Poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.renderings import MASK_SIZE
 from learn3d.settings import checked
 
-SPLITS = ("train", "val", "test")
 Array = np.ndarray | DiskArray
 
 
@@ -37,6 +36,29 @@ class DatasetInfo:
     mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None if none was found or looked for
     cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None if unknown
     solidity: float | None = None  # result of `ViewDataset.solidity`; None if not computed
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """B views for training or evaluation."""
+
+    images: Tensor  # uint8 [B, 4, S, S]: R, G, B and the mask; input of the encoder
+    masks: Tensor  # float32 [B, 64, 64] in [0, 1]: ground truth silhouettes, row 0 = top
+    poses: Poses | None  # B poses; None if unknown
+    view_ids: Tensor  # int64 [B] in 0 .. K-1: view classes
+    object_ids: Tensor  # int64 [B]: the object in each view, by its number in the split
+    class_ids: Tensor  # int64 [B]: the category of each object; 0 if there is only one
+    voxels: Tensor | None  # bool [B, 32, 32, 32]: ground truth in the data set's axes; None if unknown
+    crops: Crops | None = None  # original images for the augmentation "crop"; None if unknown
+    depth: Tensor | None = None  # float32 [B, 64, 64]: along the optical axis, 0: no surface; None if unknown
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def cameras(self) -> nmr.cameras.Camera:
+        """The B cameras of the images; their poses must be known."""
+        return self.poses.cameras()
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +247,8 @@ class ViewDataset:
         _, starts, sizes = np.unique(self.object_ids[order], return_index=True, return_counts=True)
         if not 1 <= count <= sizes.max(initial=0):
             raise ValueError(f"views_per_object must lie in 1 .. {sizes.max(initial=0)}, got {count}")
+        if sizes.max() == count:
+            return self
         number = np.arange(len(self)) - np.repeat(starts, sizes)
         return self.select(np.sort(order[number < count]))
 

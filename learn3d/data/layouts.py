@@ -1,19 +1,23 @@
-"""Loads data sets by the name of their layout."""
+"""Loads and checks data sets by the name of their layout."""
 
 from __future__ import annotations
 
 import contextlib
 import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from learn3d.data import shards
+from learn3d.data.categories import SPLITS, synset_of
 from learn3d.data.conventions import IMAGE_SIZE, LayoutProperties
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.pose_table import PoseTable
 from learn3d.data.readers import READERS
 from learn3d.data.view_bins import AngleBins
-from learn3d.files.reading import DamagedFile, MissingFile
+from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, Problem
+from learn3d.terminal import align
 
 Layout = Literal[tuple(READERS)]
 LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader in READERS.items()}
@@ -28,10 +32,8 @@ def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str |
     if view_bins is not None:
         AngleBins.parse(view_bins)
         if not LAYOUTS[layout].angles:
-            raise ValueError(
-                f"view_bins {view_bins!r}: cells of azimuth and elevation need look-at cameras, but the poses of the "
-                f"layout {layout!r} are rotations; choose a preset for this layout"
-            )
+            needed = f"need look-at cameras, but the poses of the layout {layout!r} are rotations"
+            raise ValueError(f"view_bins {view_bins!r}: cells of azimuth and elevation {needed}; choose another preset")
 
 
 def require_folder(folder: Path | str) -> None:
@@ -53,7 +55,6 @@ def load_dataset(
     view_bins: str | None = None,
     views_per_object: int | None = None,
     poses: Path | None = None,
-    progress: bool = False,
 ) -> ViewDataset:
     """Read one split ("train", "val" or "test") of one category, or of several joined by commas.
 
@@ -64,7 +65,6 @@ def load_dataset(
     views_per_object: number of views of each object (kar: the first ones; else random, the same ones in every run);
     None: as in the layout's published protocol.
     poses: file of a `PoseTable`, which replaces the poses of the data set.
-    progress: show a progress bar if the layout has many files.
 
     Raises ValueError for an unknown layout, an unsupported option or a damaged file, FileNotFoundError for a missing
     one. Messages name the file.
@@ -74,36 +74,101 @@ def load_dataset(
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
         raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
-    given = {"image_size": image_size, "views_per_object": views_per_object, "progress": progress}
-    options = {name: given[name] for name in LAYOUTS[layout].options}
-    stored = [shards.holds(folder, name, split) for name in names]
-    parts = []
+    options = {"image_size": image_size, "views_per_object": views_per_object}
     try:
-        for name, is_stored in zip(names, stored, strict=True):
-            if is_stored:
-                parts.append(shards.load(folder, name, split, layout=layout, image_size=options.get("image_size")))
-            else:
-                parts.append(READERS[layout].load(folder, name, split, **options))
-        dataset = concatenate(parts)
+        dataset = concatenate([_read_split(layout, folder, name, split, **options) for name in names])
     except (DamagedFile, MissingFile) as error:
-        if others := layouts_in(Path(folder), layout):
+        if others := _other_layouts(folder, layout):
             hint = f"this is a data set of the layout {others[0]!r}, not {layout!r}; give another folder, or train "
-            hint += f"with a preset for it, or with --layout {others[0]}"
-            raise MissingFile(Path(folder), hint) from None
+            raise MissingFile(Path(folder), f"{hint}with a preset for it, or with --layout {others[0]}") from None
         check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
         message = f"{error.message}. To list all faults of the data set, run: {check}"
         raise type(error)(error.path, message) from error
-    if views_per_object is not None and (any(stored) or "views_per_object" not in options):
+    if views_per_object is not None:
         dataset = dataset.with_few_views(views_per_object)
     if poses is not None:
         dataset = PoseTable.read(poses).apply(dataset, str(poses))
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 
 
-def layouts_in(folder: Path, asked: str) -> list[str]:
+def _read_split(
+    layout: str, folder: Path | str, category: str, split: str, findings: Findings = STRICT, **options: Any
+) -> ViewDataset | None:
+    """Read a split of a category from its shards, or with the layout's reader and those of the options that it has."""
+    if shards.holds(folder, category, split):
+        size = options.get("image_size")
+        return shards.load(folder, category, split, layout=layout, image_size=size, findings=findings)
+    known = {name: options[name] for name in LAYOUTS[layout].options if name in options}
+    return READERS[layout].load(folder, category, split, findings=findings, **known)
+
+
+def _other_layouts(folder: Path | str, asked: str) -> list[str]:
     """The layouts of a folder's data sets; [] if `asked` is one of them."""
     found = []
     for layout, reader in READERS.items():
         with contextlib.suppress(ValueError, OSError):  # a list of objects is damaged, or of another layout
             found += [layout] * bool(reader.contents(folder))
     return [] if asked in found else found
+
+
+@dataclass(frozen=True)
+class SplitReport:
+    """Faults of one category and split."""
+
+    category: str
+    split: str
+    objects: int  # number of objects that the files list
+    problems: tuple[Problem, ...]
+
+    def count(self, severity: str) -> int:
+        """Number of the problems that are an "error" or a "warning"."""
+        return sum(problem.severity == severity for problem in self.problems)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Faults of a folder. Errors are faults that `load_dataset` would raise, warnings those that it would accept."""
+
+    layout: str
+    folder: str
+    splits: tuple[SplitReport, ...]
+
+    def count(self, severity: str) -> int:
+        """Number of problems that are an "error" or a "warning"."""
+        return sum(split.count(severity) for split in self.splits)
+
+    def table(self) -> str:
+        """A line per category and split: objects, errors, warnings."""
+        rows = [(s.category, s.split, s.objects, s.count("error"), s.count("warning")) for s in self.splits]
+        return align([("category", "split", "objects", "errors", "warnings"), *(tuple(map(str, row)) for row in rows)])
+
+
+def check_folder(
+    layout: Layout, folder: Path | str, categories: Sequence[str] = (), splits: Sequence[str] = ()
+) -> Report:
+    """Examine all files of the categories and splits of a folder (default: all that it has).
+
+    A missing category or split is an error of the report. Raises ValueError for an unknown layout, FileNotFoundError if
+    the folder does not exist or has nothing of the layout.
+    """
+    check_options(layout)
+    require_folder(folder)
+    found = shards.contents(folder)
+    with contextlib.suppress(*(ValueError, OSError) if found or categories else ()):  # the check finds this fault, too
+        for category, there in READERS[layout].contents(folder).items():
+            found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))
+    if not found and not categories:
+        others = _other_layouts(folder, layout)
+        hint = f"it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else "see its files"
+        raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}; {hint} (docs/data-sets.md)")
+    reports = []
+    for category in categories or found:
+        for split in splits or found.get(category) or found.get(synset_of(category)) or SPLITS:
+            findings = Findings()
+            try:
+                _read_split(layout, folder, category, split, findings)
+            except (ValueError, OSError) as error:
+                path, message = getattr(error, "path", folder), getattr(error, "message", str(error))
+                findings.problems.append(Problem(str(path), message))
+            reports.append(SplitReport(category, split, findings.objects, tuple(dict.fromkeys(findings.problems))))
+    return Report(layout, str(folder), tuple(reports))

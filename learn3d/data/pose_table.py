@@ -14,9 +14,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learn3d.data.batch import PoseCandidates
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.poses import LookAtPoses, wrap_deg
+from learn3d.data.poses import LookAtPoses, PoseCandidates, wrap_deg
 from learn3d.data.readers.photos import view_classes
 from learn3d.files import npz
 from learn3d.files.reading import DamagedFile

@@ -1,4 +1,4 @@
-"""Camera poses of the samples of a data set: look-at poses and rotations."""
+"""Camera poses of the samples of a data set: look-at poses, rotations, and candidates for unknown ones."""
 
 from __future__ import annotations
 
@@ -126,3 +126,27 @@ class RotationPoses(_PoseSet):
 
 
 Poses = LookAtPoses | RotationPoses
+
+
+@dataclass(frozen=True, eq=False)
+class PoseCandidates:
+    """C candidate poses for each of M images. Pose i * C + c is candidate c of image i."""
+
+    poses: LookAtPoses  # M * C poses
+    view_ids: np.ndarray  # int64 [M * C]: their view classes
+    weights: np.ndarray  # float32 [M, C]: probabilities of the candidates; each row sums to 1
+    prior: np.ndarray  # float32 [M, C]: the same before any reweighting
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def draw(self, indices: Tensor, seed: int, step: int) -> tuple[LookAtPoses, Tensor]:
+        """Poses and view classes int64 [B] of the images `indices`: a candidate each, drawn by weights, seed and step.
+
+        So the gradient is an unbiased estimate of that of the expected loss over the candidates, at the cost of one
+        pose.
+        """
+        drawn = np.random.default_rng([seed, step, 2]).random(len(indices))
+        ends = self.weights[indices].cumsum(axis=1)[:, :-1]
+        chosen = indices * self.weights.shape[1] + torch.from_numpy((drawn[:, None] >= ends).sum(axis=1))
+        return self.poses[chosen], torch.from_numpy(self.view_ids[chosen])

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learn3d.data.batch import Batch
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import Batch, ViewDataset
 
 Sampling = Literal["views", "pairs", "groups", "classes"]
 GROUP_SIZE = 5  # views per object of sampling "groups"
@@ -47,7 +46,8 @@ def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1) -> Iter
         for step in range(start, options.iterations + 1):
             batch = dataset.batch(indices, voxels=False, pixels=ahead.result())
             if dataset.candidates is not None:
-                batch = dataset.candidates.draw(batch, indices, options.seed, step)
+                poses, view_ids = dataset.candidates.draw(indices, options.seed, step)
+                batch = dataclasses.replace(batch, poses=poses, view_ids=view_ids)
             if step < options.iterations:
                 indices = sample(step + 1)
                 ahead = reader.submit(dataset.read, indices.numpy())

@@ -33,8 +33,8 @@ from pydantic import Field
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from learn3d.data.categories import synset_of
-from learn3d.data.dataset import SPLITS, ViewDataset, join_datasets
+from learn3d.data.categories import find_splits, synset_of
+from learn3d.data.dataset import ViewDataset, join_datasets
 from learn3d.data.disk_array import CHANGED, MAX_BYTES, ROW, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.data.readers import READERS
@@ -93,10 +93,7 @@ def shard_path(folder: Path, number: int) -> Path:
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories of a folder that are stored as shards, and the splits of each."""
-    found = {}
-    for path in sorted(Path(folder).glob(f"*/*/{SET_FILE}")):
-        found.setdefault(path.parents[1].name, set()).add(path.parent.name)
-    return {category: tuple(s for s in SPLITS if s in splits) for category, splits in found.items()}
+    return find_splits(folder, f"*/SPLIT/{SET_FILE}")
 
 
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
@@ -208,15 +205,12 @@ def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDa
             if not ((tables["sides"] >= 0) & (tables["sides"] <= 1)).all():
                 raise ValueError("sides must lie in 0 .. 1")
             dataset = ViewDataset(
-                category=category,
-                split=split,
+                **READERS[facts.layout].PROPERTIES.about(category, split),
                 poses=poses,
                 view_ids=tables["view_ids"],
                 view_names=tuple(facts.view_names),
                 object_ids=tables["object_ids"],
                 object_names=tuple(names),
-                convention=READERS[facts.layout].PROPERTIES.convention,
-                inverted=READERS[facts.layout].PROPERTIES.inverted,
                 stored_sizes=tables["sides"],
                 **{"voxels": None} | arrays,
             )

@@ -11,8 +11,7 @@ import torch
 from tqdm import tqdm
 
 from learn3d.data import conventions
-from learn3d.data.categories import synset_of
-from learn3d.data.dataset import SPLITS
+from learn3d.data.categories import SPLITS, synset_of
 from learn3d.files.writing import publishing, write_json
 from learn3d.make_data import meshes
 from learn3d.make_data.config import DatasetConfig

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import torch
 
-from learn3d.data.categories import synset_of
-from learn3d.data.dataset import SPLITS
+from learn3d.data.categories import SPLITS, synset_of
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.files.reading import read_json
 from learn3d.files.writing import publishing, write_json

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch
-from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.losses import depth_loss, gaussian_prior_loss
 from learn3d.methods.method import MeshMethod, MeshSettings, check_groups

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch
-from learn3d.data.dataset import MASK_SIZE, DatasetInfo
+from learn3d.data.dataset import MASK_SIZE, Batch, DatasetInfo
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.device import autocast, upload

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 import nmr
-from learn3d.data.batch import Batch
+from learn3d.data.dataset import Batch
 from learn3d.methods.method import MeshMethod, MeshSettings, check_groups
 from learn3d.methods.optimization import SparseGradientAdam
 from learn3d.networks import EncoderName, GeneratorName

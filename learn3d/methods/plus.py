@@ -11,8 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.data.batch import Batch
-from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.losses import silhouette_energy_distance
 from learn3d.methods.optimization import adam
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings

@@ -8,8 +8,7 @@ from typing import Literal
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch
-from learn3d.data.dataset import DatasetInfo
+from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.device import upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod, MeshSettings, is_compact

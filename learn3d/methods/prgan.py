@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from learn3d.data.batch import Batch
+from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast, upload
 from learn3d.methods.method import Method, MethodSettings

@@ -16,8 +16,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch
-from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.poses import Poses
 from learn3d.device import upload
 from learn3d.losses import silhouette_pyramid_loss

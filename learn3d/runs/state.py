@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
-from learn3d.data.batch import PoseCandidates
 from learn3d.data.dataset import ViewDataset
+from learn3d.data.poses import PoseCandidates
 from learn3d.files import writing
 from learn3d.methods import DatasetInfo, Method
 from learn3d.runs import checkpoint

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 import nmr
-from learn3d.data.checking import check_folder
 from learn3d.data.dataset import ViewDataset
+from learn3d.data.layouts import check_folder
 from learn3d.data.readers import READERS
 from learn3d.files.reading import Problem
 

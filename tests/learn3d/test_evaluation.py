@@ -15,9 +15,8 @@ from vectors import load_vector
 
 import nmr
 from learn3d import evaluation
-from learn3d.data.batch import Batch
 from learn3d.data.conventions import KATO
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.readers.kar import KAR
 from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.data.readers.r2n2 import R2N2

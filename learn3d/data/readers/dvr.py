@@ -22,15 +22,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from learn3d.data.categories import SPLITS, find_splits
 from learn3d.data.conventions import IMAGE_SIZE, KATO, NUM_VIEWS, LayoutProperties, view_poses
-from learn3d.data.dataset import SPLITS, ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
-from learn3d.data.readers.renderings import ObjectFiles, category_folder, check_lists, read_objects
+from learn3d.data.readers.renderings import category_folder, check_lists, read_objects
 from learn3d.files import limits, npz, renderings
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, read_text
 from learn3d.files.sandbox import Call
 
-PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("progress",))
+PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True)
 POINTS = 10_000  # points that are kept of each object's 100,000, which are in random order
 _EYE_TOLERANCE = 0.01  # largest error of a camera position, in units of the object frame
 _MIN_COSINE = 0.9995  # least cosine of the angle between an image axis or a viewing direction and Kato's
@@ -39,53 +40,45 @@ _CAMERAS = "an npz file with world_mat_0 .. world_mat_23, 4x4, from the world to
 _CLOUD = "an npz file with the array 'points' [P, 3]: finite, within the unit cube"
 
 
-def load(
-    folder: Path | str, category: str, split: str, *, progress: bool = False, findings: Findings = STRICT
-) -> ViewDataset | None:
+def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> ViewDataset | None:
     """Read a split; the view classes are Kato's 24 views."""
     root = category_folder(Path(folder), category)
-    lists = {s: read_text(path, limits.TEXT_BYTES, "a list of ids").split() for s, path in _lists(root).items()}
+    paths = {s: path for s in SPLITS if (path := root / f"softras_{s}.lst").is_file()}
     path = root / f"softras_{split}.lst"
-    if split not in lists:
-        raise MissingFile(path, f"is missing; expected a list of ids. Splits here: {', '.join(lists) or 'none'}")
+    if split not in paths:
+        raise MissingFile(path, f"is missing; expected a list of ids. Splits here: {', '.join(paths) or 'none'}")
+    lists = {s: read_text(path, limits.TEXT_BYTES, "a list of ids").split() for s, path in paths.items()}
     ids = check_lists(path, lists, split, findings)
 
-    def files(name: str) -> ObjectFiles:
+    def files(name: str) -> list[Call]:
         images, masks = ([root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)] for part in ("image", "mask"))
-        return ObjectFiles(
-            root / name,
+        return [
             Call(npz.read_several, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
             Call(npz.read, root / name / "pointcloud.npz", ("points", limits.OBJECT_BYTES), _CLOUD),
-            [Call(renderings.read_with_mask, i, (m, IMAGE_SIZE)) for i, m in zip(images, masks, strict=True)],
-        )
+            *(Call(renderings.read_with_mask, i, (m, IMAGE_SIZE)) for i, m in zip(images, masks, strict=True)),
+        ]
 
-    objects = read_objects(ids, files, _build, IMAGE_SIZE, findings, f"{category} {split}" * progress)
+    objects = read_objects(ids, files, _build, IMAGE_SIZE, findings, f"{category} {split}")
     if objects is None:
         return None
-    images = objects.images.reshape(len(ids), NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE)
-    least = min(map(len, objects.shapes))
-    points = np.stack([cloud[:least] for cloud in objects.shapes])
+    images, _, _, clouds = objects
+    images = images.reshape(len(ids), NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE)
+    points = np.stack([cloud[: min(map(len, clouds))] for cloud in clouds])
     return dataclasses.replace(kato.from_arrays(images, None, category, split), object_names=tuple(ids), points=points)
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories (synset ids) of a folder and the splits of each."""
-    roots = sorted(path for path in Path(folder).iterdir() if path.is_dir())
-    return {root.name: tuple(lists) for root in roots if (lists := _lists(root))}
+    return find_splits(folder, "*/softras_SPLIT.lst")
 
 
-def _lists(root: Path) -> dict[str, Path]:
-    paths = {split: root / f"softras_{split}.lst" for split in SPLITS}
-    return {split: path for split, path in paths.items() if path.is_file()}
-
-
-def _build(files: ObjectFiles, cameras: list[np.ndarray], points: np.ndarray) -> tuple[None, np.ndarray]:
-    to_object = _fit_world(files.cameras.path, cameras)
+def _build(path: Path, cameras: list[np.ndarray], cloud: Path, points: np.ndarray) -> tuple[None, np.ndarray]:
+    to_object = _fit_world(path, cameras)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise DamagedFile(files.shape.path, f"has the shape {list(points.shape)}; expected {_CLOUD}")
+        raise DamagedFile(cloud, f"has the shape {list(points.shape)}; expected {_CLOUD}")
     points = points[:POINTS].astype(np.float64)
     if not np.abs(points).max() < 1:
-        raise DamagedFile(files.shape.path, f"has coordinates up to {np.abs(points).max():.3g}; expected {_CLOUD}")
+        raise DamagedFile(cloud, f"has coordinates up to {np.abs(points).max():.3g}; expected {_CLOUD}")
     return None, (points @ to_object.T).astype(np.float32)
 
 

@@ -27,19 +27,17 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.data.categories import synset_of
+from learn3d.data.categories import SPLITS, synset_of
 from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelConvention
-from learn3d.data.dataset import SPLITS, ViewDataset
-from learn3d.data.readers.renderings import ObjectFiles, check_lists, check_poses, join_objects, read_objects
+from learn3d.data.dataset import ViewDataset
+from learn3d.data.readers.renderings import check_lists, check_poses, join_objects, read_objects
 from learn3d.files import formats, limits, renderings
 from learn3d.files.reading import STRICT, DamagedFile, Findings, read_bytes, read_json
 from learn3d.files.sandbox import Call
 
 #: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.
 KAR = VoxelConvention("kar", swap=(1, 3), flip=(1,), kato18_scale=INNER)
-PROPERTIES = LayoutProperties(
-    voxels=True, convention=KAR, inverted=False, options=("image_size", "views_per_object", "progress")
-)
+PROPERTIES = LayoutProperties(voxels=True, convention=KAR, inverted=False, options=("image_size", "views_per_object"))
 NUM_RENDERS = 20
 HALF_FOV_DEG = math.degrees(math.atan(16 / 60))  # 14.9314
 VIEW_BINS = "15x20"  # K = 72
@@ -57,7 +55,6 @@ def load(
     *,
     image_size: int = 64,
     views_per_object: int | None = None,
-    progress: bool = False,
     findings: Findings = STRICT,
 ) -> ViewDataset | None:
     """Read a split. View classes are cells of azimuth and elevation, see `VIEW_BINS`.
@@ -78,18 +75,20 @@ def load(
     if views_per_object is None and (split != "train" or not findings.strict):
         views = findings.attempt(_rows, root / ids[0] / "view.txt") or NUM_RENDERS
 
-    def files(name: str) -> ObjectFiles:
+    def files(name: str) -> list[Call]:
         paths = [(root / name / f"render_{k}.png", root / name / f"depth_{k}.png") for k in range(views)]
         grid = folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat"
-        return ObjectFiles(
-            root / name,
+        return [
             Call(renderings.read_table, root / name / "view.txt", (views, 4, _TABLE), _TABLE),
             Call(formats.read_matlab, grid, ("Volume", VOXEL_SIZE)),
-            [Call(renderings.read_with_depth, path, (depth, image_size), "a rendering") for path, depth in paths],
-        )
+            *(Call(renderings.read_with_depth, path, (depth, image_size), "a rendering") for path, depth in paths),
+        ]
 
-    objects = read_objects(ids, files, _build, image_size, findings, f"{category} {split}" * progress)
-    return join_objects(objects, ids, category, split, HALF_FOV_DEG, VIEW_BINS, KAR)
+    def build(path: Path, table: np.ndarray, _: Path, volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return check_poses(path, table[:, [0, 1, 3]], _TABLE), volume
+
+    objects = read_objects(ids, files, build, image_size, findings, f"{category} {split}")
+    return objects and join_objects(*objects, ids, category, split, PROPERTIES, HALF_FOV_DEG, VIEW_BINS)
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -105,10 +104,12 @@ def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     """Read splits.json of a folder: synset -> split -> ids. Raises MissingFile and DamagedFile."""
     path = folder / "splits.json"
     lists = read_json(path, limits.JSON_BYTES, _LISTS)
-    for entry in lists.values() if isinstance(lists, dict) else [None]:
-        named = [entry.get(split, []) for split in SPLITS] if isinstance(entry, dict) else [None]
-        if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named):
-            raise DamagedFile(path, f"has another structure; expected {_LISTS}")
+    try:
+        named = [entry.get(split, []) for entry in lists.values() for split in SPLITS]
+    except AttributeError:  # a list, a number ...
+        named = [None]
+    if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named):
+        raise DamagedFile(path, f"has another structure; expected {_LISTS}")
     return lists
 
 
@@ -116,7 +117,3 @@ def _rows(path: Path) -> int:
     """Number of rows of a table, or 20 if it has more."""
     lines = read_bytes(path, limits.TABLE_BYTES, _TABLE).splitlines()
     return min(NUM_RENDERS, sum(bool(line.strip()) for line in lines))
-
-
-def _build(files: ObjectFiles, table: np.ndarray, volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return check_poses(files.cameras.path, table[:, [0, 1, 3]], _TABLE), volume

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learn3d.data.categories import SYNSETS, synset_of
+from learn3d.data.categories import SYNSETS, find_splits, synset_of
 from learn3d.data.conventions import (
     AZIMUTH_STEP_DEG,
     IMAGE_SIZE,
@@ -25,7 +25,7 @@ from learn3d.data.conventions import (
     LayoutProperties,
     view_poses,
 )
-from learn3d.data.dataset import SPLITS, ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.files import npz
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile
 from learn3d.files.sandbox import read
@@ -48,9 +48,9 @@ def split_paths(folder: Path | str, category: str, split: str) -> tuple[Path, Pa
 def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> ViewDataset | None:
     """Read a split. Sample `object * 24 + view` is one view of one object; the view classes are the 24 views."""
     paths = split_paths(folder, category, split)
-    images = findings.attempt(_read, paths[0], "images", category, split, None)
+    images = findings.attempt(_read, paths[0], "images", None)
     # Grids are mostly zeros, so their compression ratio is no sign of a zip bomb: the number of images bounds them.
-    voxels = findings.attempt(_read, paths[1], "voxels", category, split, None if images is None else len(images))
+    voxels = findings.attempt(_read, paths[1], "voxels", None if images is None else len(images))
     if images is None or voxels is None:
         return None
     if not findings.strict:
@@ -70,8 +70,7 @@ def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, sp
     count = len(images)
     view_ids = np.tile(np.arange(NUM_VIEWS), count)
     return ViewDataset(
-        category=category,
-        split=split,
+        **PROPERTIES.about(category, split),
         images=images.reshape(count * NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE),
         poses=view_poses(torch.from_numpy(view_ids)),
         view_ids=view_ids,
@@ -79,32 +78,22 @@ def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, sp
         object_ids=np.repeat(np.arange(count), NUM_VIEWS),
         object_names=tuple(f"{i:04d}" for i in range(count)),
         voxels=voxels,
-        convention=KATO,
-        inverted=PROPERTIES.inverted,
     )
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories (synset ids or prefixes) of a folder and the splits of each, by the names of its files."""
-    found: dict[str, set[str]] = {}
-    for kind in _ARRAYS:
-        for path in Path(folder).glob(f"*_{kind}.npz"):
-            prefix, _, split = path.name.removesuffix(f"_{kind}.npz").rpartition("_")
-            if prefix and split in SPLITS:
-                found.setdefault(prefix, set()).add(split)
-    return {prefix: tuple(s for s in SPLITS if s in splits) for prefix, splits in sorted(found.items())}
+    return find_splits(folder, *(f"*_SPLIT_{kind}.npz" for kind in _ARRAYS))
 
 
-def _read(path: Path, kind: str, category: str, split: str, count: int | None) -> np.ndarray:
+def _read(path: Path, kind: str, count: int | None) -> np.ndarray:
     """The array of one file. count: largest number of objects; None if unknown."""
     if not path.is_file():
         names = {synset: name for name, synset in SYNSETS.items()}
         there = [f"{names.get(prefix, prefix)} {s}" for prefix, splits in contents(path.parent).items() for s in splits]
-        raise MissingFile(
-            path,
-            f"is missing ({category}, {split}): a split is two files, *_images.npz and *_voxels.npz. The folder holds: "
-            f"{', '.join(there) or 'none'}. Choose one of these, or make it (learn3d make-dataset)",
-        )
+        missing = "is missing: a split is two files, *_images.npz and *_voxels.npz. The folder holds: "
+        missing += f"{', '.join(there) or 'none'}. Choose one of these, or make it (learn3d make-dataset)"
+        raise MissingFile(path, missing)
     dtype, shape = _ARRAYS[kind]
     wanted = f"an npz file with {dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}' and no pickled objects"
     max_bytes = None if count is None else count * math.prod(shape) * dtype.itemsize

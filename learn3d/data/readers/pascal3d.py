@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from learn3d.data.categories import find_splits
 from learn3d.data.conventions import VOXEL_SIZE, LayoutProperties, VoxelConvention
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import SMALLEST, Crops, bounds
@@ -53,16 +54,6 @@ _SHAPES = {  # other arrays -> shape of an item
 _ROTATION_BYTES = 200_000 * 72  # largest size of a file's rotations; Pascal3D+ has 5,000 photographs
 
 
-class _File(NamedTuple):
-    """The contents of one npz file."""
-
-    images: list[np.ndarray]  # N, uint8 [H, W, 3]
-    references: np.ndarray  # uint8 [N, 224, 224, 4]
-    boxes: np.ndarray  # float64 [N, 4]
-    rotations: np.ndarray  # float64 [N, 3, 3]
-    voxels: np.ndarray  # bool [N, 32, 32, 32]
-
-
 def load(
     folder: Path | str, category: str, split: str, *, image_size: int = IMAGE_SIZE, findings: Findings = STRICT
 ) -> ViewDataset | None:
@@ -76,29 +67,27 @@ def load(
     sizes = {key: 8 * int(np.prod(shape)) for key, shape in _SHAPES.items()}
     found = read_all([Call(npz.read_ragged, path, ("images", sizes), _WANTED)] for path in paths)
     files = [findings.attempt(_parse, path, result, findings) for path, (result,) in zip(paths, found, strict=True)]
-    findings.objects = sum(len(file.images) for file in files if file is not None)
+    findings.objects = sum(len(file[0]) for file in files if file is not None)
     if not findings.strict:
         return None
-    references, boxes, rotations, voxels = (np.concatenate(parts) for parts in list(zip(*files, strict=True))[1:])
+    images = [image for file in files for image in file[0]]
+    references, boxes, rotations, voxels = map(np.concatenate, list(zip(*files, strict=True))[1:])
+    masks, rotations = references[..., 3], rotations.astype(np.float64)
     training = rotations
     if split != "train":
         training = np.concatenate([_training_rotations(path) for path in _paths(folder, category, "train")])
     view_ids, view_names = view_classes(rotations, training)
-    crops = Crops.from_images([image for file in files for image in file.images], boxes, image_size)
-    masks = references[..., 3]
+    crops = Crops.from_images(images, boxes, image_size)
     return ViewDataset(
-        category=category,
-        split=split,
+        **PROPERTIES.about(category, split),
         images=np.concatenate([crops.cut(), _nearest(masks, image_size)[:, None]], axis=1),
         masks=_nearest(masks, MASK_SIZE),
         poses=poses(rotations),
         view_ids=view_ids,
         view_names=view_names,
         object_ids=np.arange(len(rotations)),
-        object_names=tuple(f"{p.stem}/{k}" for p, f in zip(paths, files, strict=True) for k in range(len(f.images))),
+        object_names=tuple(f"{p.stem}/{k}" for p, file in zip(paths, files, strict=True) for k in range(len(file[0]))),
         voxels=voxels,
-        convention=PASCAL3D,
-        inverted=False,
         crops=crops,
     )
 
@@ -132,11 +121,8 @@ def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarra
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories of a folder and the splits of each ("test" is val)."""
-    found = {}
-    for name in CATEGORIES:
-        if splits := tuple(s for s in ("train", "val") if any(path.exists() for path in _paths(folder, name, s))):
-            found[name] = splits
-    return found
+    found = find_splits(folder, "*_SPLIT.npz").items()
+    return {name: tuple(s for s in splits if s != "test") for name, splits in found if name in CATEGORIES}
 
 
 def class_name(category: str) -> str:
@@ -153,8 +139,8 @@ def _paths(folder: Path | str, category: str, split: str) -> list[Path]:
     return [Path(folder) / f"{class_name(category)}_{part}.npz" for part in FILES[split]]
 
 
-def _parse(path: Path, found: Any, findings: Findings) -> _File:
-    """Check the arrays of a file."""
+def _parse(path: Path, found: Any, findings: Findings) -> tuple[list[np.ndarray], ...]:
+    """Check the arrays of a file. Returns N images uint8 [H, W, 3] and the arrays of `_SHAPES`."""
     (flat, shapes), *arrays = STRICT.take(found)
     parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]) if shapes else []
     images = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -172,7 +158,7 @@ def _parse(path: Path, found: Any, findings: Findings) -> _File:
         findings.warn(path, f"images_ref[{k}] has an empty mask")
     for k in np.flatnonzero(~voxels.astype(bool).any(axis=(1, 2, 3))):
         findings.warn(path, f"voxels[{k}] is empty")
-    return _File(images, references, boxes.astype(np.float64), rotations.astype(np.float64), voxels > 0)
+    return images, references, boxes, rotations, voxels > 0
 
 
 def _check_image(path: Path, k: int, image: np.ndarray, box: np.ndarray) -> None:
@@ -185,6 +171,8 @@ def _check_image(path: Path, k: int, image: np.ndarray, box: np.ndarray) -> None
 
 
 def _check_rotations(path: Path, rotations: np.ndarray, findings: Findings) -> None:
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
+        raise DamagedFile(path, f"rotation_matrices must be [N, 3, 3], got {list(rotations.shape)}")
     for k, rotation in enumerate(rotations):
         if not np.isfinite(rotation).all() or np.linalg.det(rotation) <= 0:
             findings.take(DamagedFile(path, f"rotation_matrices[{k}] is no rotation: {rotation.round(3).tolist()}"))
@@ -193,8 +181,6 @@ def _check_rotations(path: Path, rotations: np.ndarray, findings: Findings) -> N
 def _training_rotations(path: Path) -> np.ndarray:
     """Read only the rotations of a file: float64 [N, 3, 3]."""
     rotations = read(npz.read, path, "rotation_matrices", _ROTATION_BYTES, wanted=_WANTED)
-    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
-        raise DamagedFile(path, f"rotation_matrices must be [N, 3, 3], got {list(rotations.shape)}")
     _check_rotations(path, rotations, STRICT)
     return rotations.astype(np.float64)
 

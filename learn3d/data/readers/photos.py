@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import math
@@ -23,9 +24,9 @@ from pydantic import Field
 from tqdm import tqdm
 
 import nmr
-from learn3d.data.categories import synset_of
+from learn3d.data.categories import SPLITS, synset_of
 from learn3d.data.conventions import KATO, LayoutProperties
-from learn3d.data.dataset import MASK_SIZE, SPLITS, ViewDataset
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins, training_classes
@@ -33,8 +34,9 @@ from learn3d.files import limits
 from learn3d.files.reading import STRICT, DamagedFile, Findings, read_text
 from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
+from learn3d.terminal import is_watched
 
-PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("image_size", "progress"))
+PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("image_size",))
 AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
 ELEVATION_WIDTH_DEG = 20
 PHOTOS_PER_CLASS = 8  # smallest mean number of photographs per view class
@@ -63,13 +65,7 @@ class Photo:
 
 
 def load(
-    folder: Path | str,
-    category: str,
-    split: str,
-    *,
-    image_size: int = MASK_SIZE,
-    progress: bool = False,
-    findings: Findings = STRICT,
+    folder: Path | str, category: str, split: str, *, image_size: int = MASK_SIZE, findings: Findings = STRICT
 ) -> ViewDataset | None:
     """Read a split of the photographs in `folder/category`.
 
@@ -89,25 +85,23 @@ def load(
         raise DamagedFile(table, f"has no photograph for {'train' if chosen else split}; it has: {there}")
     read = read_all([Call(read_framed, photo.file, (photo.mask, image_size), "a photograph")] for photo in chosen)
     framed = []
-    for photo, (result,) in zip(chosen, tqdm(read, category, len(chosen), disable=not progress), strict=True):
+    for photo, (result,) in zip(chosen, tqdm(read, category, len(chosen), disable=not is_watched()), strict=True):
         if isinstance(result, Exception):
             result = type(result)(result.path, f"{result.message} ({TABLE}, line {photo.line})")
         elif result.touches_border:
             findings.warn(photo.file, "its object touches the border; parts outside the image count as empty")
         framed.append(findings.take(result))
-    if chosen[0].distance is not None:
-        _check_scales(table, [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None], findings)
-    else:
-        findings.warn(table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks")
-    if not findings.strict:
-        return None
     poses, view_ids, view_names = None, np.zeros(len(chosen), np.int64), ("unknown",)
-    if chosen[0].distance is not None:
+    if chosen[0].distance is None:
+        findings.warn(table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks")
+    else:
+        _check_scales(table, [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None], findings)
         poses = _poses(chosen)
         view_ids, view_names = view_classes(poses, _poses(training))
+    if not findings.strict:
+        return None
     return ViewDataset(
-        category=category,
-        split=split,
+        **PROPERTIES.about(category, split),
         images=np.stack([each.image for each in framed]),
         masks=None if image_size == MASK_SIZE else np.stack([each.mask for each in framed]),
         poses=poses,
@@ -116,8 +110,6 @@ def load(
         object_ids=object_ids,
         object_names=tuple(names.tolist()),
         voxels=None,
-        convention=KATO,
-        inverted=PROPERTIES.inverted,
     )
 
 
@@ -125,11 +117,10 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories of a folder and the splits of each."""
     found = {}
     for table in sorted({path.parent / TABLE for name in (TABLE, "images") for path in Path(folder).glob(f"*/{name}")}):
-        try:
-            splits = set(split_objects(table, read_table(table, Findings())).values())
-        except (ValueError, OSError):  # `load` raises the same fault
-            splits = set()
-        found[table.parent.name] = tuple(name for name in SPLITS if name in splits) or ("train",)
+        splits = {"train"}
+        with contextlib.suppress(ValueError, OSError):  # `load` raises the same fault
+            splits = set(split_objects(table, read_table(table, Findings())).values()) or splits
+        found[table.parent.name] = tuple(name for name in SPLITS if name in splits)
     return found
 
 
@@ -223,14 +214,13 @@ def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
     if any(splits != {None} for splits in given.values()):
         for name, splits in given.items():
             if len(splits) > 1 or None in splits:
-                there = ", ".join(sorted(str(s) for s in splits))
+                there = ", ".join(sorted(map(str, splits)))
                 raise DamagedFile(table, f"object {name!r} must be in one split, got {there}")
-        return {name: next(iter(splits)) for name, splits in given.items()}
+        return {name: splits.pop() for name, splits in given.items()}
     names = sorted(given, key=lambda name: hashlib.sha256(name.encode()).digest())
     if len(names) < 3:
-        raise DamagedFile(
-            table, f"lists {len(names)} objects; train, val and test need 3. Photograph more, or give every row a split"
-        )
+        needed = "train, val and test need 3. Photograph more, or give every row a split"
+        raise DamagedFile(table, f"lists {len(names)} objects; {needed}")
     test, val = (max(1, round(share * len(names))) for share in (TEST_SHARE, VAL_SHARE))
     return {name: "test" if k < test else "val" if k < test + val else "train" for k, name in enumerate(names)}
 

@@ -28,16 +28,14 @@ import numpy as np
 from learn3d.data.categories import synset_of
 from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelConvention
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.readers.renderings import ObjectFiles, category_folder, check_poses, join_objects, read_objects
+from learn3d.data.readers.renderings import category_folder, check_poses, join_objects, read_objects
 from learn3d.files import formats, renderings
 from learn3d.files.reading import STRICT, DamagedFile, Findings
 from learn3d.files.sandbox import Call
 
 #: binvox grids have the axes (-z, y, -x) of the object frame, and span the cube in the header.
 R2N2 = VoxelConvention("r2n2", swap=(1, 3), flip=(1, 3), kato18_scale=INNER)
-PROPERTIES = LayoutProperties(
-    voxels=True, convention=R2N2, inverted=False, validation=False, options=("image_size", "progress")
-)
+PROPERTIES = LayoutProperties(voxels=True, convention=R2N2, inverted=False, validation=False, options=("image_size",))
 NUM_RENDERS = 24
 DISTANCE = 1.75  # distance of the camera at ratio 1
 HALF_FOV_DEG = math.degrees(math.atan(16 / 35))
@@ -47,13 +45,7 @@ _TABLE = "a row per image: azimuth, elevation, yaw, ratio of the distance, field
 
 
 def load(
-    folder: Path | str,
-    category: str,
-    split: str,
-    *,
-    image_size: int = 64,
-    progress: bool = False,
-    findings: Findings = STRICT,
+    folder: Path | str, category: str, split: str, *, image_size: int = 64, findings: Findings = STRICT
 ) -> ViewDataset | None:
     """Read a split, "train" or "test". View classes are cells of azimuth and elevation, see `VIEW_BINS`.
 
@@ -69,17 +61,16 @@ def load(
     if not chosen:
         raise DamagedFile(root, f"holds {len(ids)} objects, which leaves none for {split}; expected at least 2")
 
-    def files(name: str) -> ObjectFiles:
+    def files(name: str) -> list[Call]:
         images, voxels = root / name / "rendering", folder / "ShapeNetVox32" / synset / name / "model.binvox"
-        return ObjectFiles(
-            images,
+        return [
             Call(renderings.read_table, images / "rendering_metadata.txt", (NUM_RENDERS, 5, _TABLE), _TABLE),
             Call(formats.read_binvox, voxels, (VOXEL_SIZE,), "a voxel grid in the binvox format"),
-            [Call(renderings.read_with_alpha, images / f"{k:02d}.png", (image_size,)) for k in range(NUM_RENDERS)],
-        )
+            *(Call(renderings.read_with_alpha, images / f"{k:02d}.png", (image_size,)) for k in range(NUM_RENDERS)),
+        ]
 
-    objects = read_objects(chosen, files, _build, image_size, findings, f"{category} {split}" * progress)
-    return join_objects(objects, chosen, category, split, HALF_FOV_DEG, VIEW_BINS, R2N2)
+    objects = read_objects(chosen, files, _build, image_size, findings, f"{category} {split}")
+    return objects and join_objects(*objects, chosen, category, split, PROPERTIES, HALF_FOV_DEG, VIEW_BINS)
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -87,8 +78,8 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     return {path.name: SPLITS for path in sorted(Path(folder).glob("ShapeNetRendering/*/"))}
 
 
-def _build(files: ObjectFiles, table: np.ndarray, grid: formats.Binvox) -> tuple[np.ndarray, np.ndarray]:
+def _build(path: Path, table: np.ndarray, _: Path, grid: formats.Binvox) -> tuple[np.ndarray, np.ndarray]:
     azimuth, elevation, _, ratio, _ = table.T
-    poses = check_poses(files.cameras.path, np.stack([-azimuth, elevation, DISTANCE * ratio], axis=1), _TABLE)
+    poses = check_poses(path, np.stack([-azimuth, elevation, DISTANCE * ratio], axis=1), _TABLE)
     poses[:, 2] /= grid.scale
     return poses, grid.voxels

@@ -5,120 +5,100 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from learn3d.data.categories import synset_of
-from learn3d.data.conventions import VoxelConvention
+from learn3d.data.conventions import LayoutProperties
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins
 from learn3d.files import limits
 from learn3d.files.reading import DamagedFile, Findings, MissingFile
 from learn3d.files.sandbox import Call, read_all
-
-
-class ObjectFiles(NamedTuple):
-    """The files of one object, as calls of the sandbox."""
-
-    folder: Path  # it must exist
-    cameras: Call
-    shape: Call  # voxels or points
-    views: list[Call]  # each returns an image uint8 [4, S, S], a mask uint8 [64, 64] and the mask's largest value
-
-
-class Objects(NamedTuple):
-    """N objects of V views each, as arrays."""
-
-    images: np.ndarray  # uint8 [N * V, 4, S, S]
-    masks: np.ndarray | None  # uint8 [N * V, 64, 64]; None: the images' fourth channel
-    poses: list[np.ndarray]  # N first results of `build`
-    shapes: list[np.ndarray]  # N second results of `build`
+from learn3d.terminal import is_watched
 
 
 def read_objects(
     names: Sequence[str],
-    files: Callable[[str], ObjectFiles],
-    build: Callable[[ObjectFiles, Any, Any], tuple[Any, np.ndarray]],
+    files: Callable[[str], list[Call]],
+    build: Callable[[Path, Any, Path, Any], tuple[Any, np.ndarray]],
     image_size: int,
     findings: Findings,
-    progress: str = "",
-) -> Objects | None:
-    """Read the objects `names`, all with the same number of views. Returns None if the findings are not strict.
+    title: str,
+) -> tuple[np.ndarray, np.ndarray | None, list[Any], list[np.ndarray]] | None:
+    """Read N objects of V views each: images uint8 [N * V, 4, S, S], masks uint8 [N * V, 64, 64], poses, shapes.
 
-    build: returns the poses and the shape of an object from the results of its calls `cameras` and `shape`, or raises
-    DamagedFile. progress: title of a progress bar; "" for none.
+    The masks are None if they are the images' fourth channel. Returns None if the findings are not strict.
+
+    files: the calls for an object: its cameras, whose folder must exist; its shape (voxels or points); its views, each
+    an image, a mask and the mask's largest value. build: the poses and the shape of an object, from the paths and the
+    content of the first two files; it may raise DamagedFile. title: of the progress bar.
     """
     findings.objects, asked = len(names), deque()
 
-    def calls() -> Iterator[list[Call]]:
-        for each in map(files, names):
-            if findings.attempt(_check_folder, each.folder):
-                asked.append(each)
-                yield [each.cameras, each.shape, *each.views]
+    def groups() -> Iterator[list[Call]]:
+        for calls in map(files, names):
+            if findings.attempt(_require_folder, calls[0].path.parent):
+                asked.append([call.path for call in calls])
+                yield calls
 
-    read = tqdm(read_all(calls()), progress, len(names), disable=not progress, unit="object")
-    count = len(names) * len(files(names[0]).views) if findings.strict else 0
+    count = len(names) * (len(files(names[0])) - 2) if findings.strict else 0
     images, masks = (np.empty((count, *shape), np.uint8) for shape in ((4, image_size, image_size), (MASK_SIZE,) * 2))
     poses, shapes, row = [], [], 0
-    for cameras, shape, *views in read:
-        each = asked.popleft()
-        cameras, shape = findings.take(cameras), findings.take(shape)
-        if cameras is not None and shape is not None and (built := findings.attempt(build, each, cameras, shape)):
-            if not built[1].any():
-                findings.warn(each.shape.path, "the grid is empty")
-            poses.append(built[0])
-            shapes.append(built[1])
-        for call, view in zip(each.views, views, strict=True):
-            if findings.take(view) is None:
-                continue
-            if view[2] < 128:
-                findings.warn(call.path, f"its mask is empty: the brightest of its values 0 .. 255 is {view[2]}")
+    for results in tqdm(read_all(groups()), title, len(names), disable=not is_watched(), unit="object"):
+        (cameras_path, shape_path, *paths), (cameras, shape, *views) = asked.popleft(), map(findings.take, results)
+        if cameras is not None and shape is not None:
+            if built := findings.attempt(build, cameras_path, cameras, shape_path, shape):
+                if not built[1].any():
+                    findings.warn(shape_path, "the grid is empty")
+                poses.append(built[0])
+                shapes.append(built[1])
+        for path, view in zip(paths, views, strict=True):
+            if view is not None and view[2] < 128:
+                findings.warn(path, f"its mask is empty: the brightest of its values 0 .. 255 is {view[2]}")
             if findings.strict:
                 images[row], masks[row] = view[:2]
                 row += 1
-    return Objects(images, None if image_size == MASK_SIZE else masks, poses, shapes) if findings.strict else None
+    return (images, None if image_size == MASK_SIZE else masks, poses, shapes) if findings.strict else None
 
 
-def _check_folder(path: Path) -> bool:
+def _require_folder(path: Path) -> bool:
     if not path.is_dir():
         raise MissingFile(path, "is missing; expected the folder of an object")
     return True
 
 
 def join_objects(
-    objects: Objects | None,
+    images: np.ndarray,
+    masks: np.ndarray | None,
+    poses: list[np.ndarray],
+    voxels: list[np.ndarray],
     names: Sequence[str],
     category: str,
     split: str,
+    properties: LayoutProperties,
     half_fov_deg: float,
     view_bins: str,
-    convention: VoxelConvention,
-) -> ViewDataset | None:
-    """The data set of objects with voxels and look-at poses; None if objects is None. Colours are not inverted.
+) -> ViewDataset:
+    """The data set of the result of `read_objects`, with poses as of `check_poses`.
 
     view_bins: cells of the view classes, see `AngleBins.parse`.
     """
-    if objects is None:
-        return None
-    poses = LookAtPoses(*np.concatenate(objects.poses).T, half_fov_deg)
-    bins = AngleBins.parse(view_bins)
+    cameras, bins = LookAtPoses(*np.concatenate(poses).T, half_fov_deg), AngleBins.parse(view_bins)
     return ViewDataset(
-        category=category,
-        split=split,
-        images=objects.images,
-        poses=poses,
-        view_ids=bins.ids(poses).numpy(),
+        **properties.about(category, split),
+        images=images,
+        masks=masks,
+        poses=cameras,
+        view_ids=bins.ids(cameras).numpy(),
         view_names=tuple(bins.names()),
-        object_ids=np.repeat(np.arange(len(names)), [len(each) for each in objects.poses]),
+        object_ids=np.repeat(np.arange(len(names)), [len(each) for each in poses]),
         object_names=tuple(names),
-        voxels=np.stack(objects.shapes),
-        convention=convention,
-        masks=objects.masks,
-        inverted=False,
+        voxels=np.stack(voxels),
     )
 
 
@@ -126,10 +106,8 @@ def check_poses(path: Path, poses: np.ndarray, wanted: str) -> np.ndarray:
     """Return poses float64 [V, 3] (azimuth, elevation, distance). Raises DamagedFile if one is out of range."""
     sound = LookAtPoses(*torch.from_numpy(poses.T), 15.0).in_range().numpy()
     if not sound.all():
-        k = int(sound.argmin())
-        azimuth, elevation, distance = poses[k]
-        found = f"azimuth {azimuth:g}, elevation {elevation:g} and distance {distance:g}"
-        raise DamagedFile(path, f"row {k} has {found}; expected {wanted}")
+        row = "row {} has azimuth {:g}, elevation {:g} and distance {:g}".format(sound.argmin(), *poses[sound.argmin()])
+        raise DamagedFile(path, f"{row}; expected {wanted}")
     return poses
 
 

@@ -11,8 +11,8 @@ import torch
 
 import nmr
 from learn3d.data import conventions
-from learn3d.data.categories import synset_of
-from learn3d.data.dataset import SPLITS, ViewDataset
+from learn3d.data.categories import SPLITS, synset_of
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer, write_png
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import nmr
-from learn3d.data.categories import synset_of
-from learn3d.data.dataset import DEPTH_REACH, SPLITS
+from learn3d.data.categories import SPLITS, synset_of
+from learn3d.data.dataset import DEPTH_REACH
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers.kar import KAR, read_splits
 from learn3d.data.readers.r2n2 import DISTANCE, HALF_FOV_DEG, R2N2

@@ -12,9 +12,8 @@ import pytest
 from reader_checks import cut_short
 from shapenet_files import CHAIR, write_dvr, write_kar, write_r2n2
 
-from learn3d.data.checking import check_folder
-from learn3d.data.layouts import LAYOUTS, Layout, check_options, load_dataset
-from learn3d.data.readers import READERS
+from learn3d.data.layouts import LAYOUTS, Layout, check_folder, check_options, load_dataset
+from learn3d.data.readers import READERS, renderings
 
 TABLE = "04379243"
 
@@ -64,16 +63,17 @@ def test_a_folder_that_is_not_there_or_of_another_layout_is_named(folders, tmp_p
             load_dataset("dvr", folder, "chair", "test")
 
 
-def test_progress_is_off_unless_asked_for(folders, capsys) -> None:
+def test_progress_is_shown_on_a_terminal_only(folders, capsys, monkeypatch) -> None:
     load_dataset("dvr", folders / "dvr", "chair", "test")
     assert capsys.readouterr().err == ""
-    load_dataset("dvr", folders / "dvr", "chair", "test", progress=True)
+    monkeypatch.setattr(renderings, "is_watched", lambda: True)
+    load_dataset("dvr", folders / "dvr", "chair", "test")
     assert "chair" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_options_of_a_layout(layout) -> None:
-    known = set(inspect.signature(READERS[layout].load).parameters) & {"image_size", "views_per_object", "progress"}
+    known = set(inspect.signature(READERS[layout].load).parameters) & {"image_size", "views_per_object"}
     assert known == set(LAYOUTS[layout].options)
     if "image_size" in known:
         check_options(layout, image_size=224)
@@ -97,7 +97,7 @@ AIRPLANE = "02691156"
 def test_missing_categories_and_splits_are_errors(tiny_folder, tmp_path) -> None:
     report = check_folder("kato", tiny_folder, ["table"], ["train", "test"])
     assert [(s.split, s.objects, s.count("error")) for s in report.splits] == [("train", 0, 2), ("test", 0, 2)]
-    with pytest.raises(FileNotFoundError, match="there is no folder"):
+    with pytest.raises(FileNotFoundError, match="there is no such folder"):
         check_folder("kato", tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match=r"'dvr'; it is .* 'kato': add --layout kato"):
         check_folder("dvr", tiny_folder)

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 import nmr
 from learn3d.config import TrainConfig
-from learn3d.data.checking import check_folder
 from learn3d.data.dataset import concatenate
+from learn3d.data.layouts import check_folder
 from learn3d.data.readers import pascal3d
 from learn3d.data.sampling import augment
 from learn3d.networks.resnet import ResNet18Encoder

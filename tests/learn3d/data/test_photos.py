@@ -16,8 +16,7 @@ from PIL import Image
 
 from learn3d.commands.data import EstimatePoses
 from learn3d.config import TrainConfig
-from learn3d.data.checking import check_folder
-from learn3d.data.layouts import load_dataset
+from learn3d.data.layouts import check_folder, load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import photos
 from learn3d.data.readers.photos import split_objects

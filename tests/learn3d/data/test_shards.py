@@ -19,9 +19,8 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from learn3d.data import shards
-from learn3d.data.checking import check_folder
 from learn3d.data.disk_array import DiskArray
-from learn3d.data.layouts import load_dataset
+from learn3d.data.layouts import check_folder, load_dataset
 from learn3d.data.readers import kato
 from learn3d.files.reading import DamagedFile
 from learn3d.runs import checkpoint

@@ -15,7 +15,7 @@ from fuzz_targets import ERRORS, SETTINGS, TARGETS, Target, layout_target
 from reader_checks import at_most
 
 from learn3d.config import TrainConfig
-from learn3d.data.checking import check_folder
+from learn3d.data.layouts import check_folder
 from learn3d.data.readers import READERS
 from learn3d.training import train
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from learn3d.data.batch import Batch
+from learn3d.data.dataset import Batch
 from learn3d.data.readers import kato
 from learn3d.losses import domain_confusion_loss, pose_classification_loss
 from learn3d.make_data.render import DatasetConfig, make_dataset

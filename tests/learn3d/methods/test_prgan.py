@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.batch import Batch
 from learn3d.data.conventions import KATO
+from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.methods.method import DatasetInfo
 from learn3d.methods.prgan import PrGAN, PrGANSettings, statistics_loss

@@ -11,8 +11,7 @@ import torch
 from torch import nn
 
 import nmr
-from learn3d.data.batch import Batch
-from learn3d.data.dataset import DEPTH_REACH, ViewDataset, depth_levels, depth_of_levels
+from learn3d.data.dataset import DEPTH_REACH, Batch, ViewDataset, depth_levels, depth_of_levels
 from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices

@@ -12,9 +12,8 @@ import torch
 import torch.nn.functional as F
 
 import nmr
-from learn3d.data.batch import Batch
 from learn3d.data.conventions import KATO
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods import create_method
