@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -27,17 +26,10 @@ CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
 F_SCORE_DISTANCE = 0.05  # units of the object frame: objects are 1 long (Pascal3D+: up to 2)
 
-#: Metrics of each image. kato18 and kato19 are voxelizers (`data.conventions`).
-MEASURED = (
-    "voxel_iou",  # kato18; NaN if prediction and truth are empty
-    "voxel_iou_kato19",
-    "precision",  # share of the predicted voxels that are true (kato18)
-    "recall",  # share of the true voxels that are predicted (kato18)
-    "hollow",  # 1 if the mesh exceeds the grid: kato18 then leaves its inside empty
-    "chamfer_l1",  # NaN if a surface is empty
-    "f_score",  # 0 if only the prediction is empty
-    "silhouette_iou",  # at the camera of another image of the object
-)
+#: Metrics of each image; learn3d.experiments.measurement.MEASURES defines them. IoUs are NaN if both shapes are empty,
+#: chamfer_l1 if one is. f_score is 0 if only the prediction is empty. precision, recall and voxel_iou are kato18's.
+#: hollow is 1 if a mesh exceeds the grid: kato18 then leaves its inside empty.
+MEASURED = ("voxel_iou", "voxel_iou_kato19", "precision", "recall", "hollow", "chamfer_l1", "f_score", "silhouette_iou")
 NO_MMD = "no MMD: it needs at least two view classes with at least two images each"
 
 
@@ -52,21 +44,14 @@ class Evaluation:
 
     @property
     def voxel_iou(self) -> float | None:
-        """Mean voxel IoU (kato18)."""
         return self.means.get("voxel_iou")
 
     @property
     def mmd(self) -> float | None:
-        """Mean MMD, as the published code has it."""
         return self.means.get("mmd")
 
     @property
-    def main_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
-        """Metric that is shown first: the IoU of silhouettes if no voxels are known."""
-        return "silhouette_iou" if "voxel_iou" not in self.means and "silhouette_iou" in self.means else "voxel_iou"
-
-    @property
-    def selection_metric(self) -> Literal["voxel_iou", "silhouette_iou"]:
+    def selection_metric(self) -> str:
         """Metric that selects the best checkpoint: the IoU of silhouettes, which needs no 3D data, if it is known."""
         return "silhouette_iou" if "silhouette_iou" in self.means else "voxel_iou"
 
@@ -94,12 +79,11 @@ def evaluate(
     distances to about 1/32.
     align: turns or moves the predicted shapes of a batch before they are compared.
     """
-    count = len(dataset) if max_images is None else min(max_images, len(dataset))
-    samples = spread_samples(dataset.object_ids, dataset.view_ids, count)
+    samples = spread_samples(dataset.object_ids, dataset.view_ids, len(dataset) if max_images is None else max_images)
     others = _other_images(dataset.object_ids)
     novel_views = bool((others != torch.arange(len(others))).any())
     generator = torch.Generator().manual_seed(0)
-    surfaces = _true_surfaces(dataset, generator) if detailed else None
+    surfaces = _true_surfaces(dataset, generator) if detailed else []
     codes, values = [], []
     with method.in_use():
         for chosen in samples.split(batch_size):
@@ -108,12 +92,10 @@ def evaluate(
             shapes = method.decode(code)
             if align is not None:
                 shapes = align(shapes, batch, dataset)
-            measured = {}
-            if dataset.voxels is not None:
-                measured = _compare_voxels(shapes, batch, dataset, detailed)
+            measured = {} if dataset.voxels is None else _compare_voxels(shapes, batch, dataset, detailed)
             if (novel_views or not measured) and dataset.poses is not None and isinstance(shapes, Meshes):
                 measured |= _compare_silhouettes(shapes, dataset.batch(others[chosen]))
-            if surfaces is not None:
+            if surfaces:
                 measured |= _compare_surfaces(shapes, [surfaces[k] for k in batch.object_ids.tolist()], generator)
             unknown = torch.full((len(chosen),), math.nan)
             values.append(torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1))
@@ -125,21 +107,21 @@ def evaluate(
     return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds)
 
 
-def occupancy(shapes: Meshes | Grids, dataset: ViewDataset, definition: Definition) -> Tensor:
-    """Predictions as bool [B, 32, 32, 32] in the data set's voxel axes. definition: voxelizer of meshes."""
-    if isinstance(shapes, Meshes):
-        return dataset.voxelize(shapes.vertices, shapes.faces, definition)
-    if dataset.convention.cube_side != 1.0:
-        raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels")
-    return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
-
-
 def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, detailed: bool) -> dict[str, Tensor]:
-    grid = occupancy(shapes, dataset, "kato18")
+    def occupied(definition: Definition) -> Tensor:
+        """Bool [B, 32, 32, 32] in the data set's axes."""
+        if isinstance(shapes, Meshes):
+            return dataset.voxelize(shapes.vertices, shapes.faces, definition)
+        if dataset.convention.cube_side != 1.0:
+            name = dataset.convention.name
+            raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {name} voxels")
+        return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
+
+    grid = occupied("kato18")
     precision, recall = nmr.metrics.voxel_precision_recall(grid, batch.voxels)
     found = {"voxel_iou": nmr.metrics.voxel_iou(grid, batch.voxels), "precision": precision, "recall": recall}
     if detailed:
-        found["voxel_iou_kato19"] = nmr.metrics.voxel_iou(occupancy(shapes, dataset, "kato19"), batch.voxels)
+        found["voxel_iou_kato19"] = nmr.metrics.voxel_iou(occupied("kato19"), batch.voxels)
     is_mesh = isinstance(shapes, Meshes)
     found["hollow"] = dataset.convention.exceeds_grid(shapes.vertices, "kato18") if is_mesh else torch.zeros(len(grid))
     return found
@@ -167,16 +149,16 @@ def _compare_surfaces(shapes: Meshes | Grids, truth: list[Tensor], generator: to
     return {"chamfer_l1": chamfer, "f_score": f_score}
 
 
-def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor] | None:
-    """Points [P, 3] on the true surface of every object, in the object frame; None if unknown."""
-    convention = dataset.convention
-    parts = np.split(np.arange(dataset.num_objects), range(256, dataset.num_objects, 256))
-    if dataset.points is not None:
-        return [points.float() for part in parts for points in torch.from_numpy(dataset.points[part])]
-    if dataset.voxels is None:
-        return None
-    grids = (grid for part in parts for grid in convention.to_object(torch.from_numpy(dataset.voxels[part])))
-    return [_sample(grid_surface(grid.float(), box=convention.cube_side), generator) for grid in grids]
+def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor]:
+    """Points [P, 3] on the true surface of every object, in the object frame; [] if unknown."""
+    found = []
+    for part in np.split(np.arange(dataset.num_objects), range(256, dataset.num_objects, 256)):
+        if dataset.points is not None:
+            found += torch.from_numpy(dataset.points[part]).float()
+        elif dataset.voxels is not None:
+            grids = dataset.convention.to_object(torch.from_numpy(dataset.voxels[part])).float()
+            found += [_sample(grid_surface(grid, box=dataset.convention.cube_side), generator) for grid in grids]
+    return found
 
 
 def _sample(surface: Surface, generator: torch.Generator) -> Tensor:

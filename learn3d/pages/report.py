@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,57 +34,6 @@ from learn3d.terminal import note, plain
 UNIT = 1e-4  # length of 1 in the stored int16 coordinates, which reach 3.3; objects reach 1
 #: Maps row vectors of the object frame to the page's axes, with z up (y is up in mesh files).
 _TO_PAGE = mesh_to_object() @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-
-
-@torch.no_grad()
-def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, Any]]:
-    """For each image the picture and its meshes: one of each run, then the true shape if it is known.
-
-    "reach" is the largest radius of the meshes, "eye" the direction of the camera (an oblique one if it is unknown).
-    """
-    dataset = max((run.dataset for run in runs), key=lambda dataset: dataset.image_size)
-    batch = dataset.batch(torch.tensor(samples))
-    images = [run.dataset.batch(torch.tensor(samples)).images for run in runs]
-    shapes = [run.method.decode(run.method.encode(own)).surfaces() for run, own in zip(runs, images, strict=True)]
-    if batch.voxels is not None:
-        grids = dataset.convention.to_object(batch.voxels).float()
-        surfaces = [grid_surface(grid, box=dataset.convention.cube_side) for grid in grids]
-        shapes.append([Surface(smooth(s.vertices, s.faces), s.faces) if len(s.faces) else s for s in surfaces])
-    pictures = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
-    oblique = LookAtPoses(torch.full((len(samples),), -30.0), 20.0, 1.0, 15.0)
-    cameras = eyes(batch.poses or oblique).numpy() @ _TO_PAGE
-    cameras /= np.linalg.norm(cameras, axis=1, keepdims=True)
-    items = []
-    for number, sample in enumerate(samples):
-        surfaces = [of_run[number] for of_run in shapes]
-        Image.fromarray(pictures[number]).save(png := io.BytesIO(), "png")
-        items.append(
-            {
-                "name": plain(dataset.object_names[int(batch.object_ids[number])]),
-                "view": plain(dataset.view_names[int(batch.view_ids[number])]),
-                "index": sample,
-                "image": "data:image/png;base64," + base64.b64encode(png.getvalue()).decode(),
-                "eye": cameras[number].round(4).tolist(),
-                "reach": max([float(s.vertices.norm(dim=1).max()) for s in surfaces if len(s.faces)], default=1) / UNIT,
-                "meshes": [_mesh(surface) for surface in surfaces],
-            }
-        )
-    return items
-
-
-def _mesh(surface: Surface) -> dict[str, Any]:
-    points = np.rint(surface.vertices.double().numpy() @ _TO_PAGE / UNIT).clip(-32767, 32767)
-    corners = surface.faces.numpy()[:, [0, 2, 1]]  # reversed, because the object frame is left-handed
-    packed = {axis: _base64(points[:, n], "i2") for n, axis in enumerate("xyz")}
-    kind = "u2" if len(points) <= 2**16 else "u4"
-    return packed | {axis: _base64(corners[:, n], kind) for n, axis in enumerate("ijk")} | {"empty": len(corners) == 0}
-
-
-def _base64(values: np.ndarray, dtype: str) -> dict[str, str]:
-    """An array in plotly's encoding."""
-    return {"dtype": dtype, "bdata": base64.b64encode(values.astype(f"<{dtype}").tobytes()).decode()}
-
-
 #: Okabe and Ito's colours, safe for every kind of colour vision, darker ones first, without the faint yellow.
 COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 #: Titles of curves. Other curves have the name under which they are logged.
@@ -104,56 +52,11 @@ TITLES = {
 }
 _FIRST = ("voxel_iou", "mmd", "projection", "total")  # the first curves; the others follow in the order of the log
 _NOT_CURVES = {"hollow", "seconds"}
-
 SECTOR_DEG = 15
 POINTS = 500  # the most points of a curve: every n-th is drawn of a longer one
 MOST_SHOWN = 100  # images with shapes; each takes some 60 kB
 #: All curves of a run: by split ("train", "val") and name, the value at each step, in the order of the steps.
 Log = dict[tuple[str, str], dict[int, float]]
-
-
-def read_metrics(folder: Path) -> Log:
-    """The curves in a run folder's metrics.jsonl. An incomplete last line is ignored: the run may be writing it.
-
-    Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or a line that is no record.
-    """
-    file = Path(folder) / "metrics.jsonl"
-    lines = read_text(file, limits.METRICS_BYTES, "the metrics of a run", errors="replace").splitlines()
-    curves: Log = {}
-    for number, line in enumerate(lines, start=1):
-        try:
-            record = parse_json(line)
-            step, split = record.pop("step"), str(record.pop("split"))
-            if type(step) is not int or not 0 <= step <= limits.ITERATIONS:
-                raise ValueError("no step")
-        except (KeyError, TypeError, AttributeError, ValueError):
-            if number == len(lines) and number > 1:
-                break
-            raise ValueError(f"{file}, line {number} is no record with a step and a split: {line[:60]!r}") from None
-        for name, value in record.items():
-            if type(value) in (int, float) and name not in _NOT_CURVES:
-                if not (title := f"{split} {name}").isprintable() or len(title) > limits.CURVE_NAME:
-                    wrong = title[: limits.CURVE_NAME]
-                    raise ValueError(f"{file}, line {number} has a metric with an invalid name: {wrong!r}")
-                curves.setdefault((split, name), {})[step] = float(value)
-    if not 0 < len(curves) <= limits.CURVES:
-        raise ValueError(f"{file} holds {len(curves)} different numbers; from 1 to {limits.CURVES} are drawn")
-    return {key: dict(sorted(curve.items())) for key, curve in curves.items()}
-
-
-def mean_by_azimuth(azimuths_deg: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuths float64 [D] of the sectors that have images, and the mean of their values, NaN if none is known.
-
-    Sectors have 15 degrees and are centred at 0, 15, 30 ... azimuths_deg, values: float [M].
-    """
-    sectors, ids = np.unique(np.round(azimuths_deg / SECTOR_DEG) % (360 / SECTOR_DEG), return_inverse=True)
-    return SECTOR_DEG * sectors, np.array([mean(values[ids == number]) for number in range(len(sectors))])
-
-
-def mean(values: np.ndarray) -> float:
-    """The mean of the values that are not NaN; NaN if all are."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else float("nan")
 
 
 def write_report(
@@ -185,14 +88,14 @@ def write_report(
     for run in runs:
         note(f"measuring {run.label} on {len(run.dataset)} images")
         results.append(evaluate(run.method, run.dataset))
-    page = _fill(runs, results, logs, objects, indices) | {"split": split, "which": which}
-    folder = resources.files("learn3d.pages")
-    style, script = (Markup(folder.joinpath(f"report.{kind}").read_text("utf-8")) for kind in ("css", "js"))
+    page = _measure(runs, results, objects, indices) | {"split": split, "which": which}
+    page["data"] = plain((data or runs[0].metadata.config.data).name)
+    page["browser"]["curves"] = draw_curves(logs)
+    texts = {kind: Path(__file__).with_suffix(f".{kind}").read_text("utf-8") for kind in ("html", "css", "js")}
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["plain"] = plain
-    template = environment.from_string(folder.joinpath("report.html").read_text("utf-8"))
-    page["data"] = plain((data or runs[0].metadata.config.data).name)
-    content = template.render(page, style=style, script=script, plotly=Markup(get_plotlyjs())).encode()
+    parts = {"style": Markup(texts["css"]), "script": Markup(texts["js"]), "plotly": Markup(get_plotlyjs())}
+    content = environment.from_string(texts["html"]).render(page, **parts).encode()
     writing.write_bytes(output, content)
     return len(content)
 
@@ -212,30 +115,27 @@ def _check_same_images(runs: Sequence[Run], data: Path | None) -> None:
             raise ValueError(f"{run.label} and {runs[0].label} read different images of this data; report them apart")
 
 
-def _fill(
-    runs: Sequence[Run], results: Sequence[Evaluation], logs: Sequence[Log], objects: int, indices: Sequence[int]
+def _measure(
+    runs: Sequence[Run], results: Sequence[Evaluation], objects: int, indices: Sequence[int]
 ) -> dict[str, Any]:
     """The values of the template; "browser" is for the script of the page."""
     dataset = runs[0].dataset
-    ids, names, truth = dataset.object_ids, dataset.object_names, dataset.voxels is not None
-    ious = np.stack([result.values[result.main_metric].numpy() for result in results])  # run by image
+    ids, names, truth = dataset.object_ids, [plain(name) for name in dataset.object_names], dataset.voxels is not None
+    metric, kind = ("voxel_iou", "voxel IoU") if truth else ("silhouette_iou", "silhouette IoU")
+    ious = np.stack([result.values[metric].numpy() for result in results])  # run by image
     sums = np.stack([np.bincount(ids, np.nan_to_num(row), len(names)) for row in ious])
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
     means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)  # run by object
-    over_runs = np.array([mean(column) for column in means.T])
-    ranked = np.unique(ids)  # the best object first
-    ranked = ranked[np.argsort(-np.nan_to_num(over_runs[ranked], nan=-1.0), kind="stable")]
-
-    def typical_sample(number: int) -> int:
-        samples = np.flatnonzero(ids == number)
-        distances = [abs(mean(ious[:, sample]) - over_runs[number]) for sample in samples]
-        return samples[np.nan_to_num(distances, nan=9.0).argmin()]
-
-    if not indices:
+    of_images, of_objects = _mean(ious, axis=0), _mean(means, axis=0)
+    numbers = np.unique(ids)
+    ranked = numbers[np.argsort(-np.nan_to_num(of_objects[numbers], nan=-1.0), kind="stable")]  # the best object first
+    if not indices:  # of each object the image with the most typical IoU
+        order = np.nan_to_num(np.abs(of_images - of_objects[ids]), nan=9.0).argsort(kind="stable")
+        typical = dict(zip(ids[order[::-1]], order[::-1], strict=True))
         places = np.unique(np.linspace(0, len(ranked) - 1, min(objects, len(ranked))).round().astype(int))
-        indices = [typical_sample(number) for number in ranked[places]]
-    rank = {number: place for place, number in enumerate(ranked)}
-    shown = sorted(map(int, dict.fromkeys(indices)), key=lambda sample: rank[ids[sample]])
+        indices = [typical[number] for number in ranked[places]]
+    rank = ranked.tolist().index
+    shown = sorted(map(int, dict.fromkeys(indices)), key=lambda sample: rank(ids[sample]))
     items = pack_shapes(runs, shown)
     for item, sample in zip(items, shown, strict=True):
         item |= {"ious": _numbers(ious[:, sample]), "means": _numbers(means[:, ids[sample]])}
@@ -248,38 +148,118 @@ def _fill(
     resampled = [resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)]
     rows = []
     for run, result, entry, samples in zip(runs, results, legend, resampled, strict=True):
-        row = entry | {"about": run.metadata, "method": PRESETS[run.metadata.config.preset].label, "mmd": result.mmd}
-        row |= {"iou": result.means.get(result.main_metric), "interval": percentile_interval(samples)}
-        row["command"] = command_line(run.metadata.config, data="DATA", output="OUTPUT", pretrained="WEIGHTS")
-        if rows and None not in (row["iou"], rows[0]["iou"]):
-            row["difference"] = row["iou"] - rows[0]["iou"]
+        config, iou = run.metadata.config, result.means.get(metric)
+        row = entry | {"about": run.metadata, "method": PRESETS[config.preset].label, "mmd": result.mmd, "iou": iou}
+        row["interval"] = percentile_interval(samples)
+        row["command"] = command_line(config, data="DATA", output="OUTPUT", pretrained="WEIGHTS")
+        if rows and None not in (iou, rows[0]["iou"]):
+            row["difference"] = iou - rows[0]["iou"]
             row["difference_interval"] = percentile_interval(samples - resampled[0])
         rows.append(row)
-    kind = "voxel IoU" if truth else "silhouette IoU"
     return {
         "runs": rows,
         "category": plain(dataset.category),
         "images": len(dataset),
-        "objects": [
-            {"name": plain(names[number]), "ious": _numbers(means[:, number]), "item": first_item.get(number)}
-            for number in ranked
-        ],
+        "objects": [{"name": names[n], "ious": _numbers(means[:, n]), "item": first_item.get(n)} for n in ranked],
         "kind": kind,
-        "meaning": MEASURES["voxel_iou" if truth else "silhouette_iou"][1],
+        "meaning": MEASURES[metric][1],
         "mmd": MEASURES["mmd"][1],
         "truth": truth,
-        "browser": {
-            "runs": legend,
-            "items": items,
-            "kind": kind,
-            "views": views,
-            "curves": _curves(logs),
-            "unit": UNIT,
-        },
+        "browser": {"runs": legend, "items": items, "kind": kind, "views": views, "unit": UNIT},
     }
 
 
-def _curves(logs: Sequence[Log]) -> list[dict[str, Any]]:
+def mean_by_azimuth(azimuths_deg: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths float64 [D] of the sectors that have images, and the mean of their values, NaN if none is known.
+
+    Sectors have 15 degrees and are centred at 0, 15, 30 ... azimuths_deg, values: float [M].
+    """
+    sectors, ids = np.unique(np.round(azimuths_deg / SECTOR_DEG) % (360 / SECTOR_DEG), return_inverse=True)
+    return SECTOR_DEG * sectors, np.array([_mean(values[ids == number]) for number in range(len(sectors))])
+
+
+def _mean(values: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """The mean of the values that are not NaN; NaN if all are."""
+    return np.ma.filled(np.ma.masked_invalid(values).mean(axis), np.nan)
+
+
+@torch.no_grad()
+def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, Any]]:
+    """For each image the picture and its meshes: one of each run, then the true shape if it is known.
+
+    "reach" is the largest radius of the meshes, "eye" the direction of the camera (an oblique one if it is unknown).
+    """
+    dataset = max((run.dataset for run in runs), key=lambda dataset: dataset.image_size)
+    batch = dataset.batch(torch.tensor(samples))
+    images = [run.dataset.batch(torch.tensor(samples)).images for run in runs]
+    shapes = [run.method.decode(run.method.encode(own)).surfaces() for run, own in zip(runs, images, strict=True)]
+    if batch.voxels is not None:
+        grids = dataset.convention.to_object(batch.voxels).float()
+        surfaces = [grid_surface(grid, box=dataset.convention.cube_side) for grid in grids]
+        shapes.append([Surface(smooth(s.vertices, s.faces), s.faces) if len(s.faces) else s for s in surfaces])
+    pictures = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
+    oblique = LookAtPoses(torch.full((len(samples),), -30.0), 20.0, 1.0, 15.0)
+    cameras = eyes(batch.poses or oblique).numpy() @ _TO_PAGE
+    cameras /= np.linalg.norm(cameras, axis=1, keepdims=True)
+    items = []
+    for number, (sample, *surfaces) in enumerate(zip(samples, *shapes, strict=True)):
+        Image.fromarray(pictures[number]).save(png := io.BytesIO(), "png")
+        item = {
+            "name": plain(dataset.object_names[int(batch.object_ids[number])]),
+            "view": plain(dataset.view_names[int(batch.view_ids[number])]),
+            "index": sample,
+            "image": "data:image/png;base64," + base64.b64encode(png.getvalue()).decode(),
+            "eye": cameras[number].round(4).tolist(),
+            "reach": max([float(s.vertices.norm(dim=1).max()) for s in surfaces if len(s.faces)], default=1) / UNIT,
+            "meshes": [_mesh(surface) for surface in surfaces],
+        }
+        items.append(item)
+    return items
+
+
+def _mesh(surface: Surface) -> dict[str, Any]:
+    """A surface in plotly's encoding of arrays."""
+    points = np.rint(surface.vertices.double().numpy() @ _TO_PAGE / UNIT).clip(-32767, 32767)
+    corners = surface.faces.numpy()[:, [0, 2, 1]]  # reversed, because the object frame is left-handed
+    kind = "<u2" if len(points) <= 2**16 else "<u4"
+    arrays = dict(zip("xyzijk", [*points.T.astype("<i2"), *corners.T.astype(kind)], strict=True))
+    packed = {
+        name: {"dtype": values.dtype.str[1:], "bdata": base64.b64encode(values.tobytes()).decode()}
+        for name, values in arrays.items()
+    }
+    return packed | {"empty": len(corners) == 0}
+
+
+def read_metrics(folder: Path) -> Log:
+    """The curves in a run folder's metrics.jsonl. An incomplete last line is ignored: the run may be writing it.
+
+    Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or a line that is no record.
+    """
+    file = Path(folder) / "metrics.jsonl"
+    lines = read_text(file, limits.METRICS_BYTES, "the metrics of a run", errors="replace").splitlines()
+    curves: Log = {}
+    for number, line in enumerate(lines, start=1):
+        try:
+            record = parse_json(line)
+            step, split = record.pop("step"), str(record.pop("split"))
+            titles = [f"{split} {name}" for name in record]
+            valid = all(title.isprintable() and len(title) <= limits.CURVE_NAME for title in titles)
+            if type(step) is not int or not 0 <= step <= limits.ITERATIONS or not valid:
+                raise ValueError
+        except (KeyError, TypeError, AttributeError, ValueError):
+            if number == len(lines) and number > 1:
+                break
+            wanted = f"record with a step, a split and names of up to {limits.CURVE_NAME} characters"
+            raise ValueError(f"{file}, line {number} is no {wanted}: {line[:60]!r}") from None
+        for name, value in record.items():
+            if type(value) in (int, float) and name not in _NOT_CURVES:
+                curves.setdefault((split, name), {})[step] = float(value)
+    if not 0 < len(curves) <= limits.CURVES:
+        raise ValueError(f"{file} holds {len(curves)} different numbers; from 1 to {limits.CURVES} are drawn")
+    return {key: dict(sorted(curve.items())) for key, curve in curves.items()}
+
+
+def draw_curves(logs: Sequence[Log]) -> list[dict[str, Any]]:
     """A plot for each number in the logs, with a line per run: those of the validation first, then the losses."""
     keys = dict.fromkeys(key for log in logs for key in log)
     plots = []

@@ -154,11 +154,11 @@ def test_metrics_become_curves(tmp_path) -> None:
     read = report.read_metrics(write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl'))
     assert set(read) == {("train", "projection"), ("train", "total"), ("val", "voxel_iou")}
     assert read["train", "projection"] == pytest.approx({50: 1.25, 100: 0.75, 150: 1 / 3 + 0.25})
-    titles = [plot["title"] for plot in report._curves([read])]
+    titles = [plot["title"] for plot in report.draw_curves([read])]
     assert titles == ["voxel IoU, val", "projection loss (1 - IoU), train", "total loss (weighted), train"]
 
 
-NO_RECORD = "line 1 is no record with a step and a split"
+NO_RECORD = "line 1 is no record with a step, a split and names of up to 60 characters"
 
 
 @pytest.mark.parametrize(
@@ -169,9 +169,9 @@ NO_RECORD = "line 1 is no record with a step and a split"
         ('{"step": true, "split": "val"}', NO_RECORD),
         ('{"step": 1e300, "split": "val"}', NO_RECORD),
         ("\udcff", NO_RECORD),
-        ('{"step": 1, "split": "train", "\\ud800": 1.0}', "line 1 has a metric with an invalid name: 'train "),
-        ('{"step": 1, "split": "train", "\\u001b[2J": 1.0}', "line 1 has a metric with an invalid name: 'train "),
-        (json.dumps({"step": 1, "split": "t", "a" * 61: 1.0}), "line 1 has a metric with an invalid name: 't a"),
+        ('{"step": 1, "split": "train", "\\ud800": 1.0}', NO_RECORD),
+        ('{"step": 1, "split": "train", "\\u001b[2J": 1.0}', NO_RECORD),
+        (json.dumps({"step": 1, "split": "t", "a" * 61: 1.0}), NO_RECORD),
         (json.dumps({"step": 1, "split": "t"} | {f"n{k}": 1.0 for k in range(101)}), r"holds 10\d different numbers"),
         ("\n" * 100_000, r"metrics\.jsonl: has \d+ bytes; the limit is 90000"),
     ],
