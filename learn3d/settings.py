@@ -11,6 +11,7 @@ Values are never converted: "1" and true are not numbers. NaN and infinity are r
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
@@ -41,20 +42,6 @@ def checked(cls: type[T]) -> type[T]:
     return cls
 
 
-_WORDS = {
-    "Input should": "must",
-    "String should": "must",
-    "Tuple should": "must",
-    " after validation": "",
-    "greater than or equal to": "at least",
-    "less than or equal to": "at most",
-    "a valid integer": "a whole number",
-    "a valid number": "a number",
-    "a valid string": "text",
-    "a valid tuple": "a list",
-}
-
-
 def _sentence(error: Any, cls: type) -> str:
     """One of pydantic's errors as part of a sentence: the field, the wanted value, the given value."""
     name = error["loc"][0] if error["loc"] else ""
@@ -67,9 +54,7 @@ def _sentence(error: Any, cls: type) -> str:
     if error["type"] == "value_error":  # a validator's own message names the given value
         message = str(error["ctx"]["error"])
         return message if name in message.split() else f"{name} {message}".strip()
-    said = error["msg"]
-    for theirs, ours in _WORDS.items():
-        said = said.replace(theirs, ours)
+    said = re.sub(r"^\w+ should", "must", error["msg"])
     return f"{name} {said}, got {error['input']!r:.200}"
 
 

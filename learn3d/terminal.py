@@ -20,28 +20,25 @@ INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-def without_traceback(*errors: type[Exception]) -> Callable[[Callable[P, int]], Callable[P, int]]:
+def without_traceback(main: Callable[P, int]) -> Callable[P, int]:
     """Decorator of the main function of a command, which returns an exit status: errors become one line on stderr.
 
-    ValueError, OSError and the given errors end it with status 1 and the line "error: " and the message. Ctrl-C ends it
-    with status 130. Any other error is a bug and keeps its traceback.
+    ValueError, OSError, MemoryError and FloatingPointError end it with status 1 and the line "error: " and the message.
+    Ctrl-C ends it with status 130. Any other error is a bug and keeps its traceback.
     """
 
-    def decorate(main: Callable[P, int]) -> Callable[P, int]:
-        @functools.wraps(main)
-        def run(*arguments: P.args, **options: P.kwargs) -> int:
-            try:
-                return main(*arguments, **options)
-            except (ValueError, OSError, *errors) as error:
-                note(f"error: {error}")
-                return 1
-            except KeyboardInterrupt:
-                note("interrupted; what was saved before is as it was")
-                return INTERRUPTED
+    @functools.wraps(main)
+    def run(*arguments: P.args, **options: P.kwargs) -> int:
+        try:
+            return main(*arguments, **options)
+        except (ValueError, OSError, MemoryError, FloatingPointError) as error:
+            note(f"error: {error}")
+            return 1
+        except KeyboardInterrupt:
+            note("interrupted; what was saved before is as it was")
+            return INTERRUPTED
 
-        return run
-
-    return decorate
+    return run
 
 
 def plain(text: str) -> str:

@@ -40,7 +40,7 @@ Tab completion in new shells:
 or, with zsh and a folder in its $fpath: learn3d --completion zsh > FOLDER/_learn3d"""
 
 
-@without_traceback(MemoryError, FloatingPointError)
+@without_traceback
 def main(*given: str) -> int:
     """Run the command line, with the words `given` before it; returns the exit status."""
     name, *arguments = [*given, *sys.argv[1:]] or ["--help"]

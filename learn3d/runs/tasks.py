@@ -85,7 +85,7 @@ def _run_in_process(task: Task, stop: threading.Event) -> int:
         return process.wait()
 
 
-@without_traceback(FloatingPointError, MemoryError)
+@without_traceback
 def _child() -> int:
     """The main function of a task's process."""
     task = pickle.load(sys.stdin.buffer)

@@ -18,7 +18,7 @@ PROGRAM = """
 import sys
 from learn3d.terminal import without_traceback, {call}
 
-@without_traceback()
+@without_traceback
 def main():
     for _ in range(10):
         {call}("a line of a table")
@@ -45,7 +45,7 @@ def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
 
 @pytest.mark.parametrize("error", [ValueError("a"), FileNotFoundError("b"), FloatingPointError("c"), TypeError("d")])
 def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(error: Exception, capsys) -> None:
-    @without_traceback(FloatingPointError)
+    @without_traceback
     def main() -> int:
         raise error
 

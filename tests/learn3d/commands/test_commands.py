@@ -140,7 +140,10 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
         ("train --data {tmp}/no --category chair --output {tmp}/run", "data set with --data"),
         ("train --output {run} --resume --preset vanilla", "with the preset peng2020-kato, got peng2020-kato-vanilla"),
         ("train --output {run} --resume --overwrite", "give one of them"),
-        ("train --data x --category chair --output {tmp}/run --batch-size 0", "batch_size must be at least 1, got 0"),
+        (
+            "train --data x --category chair --output {tmp}/run --batch-size 0",
+            "must be greater than or equal to 1, got 0",
+        ),
         ("train --data {data} --category lamp --output {tmp}/run", "is missing (lamp, train)"),
         ("make-dataset --output {tmp}/x --category chair", "give --source (a folder"),
         ("check-dataset {tmp}/no", "there is no folder"),

@@ -170,7 +170,7 @@ def test_a_direction_without_training_photos_gets_the_nearest_class() -> None:
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("azimuth_deg", "12,5", "azimuth_deg must be a number, got '12,5'"),
+        ("azimuth_deg", "12,5", "azimuth_deg must be a valid number, got '12,5'"),
         ("fov_deg", "nan", "fov_deg must be a finite number, got nan"),
         ("elevation_deg", "90", "elevation_deg must be less than 90, got 90"),
         ("distance", "0.3", "distance must be greater than 0.5, got 0.3"),
@@ -179,7 +179,7 @@ def test_a_direction_without_training_photos_gets_the_nearest_class() -> None:
         ("file", "../secret.png", "it must name a file in images/, got '../secret.png'"),
         ("file", "/etc/passwd", "it must name a file in images/, got '/etc/passwd'"),
         ("file", "chair000_0.jpg", "chair000_0.jpg is in two lines"),
-        ("fov_deg", "x" * 100_000, "fov_deg must be a number, got 'x{100,300}"),
+        ("fov_deg", "x" * 100_000, "fov_deg must be a valid number, got 'x{100,300}"),
     ],
     ids=range(10),
 )

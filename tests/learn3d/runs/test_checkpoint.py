@@ -72,12 +72,12 @@ def test_a_flipped_bit_in_any_byte_is_found(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"progress": {"step": "abc"}}, "step must be a whole number, got 'abc'"),
-        ({"progress": {"losses": {"total": "high"}}}, "losses must be a number"),
+        ({"progress": {"step": "abc"}}, "step must be a valid integer, got 'abc'"),
+        ({"progress": {"losses": {"total": "high"}}}, "losses must be a valid number"),
         ({"progress": {"surprise": 1}}, "there is no option 'surprise'"),
         ({"config": [1]}, "config must be"),
         ({"versions": None}, "versions must be"),
-        ({"info": {"num_views": 10**9}}, "num_views must be at most"),
+        ({"info": {"num_views": 10**9}}, "num_views must be less than or equal to"),
         ({"info": {}}, "num_views is missing"),
         ("[1]", "must be a mapping"),
         ("[" * 100_000, "nested too deeply"),
