@@ -144,9 +144,9 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
             "train --data x --category chair --output {tmp}/run --batch-size 0",
             "must be greater than or equal to 1, got 0",
         ),
-        ("train --data {data} --category lamp --output {tmp}/run", "is missing (lamp, train)"),
+        ("train --data {data} --category lamp --output {tmp}/run", "03636649_train_images.npz: is missing"),
         ("make-dataset --output {tmp}/x --category chair", "give --source (a folder"),
-        ("check-dataset {tmp}/no", "there is no folder"),
+        ("check-dataset {tmp}/no", "there is no such folder"),
         ("evaluate", "give at least one run"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),
         (
