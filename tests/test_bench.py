@@ -24,7 +24,7 @@ def test_deodr_must_draw_what_we_draw(monkeypatch):
             bench.deodr_programs(work, 1, stack)
 
 
-@pytest.mark.parametrize(("workload", "rows"), [("w1", 2), ("w4", 2), ("colors", 7), ("voxels", 1)])
+@pytest.mark.parametrize(("workload", "rows"), [("w1", 2), ("w4", 2), ("white", 2), ("uv-lights", 4), ("voxels", 1)])
 def test_every_program_of_a_workload_is_timed(monkeypatch, capsys, workload, rows):
     threads = torch.get_num_threads()
     monkeypatch.setattr(bench.importlib.util, "find_spec", lambda name: None)  # without deodr

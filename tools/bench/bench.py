@@ -1,12 +1,11 @@
 """Measure the renderer, its losses and its metrics. Compare only numbers of one run.
 
-  bench.py all: everything below
-  bench.py w1: 64 spheres, 64x64 anti-aliased
-  bench.py w2: one mesh of 81,920 faces, 512x512
-  bench.py w3: one mesh of 1,280 faces, 1024x1024
-  bench.py w4: w1 with depth instead of silhouettes
-  bench.py colors: w1 in colour, with one thread: white, vertex colours, texture images, lights
-  bench.py voxels: voxel IoU of 1000 predictions
+  w1: 64 spheres, 64x64 anti-aliased
+  w2: one mesh of 81,920 faces, 512x512
+  w3: one mesh of 1,280 faces, 1024x1024
+  w4: w1 with depth instead of silhouettes
+  white, vertex, uv, uv-lights: w1 in colour: white, vertex colours, texture images of 128x128, lights
+  voxels: voxel IoU of 1000 predictions
 
 Prints the median and the fastest of the repeats in milliseconds; repeats alternate between the programs. Freed memory
 is kept, as in training (learn3d/device.py). w1 to w4 are measured with deodr as well, if it is installed.
@@ -43,13 +42,8 @@ WORKLOADS = {
     "w3": {"batch": 1, "subdivisions": 3, "size": 1024, "anti_aliasing": False},
     "w4": {"subdivisions": 3, "size": 64, "output": "depth"},
 }
-#: Kinds of colours of the output "rgb".
-COLORS = {
-    "white": "white",
-    "vertex": "vertex colours",
-    "uv": "texture images of 128x128",
-    "uv-lights": "texture images of 128x128 and lights",
-}
+COLORS = ("white", "vertex", "uv", "uv-lights")
+WORKLOADS |= {kind: {"subdivisions": 3, "size": 64, "output": "rgb", "colors": kind} for kind in COLORS}
 TEXELS = 128  # along each side of a texture image
 Timing = tuple[float, float]  # seconds: forward pass, total
 Program = Callable[[], Timing]
@@ -57,12 +51,12 @@ Program = Callable[[], Timing]
 
 @dataclass(frozen=True)
 class Options:
-    workload: tyro.conf.Positional[Literal["all", "w1", "w2", "w3", "w4", "colors", "voxels"]] = "w1"
+    workload: tyro.conf.Positional[Literal[("all", *WORKLOADS, "voxels")]] = "w1"
     """Name of the workload, from the list above."""
     batch: int = 64
-    """Meshes of w1, w4 and colors."""
+    """Meshes, but for w2, w3 and voxels."""
     threads: int = 2
-    """Threads of nmr and torch (colors takes one). deodr has no threads: it gets one process, and as many as these."""
+    """Threads of nmr and torch. deodr has no threads: it gets one process, and as many as these."""
     repeats: int = 15
     """Timed runs of each program."""
 
@@ -149,12 +143,14 @@ def time_passes(
 
 
 def bench_render(name: str, options: Options) -> None:
-    """Time nmr, and deodr if it is installed."""
+    """Time nmr, without and with gradients of the colours, and deodr if it is installed."""
     work = spheres(**{"batch": options.batch} | WORKLOADS[name])
     counts = dict.fromkeys((options.threads, 1))
     programs = {f"nmr, {n} threads": partial(time_passes, n, work.draw, work.go_back, work.vertices) for n in counts}
+    if work.values is not None:
+        programs |= {f"{name}, gradients of colours": partial(run, work.values) for name, run in programs.items()}
     with ExitStack() as stack:
-        if importlib.util.find_spec("deodr"):
+        if work.output != "rgb" and importlib.util.find_spec("deodr"):
             programs |= deodr_programs(work, options.threads, stack)
         report(f"{name}: {work}, forward + backward", programs, options.repeats)
 
@@ -183,17 +179,6 @@ def deodr_programs(work: Work, processes: int, stack: ExitStack) -> dict[str, Pr
 
 def run_deodr(work: Work) -> Timing:
     return time_passes(1, deodr(work.faces, work.camera, work.size, work.output), work.go_back, work.vertices)
-
-
-def bench_colors(options: Options) -> None:
-    """Time one thread, without and with gradients of the colours."""
-    for kind, about in COLORS.items():
-        work = spheres(options.batch, 3, 64, output="rgb", colors=kind)
-        run = partial(time_passes, 1, work.draw, work.go_back, work.vertices)
-        programs = {"nmr, 1 thread": run}
-        if work.values is not None:
-            programs["nmr, 1 thread, gradients of colours"] = partial(run, work.values)
-        report(f"colors: {work}, {about}, forward + backward", programs, options.repeats)
 
 
 def bench_voxels(options: Options) -> None:
@@ -232,15 +217,14 @@ def report(title: str, programs: dict[str, Program], repeats: int) -> None:
         print(f"{name:<40}" + "".join(f"{number:>12.2f}" for number in numbers), flush=True)
 
 
-BENCHES = {name: partial(bench_render, name) for name in WORKLOADS} | {"colors": bench_colors, "voxels": bench_voxels}
-
-
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
     keep_freed_memory()
-    for name, bench in BENCHES.items():
+    for name in WORKLOADS:
         if options.workload in ("all", name):
-            bench(options)
+            bench_render(name, options)
+    if options.workload in ("all", "voxels"):
+        bench_voxels(options)
 
 
 if __name__ == "__main__":
