@@ -29,13 +29,12 @@ from learn3d.data.framing import (
     threshold_mask,
 )
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
-from learn3d.data.poses import Poses
 from learn3d.files import limits, writing
 from learn3d.fitting.camera import belief
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.fitting.fit import Progress, fit, predict, silent
+from learn3d.fitting.fit import Progress, fit, predict
 from learn3d.fitting.smoothing import divide, outer_surface
 from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.methods import MeshMethod, Method
@@ -138,10 +137,10 @@ def reconstruct_files(
             note(f"warning: {name}: {made[-1].warning}")
         elif made[-1].kind:
             note(f"{name}: category {made[-1].kind}")
-    stored, azimuths = np.stack([each.stored for each in made]), [each.azimuth_deg for each in made]
-    return save(folder, names, model, stored, [each.surface for each in made], azimuths, mesh_format=mesh_format)
+    return save(folder, names, made, model, mesh_format)
 
 
+@torch.no_grad()
 def reconstruct_dataset(
     run: Path | None,
     folder: Path,
@@ -165,11 +164,16 @@ def reconstruct_dataset(
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     if refined and batch.poses is None:
         raise ValueError(f"the data of {dataset.category} have no poses, which fitting needs; leave out --refine")
-    images = batch.images.numpy()
-    surfaces = reconstruct(model.method, images, *(batch.masks, batch.poses) if refined else ())
-    names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
-    azimuths = None if batch.poses is None else azimuths_deg(batch.poses).tolist()
-    return save(folder, names, model, images, surfaces, azimuths, mesh_format=mesh_format)
+    if refined:
+        shapes = refine(model.method, batch.images, batch.masks, batch.poses)
+    else:
+        shapes = model.method.decode(model.method.encode(batch.images))
+    made = []
+    for row, (surface, stored) in enumerate(zip(shapes.surfaces(), batch.images.numpy(), strict=True)):
+        known = batch.poses is not None
+        azimuth_deg = float(azimuths_deg(batch.poses)[row]) if known else input_azimuth_deg(surface, stored[3])
+        made.append(Reconstruction(surface, stored, azimuth_deg))
+    return save(folder, [f"{dataset.category}_{split}_{index:06}" for index in indices], made, model, mesh_format)
 
 
 def _read(
@@ -240,11 +244,12 @@ class Reconstruction(NamedTuple):
     surface: Surface  # object frame; with the picture's colours if it was fitted
     stored: np.ndarray  # uint8 [4, S, S]: the input of the network
     azimuth_deg: float  # estimated azimuth of the picture's camera
-    silhouette_iou: float | None  # IoU of the fitted shape's silhouette and the mask; None without a fit
-    kind: str | None  # predicted category; None without a fit, or without templates if the model has one category
-    warning: str | None  # a reason to doubt the shape; None without a fit
+    silhouette_iou: float | None = None  # IoU of the fitted shape's silhouette and the mask; None without a fit
+    kind: str | None = None  # predicted category; None without a fit, or without templates if the model has only one
+    warning: str | None = None  # a reason to doubt the shape; None without a fit
 
 
+@torch.no_grad()
 def reconstruct_picture(
     model: Model,
     colors: np.ndarray,
@@ -252,7 +257,7 @@ def reconstruct_picture(
     *,
     crop: bool = True,
     refined: bool = True,
-    progress: Progress = silent,
+    progress: Progress = lambda *_: None,
 ) -> Reconstruction:
     """Reconstruct a picture uint8 [H, W, 3] with its mask uint8 [H, W]; its camera is unknown.
 
@@ -262,41 +267,36 @@ def reconstruct_picture(
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
     if not refined or not isinstance(method, MeshMethod):
-        (surface,) = reconstruct(method, stored[None])
+        (surface,) = method.decode(method.encode(image[None])).surfaces()
         found = method.view_probabilities(image[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
-        return Reconstruction(surface, stored, azimuth_deg, None, None, None)
-    fine = prepare_image(
-        colors, mask, object_size=CENTRED_SIZE, size=_COLORED, layout="kar"
-    )  # kar: colours not inverted
-    small = nn.functional.interpolate(
-        torch.from_numpy(fine[None, 3:]).float() / 255, (MASK_SIZE, MASK_SIZE), mode="area"
-    )
-    mask = small[0, 0]
+        return Reconstruction(surface, stored, azimuth_deg)
+    options = {"object_size": CENTRED_SIZE, "size": _COLORED, "layout": "kar"}  # kar: colours are not inverted
+    fine = prepare_image(colors, mask, **options)
+    mask = _reduce(fine[3])[0, 0]
     progress("camera", 0.0)
-    kind, warning = recognize(model, image)
     predicted = predict(method, image, mask)
+    kind, warning = recognize(model, predicted.code[0])
     templates = model.templates if warning is None else None
     if templates is not None:
-        fitted, kind = fit_template(method, templates, model.categories, predicted, mask, progress)
+        fitted, kind = fit_template(templates, model.categories, predicted, mask, progress)
         mesh, mirror = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), MIRROR
     else:
         fitted = fit(method, predicted, mask, progress)
         mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
     progress("colours", 0.9)
     picture = fine[:3].transpose(1, 2, 0), fine[3]
-    surface = color_mesh(*mesh, fitted.view, *picture, mirror, textured=templates is not None)
+    surface = color_mesh(mesh, fitted.view, *picture, mirror, textured=templates is not None)
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
 
 
-def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
-    """Predicted category of a stored image uint8 [4, S, S], and a warning if it shows an unknown kind of object.
+def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
+    """Predicted category of a picture's code [C], and a warning if it is that of an unknown kind of object.
 
     The category is None if the model has only one.
     """
     if model.known_codes is None:
         return None, None
-    (code,) = model.method.encode(image[None]).float().cpu()
     kinds = model.categories
     kind = kinds[model.known_codes.nearest_kind(code)] if len(kinds) > 1 else None
     if not model.known_codes.is_strange(code):
@@ -305,21 +305,9 @@ def recognize(model: Model, image: Tensor) -> tuple[str | None, str | None]:
     return kind, f"this looks like nothing that the model was trained on ({known}), so its shape is a guess"
 
 
-@torch.no_grad()
-def reconstruct(
-    method: Method, images: np.ndarray, masks: Tensor | None = None, poses: Poses | None = None
-) -> list[Surface]:
-    """Meshes, in the object frame, of stored images uint8 [B,4,S,S].
-
-    With masks float32 [B,64,64] and poses, shapes are fitted to them (`methods.refinement`); ValueError if the method
-    predicts voxels.
-    """
-    pixels = torch.from_numpy(images)
-    if poses is None:
-        return method.decode(method.encode(pixels)).surfaces()
-    if not isinstance(method, MeshMethod):
-        raise ValueError("only meshes can be fitted to masks, and this run predicts voxels; leave out --refine")
-    return refine(method, pixels, masks, poses).surfaces()
+def _reduce(mask: np.ndarray) -> Tensor:
+    """A mask uint8 [S, S] as float32 [1, 1, 64, 64] in 0 .. 1."""
+    return nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE, mode="area")
 
 
 @torch.no_grad()
@@ -329,8 +317,7 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor 
     A guess for pictures: elevation and distance are unknown, so four elevations are tried, and all outlines are scaled
     to one size. probabilities: see `fitting.camera.find_view`.
     """
-    small = nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, (64, 64), mode="area")
-    target, azimuths, losses = centre(small)[0], [15.0 * k for k in range(24)], []
+    target, azimuths, losses = centre(_reduce(mask))[0], [15.0 * k for k in range(24)], []
     for elevation in (0.0, 10.0, 20.0, 30.0):
         cameras = nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG)
         silhouettes = centre(nmr.render_silhouette(surface.vertices, surface.faces, cameras, image_size=64)[:, None])
@@ -392,31 +379,22 @@ def _finish_materials(tree: dict) -> None:
 
 
 def save(
-    folder: Path,
-    names: Sequence[str],
-    model: Model,
-    images: np.ndarray,
-    surfaces: Sequence[Surface],
-    azimuths: Sequence[float] | None = None,
-    *,
-    mesh_format: MeshFormat = "glb",
+    folder: Path, names: Sequence[str], made: Sequence[Reconstruction], model: Model, mesh_format: MeshFormat
 ) -> list[Path]:
     """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input, mask, six views) of each shape.
 
-    images: stored images uint8 [B,4,S,S]. azimuths: azimuths of their cameras in degrees; None if unknown, they are
-    then estimated. Returns three paths for each name.
+    Returns three paths for each name.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = natural_colors(images, inverted=LAYOUTS[model.config.layout].inverted)
+    titles = ["input", "mask", "from the input's side", *(f"turned by {60 * k}°" for k in range(1, 6))]
     paths = []
-    for row, (name, surface) in enumerate(zip(names, surfaces, strict=True)):
+    for name, (surface, stored, azimuth_deg, *_) in zip(names, made, strict=True):
         mesh, animation, strip = (folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png"))
         export_mesh(mesh, surface)
         save_gif(animation, turntable(surface))
-        start = azimuths[row] if azimuths else input_azimuth_deg(surface, images[row, 3])
-        views = draw_around(surface, [start - 60 * k for k in range(6)], image_size=STRIP_SIZE)
-        titles = ["input", "mask", "from the input's side", *(f"turned by {60 * k}°" for k in range(1, 6))]
-        shown = [pictures[row], np.repeat(images[row, 3][..., None], 3, axis=2)]
-        save_png(strip, tile([[*shown, *views]], titles, tile_size=STRIP_SIZE))
+        colors = natural_colors(stored, inverted=LAYOUTS[model.config.layout].inverted)
+        views = draw_around(surface, [azimuth_deg - 60 * k for k in range(6)], image_size=STRIP_SIZE)
+        shown = [colors, np.repeat(stored[3][..., None], 3, axis=2), *views]
+        save_png(strip, tile([shown], titles, tile_size=STRIP_SIZE))
         paths += [mesh, animation, strip]
     return paths

@@ -12,7 +12,7 @@ import tyro
 import nmr
 from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.poses import wrap_deg
-from learn3d.fitting.fit import Fit, fit, predict
+from learn3d.fitting.fit import fit, predict
 from learn3d.fitting.templates import fit_template
 from learn3d.make_data.meshes import fit_to_box
 from learn3d.networks.encoders import centre
@@ -37,14 +37,13 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
             batch = dataset.batch(torch.tensor([index]))
             (image,), mask = batch.images, centre(batch.masks[:, None])[0, 0]
             predicted = predict(model.method, image, mask)
-            template, kind = fit_template(model.method, model.templates, model.categories, predicted, mask)
+            template, kind = fit_template(model.templates, model.categories, predicted, mask)
             boxed = template._replace(vertices=torch.from_numpy(fit_to_box(template.vertices.numpy())))
-            first = Fit(predicted.vertices[0], model.method.faces, predicted.view, predicted.iou)
-            shapes = (first, fit(model.method, predicted, mask), boxed)
+            shapes = (predicted.shape, fit(model.method, predicted, mask), boxed)
             grids = [dataset.voxelize(shape.vertices[None].clamp(-0.499, 0.499), shape.faces) for shape in shapes]
             voxels = [float(nmr.metrics.voxel_iou(grid, batch.voxels)) for grid in grids]
             error_deg = wrap_deg(template.view.azimuth_deg - azimuths_deg(batch.poses))
-            right = float(error_deg.abs()) < 20, kind == name, recognize(model, image)[1] is not None
+            right = float(error_deg.abs()) < 20, kind == name, recognize(model, predicted.code[0])[1] is not None
             rows.append((*(shape.iou for shape in shapes), *voxels, *right))
         print(f"{name:12}", *(f"{value:20.3f}" for value in np.mean(rows, axis=0)), flush=True)
 

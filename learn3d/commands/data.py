@@ -23,8 +23,15 @@ from learn3d.make_data.render import make_dataset
 from learn3d.make_data.sharded import make_shards
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
-from learn3d.poses.sheet import LEGEND, draw_sheet
-from learn3d.poses.views import MIN_CONFIDENCE, CameraOptions, compare, estimate_views, load_views
+from learn3d.poses.views import (
+    LEGEND,
+    MIN_CONFIDENCE,
+    CameraOptions,
+    compare,
+    draw_sheet,
+    estimate_views,
+    load_views,
+)
 from learn3d.settings import Count, split_names
 from learn3d.terminal import is_watched, note, say
 

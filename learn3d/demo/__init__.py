@@ -1,1 +1,1 @@
-"""The page of `learn3d demo` (extra `demo`): `server` and `gate` serve the files of `page/`, `picture` makes meshes."""
+"""The page of `learn3d demo` (extra `demo`): `server` serves the files of `page/`, `picture` makes meshes."""

@@ -1,9 +1,13 @@
-"""The server of the page: static files, and an address that turns pixels into meshes. It stores no visitor's data."""
+"""The server of the page: static files, and an address that turns pixels into meshes. It stores no visitor's data.
+
+Other web pages in the same browser cannot use it.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import json
 import logging
 import socket
@@ -14,18 +18,20 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from learn3d.demo.gate import Gate
-from learn3d.demo.picture import EXAMPLES, SIDE, Picture, Send, example, make_meshes, unpack
+from learn3d.demo.picture import EXAMPLES, SIDE, Picture, example, make_meshes, unpack
 from learn3d.reconstruction import Model, load_model
 from learn3d.terminal import plain, say
 
@@ -33,10 +39,14 @@ MOST_BYTES = 5 * SIDE**2  # largest body of a request
 VISITORS = 200  # simultaneous requests, 260 MB in all; the browser of a later one tries again
 PATIENCE = 30  # seconds in which a picture must arrive
 _TICK = 0.05  # seconds
-
-
-class _Closed(Exception):
-    """Ends a job when the server stops."""
+#: The browser loads nothing from other servers, and does not show the page in a frame of another page.
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
 
 
 class JobQueue:
@@ -46,7 +56,7 @@ class JobQueue:
         self.closed: Callable[[], bool] = lambda: False  # whether the server stops
         self._thread, self._line = ThreadPoolExecutor(1), deque()
 
-    async def run(self, job: Callable[[Send], None]) -> AsyncIterator[bytes]:
+    async def run(self, job: Callable[[Callable[[dict], None]], None]) -> AsyncIterator[bytes]:
         """Run a job and yield the messages that it sends, each a line of JSON; before them {"place": jobs ahead of it}.
 
         A waiting job is dropped if the iteration ends early, because the visitor has left.
@@ -55,11 +65,11 @@ class JobQueue:
 
         def send(message: dict) -> None:
             if self.closed():
-                raise _Closed
+                raise asyncio.CancelledError  # ends the job
             messages.append(message)
 
         def run_job() -> None:
-            with contextlib.suppress(_Closed):
+            with contextlib.suppress(asyncio.CancelledError):
                 job(send)
 
         self._line.append(ticket)
@@ -129,17 +139,38 @@ async def _receive(request: Request) -> Picture:
     return unpack(bytes(content), int(query["width"]), int(query["height"]), box)
 
 
-class _PlainFormatter(logging.Formatter):
-    """Escapes control characters: an error may contain a visitor's text."""
+class Gate:
+    """ASGI middleware that refuses requests of other web pages, and those to another host name.
 
-    def format(self, record: logging.LogRecord) -> str:
-        return plain(super().format(record))
+    An attacker's host name can point to this server (DNS rebinding). So the Host header must be an IP address, `host`
+    or a name of this machine.
+    """
 
+    def __init__(self, app: ASGIApp, host: str) -> None:
+        machine = socket.gethostname()
+        self._app, self._names = app, {host, "localhost", machine, f"{machine}.local"}
 
-def name_models(runs: Sequence[Path]) -> list[str]:
-    """The displayed names of runs: those of their folders or files, numbered if they are equal."""
-    names = [Path(run).resolve().name for run in runs]
-    return [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_HEADERS)
+            await send(message)
+
+        headers = Headers(scope=scope)
+        host, origin = headers.get("host", ""), headers.get("origin")
+        app = self._app
+        if not self._is_this_machine(host):
+            app = PlainTextResponse("open this page by the address of its machine", 403)
+        elif origin is not None and urlsplit(origin).netloc != host:
+            app = PlainTextResponse("this request comes from another page", 403)
+        await app(scope, receive, send_with_headers)
+
+    def _is_this_machine(self, host: str) -> bool:
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+            return name in self._names or bool(ipaddress.ip_address(name))
+        except ValueError:
+            return False
 
 
 def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
@@ -147,15 +178,16 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
 
     Raises ValueError or OSError if a model cannot be loaded or the address is in use.
     """
-    models = {name: load_model(run) for name, run in zip(name_models(runs), runs, strict=True)}
-    models = models or {"small model": load_model(None)}
+    names = [Path(run).resolve().name for run in runs]
+    names = [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+    models = dict(zip(names, map(load_model, runs), strict=True)) or {"small model": load_model(None)}
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         listening = socket.create_server((host, port), family=family, backlog=VISITORS)
     except (OSError, OverflowError) as error:
         raise OSError(f"cannot open a page at {host}:{port}; give another --port or --host") from error
     errors = logging.StreamHandler()
-    errors.setFormatter(_PlainFormatter("%(message)s"))
+    errors.format = lambda record: plain(logging.Handler.format(errors, record))  # it may contain a visitor's text
     logging.getLogger("uvicorn").addHandler(errors)
     jobs = JobQueue()
     limits = {"limit_concurrency": VISITORS, "timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}

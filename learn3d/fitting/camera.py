@@ -23,7 +23,8 @@ ELEVATIONS_DEG = (0.0, 12.0, 25.0, 40.0, 55.0)  # elevations that are tried with
 STARTS = 6  # best of these views, from which the camera is optimised
 STEPS = 25
 BELIEF = 0.05  # weight of the log-probability of a view, relative to the IoU
-_SCALES = (60.0, 60.0, 1.0, 1.0)  # units of azimuth, elevation, distance and shift as variables
+# Units of azimuth, elevation, distance and shift as variables: a step moves the outline about equally far for each.
+_SCALES = (60.0, 60.0, 1.0, 1.0)
 
 Meshes = Tensor | Sequence[Tensor]
 
@@ -47,9 +48,8 @@ class View(NamedTuple):
 
     def cameras(self) -> nmr.LookAt:
         """The cameras, which look at the origin; `place` shifts shapes for them."""
-        return nmr.LookAt.from_angles(
-            self.log_distance.exp(), self.elevation_deg, self.azimuth_deg, half_fov_deg=HALF_FOV_DEG
-        )
+        angles = self.elevation_deg, self.azimuth_deg
+        return nmr.LookAt.from_angles(self.log_distance.exp(), *angles, half_fov_deg=HALF_FOV_DEG)
 
     def place(self, vertices: Meshes) -> Meshes:
         """Vertices [N, V, 3] or N tensors [V_n, 3], moved by `shift`."""
@@ -58,15 +58,10 @@ class View(NamedTuple):
             return vertices + moves[:, None]
         return [shape + move for shape, move in zip(vertices, moves, strict=True)]
 
-    def silhouettes(self, vertices: Meshes, faces: Meshes, size: int = MASK_SIZE) -> Tensor:
-        """Silhouettes float32 [N, size, size] of vertices [N, V, 3] or N tensors [V_n, 3]."""
-        return nmr.render_silhouette(self.place(vertices), faces, self.cameras(), image_size=size)
-
     def ious(self, vertices: Meshes, faces: Meshes, mask: Tensor) -> Tensor:
-        """Soft IoU [N] of a mask [64, 64] and each silhouette. One shape [1, V, 3] is seen in all views."""
-        if isinstance(vertices, Tensor):
-            vertices = vertices.expand(len(self.azimuth_deg), -1, -1)
-        silhouettes = self.silhouettes(vertices, faces)
+        """Soft IoU [N] of a mask [64, 64] and the silhouettes of shapes [N, V, 3], [1, V, 3] or N tensors [V_n, 3]."""
+        placed = self.place(vertices)
+        silhouettes = nmr.render_silhouette(placed, faces, self.cameras(), image_size=MASK_SIZE)
         both = (silhouettes * mask).sum((1, 2))
         return both / (silhouettes + mask - silhouettes * mask).sum((1, 2)).clamp(min=1e-6)
 
@@ -74,24 +69,11 @@ class View(NamedTuple):
         """The views `rows`."""
         return View(*(part[rows] for part in self))
 
-    def parameters(self) -> list[Tensor]:
-        """Variables for `minimize`, of which `from_parameters` makes a view.
-
-        A step of Adam moves the outline about equally far for each of them.
-        """
-        return [(part / scale).requires_grad_() for part, scale in zip(self, _SCALES, strict=True)]
-
-    @staticmethod
-    def from_parameters(parameters: Sequence[Tensor]) -> View:
-        """The view that such variables describe."""
-        view = View(*(scale * part for part, scale in zip(parameters, _SCALES, strict=True)))
-        return view._replace(elevation_deg=view.elevation_deg.clamp(-30, 85))
-
 
 def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> View:
-    """Cameras in these directions, angles [N], at which vertices [N, V, 3] are framed like pictures."""
-    zero, tangent = torch.zeros(len(vertices)), math.tan(math.radians(HALF_FOV_DEG))
-    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(vertices), 2))
+    """Cameras in N directions, angles [N], at which vertices [V, 3] are framed like pictures."""
+    zero, tangent = torch.zeros(len(azimuth_deg)), math.tan(math.radians(HALF_FOV_DEG))
+    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(zero), 2))
     points = vertices @ view.axes().transpose(1, 2)
     distance, shift = torch.full_like(zero, 1.0 / tangent), view.shift
     for _ in range(6):
@@ -107,26 +89,22 @@ def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> 
 def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None) -> tuple[View, float]:
     """The view at which the silhouette of a shape [V, 3], [F, 3] fits a framed mask [64, 64] best, and their IoU.
 
-    probabilities: float32 [AZIMUTHS], the probability of each azimuth cell from -180 degrees on, if it is known.
+    The best of a grid of views, with azimuths more than 20 degrees apart, are optimised. probabilities: float32
+    [AZIMUTHS], the probability of each azimuth cell from -180 degrees on, if it is known.
     """
-    view = _fit_camera(_search(vertices[None], faces, mask, probabilities), vertices, faces, mask)
-    ious = view.ious(vertices[None], faces, mask)
-    best = (ious + belief(view.azimuth_deg, probabilities)).argmax()[None]
-    return view.select(best), float(ious[best])
-
-
-def _search(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None) -> View:
-    """The `STARTS` best views of a shape [1, V, 3] with azimuths more than 20 degrees apart, best first."""
     azimuths = -180 + (torch.arange(AZIMUTHS) + 0.5) * (360 / AZIMUTHS)
     grid = torch.cartesian_prod(azimuths, torch.tensor(ELEVATIONS_DEG))
-    many = vertices.expand(len(grid), -1, -1)
-    view = frame_view(many, grid[:, 0], grid[:, 1])
-    scores = view.ious(many, faces, mask) + belief(view.azimuth_deg, probabilities)
+    view = frame_view(vertices, grid[:, 0], grid[:, 1])
+    scores = view.ious(vertices[None], faces, mask) + belief(view.azimuth_deg, probabilities)
     chosen = []
     for row in scores.argsort(descending=True).tolist():
         if all(wrap_deg(grid[row, 0] - grid[other, 0]).abs() > 20 for other in chosen):
             chosen.append(row)
-    return view.select(torch.tensor(chosen[:STARTS]))
+    starts = view.select(torch.tensor(chosen[:STARTS]))
+    view = minimize(lambda view: -view.ious(vertices[None], faces, mask).sum(), starts, STEPS, (0.03,))
+    ious = view.ious(vertices[None], faces, mask)
+    best = (ious + belief(view.azimuth_deg, probabilities)).argmax()[None]
+    return view.select(best), float(ious[best])
 
 
 def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
@@ -139,21 +117,26 @@ def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
     return BELIEF * (log[low] * (1 - part) + log[(low + 1) % AZIMUTHS] * part)
 
 
-@torch.enable_grad()
-def minimize(loss: Callable[[], Tensor], groups: list[dict], steps: int) -> None:
-    """Minimise a loss with Adam. groups: variables and their learning rates, which fall to a tenth in the end."""
+def minimize(
+    loss: Callable[[View], Tensor], view: View, steps: int, rates: Sequence[float], *variables: Tensor
+) -> View:
+    """The view, from `view` on, that minimises a loss together with other variables, by Adam.
+
+    rates: learning rates of the view and of each variable, which fall to a tenth in the end.
+    """
+    parts = [(part / scale).requires_grad_() for part, scale in zip(view, _SCALES, strict=True)]
+
+    def current() -> View:
+        found = View(*(scale * part for part, scale in zip(parts, _SCALES, strict=True)))
+        return found._replace(elevation_deg=found.elevation_deg.clamp(-30, 85))
+
+    groups = [{"params": group, "lr": lr} for group, lr in zip((parts, *variables), rates, strict=True)]
     optimizer = torch.optim.Adam(groups)
-    full = [group["lr"] for group in groups]
     for step in range(steps):
-        for group, rate in zip(optimizer.param_groups, full, strict=True):
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * (1 - 0.9 * step / steps)
         optimizer.zero_grad()
-        loss().backward()
+        with torch.enable_grad():
+            loss(current()).backward()
         optimizer.step()
-
-
-def _fit_camera(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> View:
-    parameters = view.parameters()
-    groups = [{"params": parameters, "lr": 0.03}]
-    minimize(lambda: -View.from_parameters(parameters).ious(vertices[None], faces, mask).sum(), groups, STEPS)
-    return View.from_parameters(parameters)
+    return current()

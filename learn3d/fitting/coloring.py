@@ -1,6 +1,11 @@
-"""Colours for a mesh from the picture to which it was fitted; hidden parts get blurred colours of their neighbours."""
+"""Colours for a mesh from the picture to which it was fitted, at its vertices and in a texture image.
+
+Hidden parts get blurred colours of their neighbours. Each face has a triangle of its own in the texture image.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -14,8 +19,7 @@ from torch import Tensor
 import nmr
 from learn3d.fitting.camera import View
 from learn3d.fitting.smoothing import joined, sharpen
-from learn3d.fitting.texturing import paint
-from learn3d.pictures.surfaces import Surface
+from learn3d.pictures.surfaces import Surface, Texture
 
 DEPTH_SIZE = 256  # side of the depth map that decides which vertices are visible
 BEHIND = 0.02  # distance behind the depth map from which a vertex is hidden, in units of the object frame
@@ -23,11 +27,17 @@ GRAZING = 0.25  # cosine between normal and line of sight below which a colour i
 EQUAL = 0.06  # two parts are equal if the sizes of their boxes and their heights above the ground differ by less
 BORDER = 2  # width in pixels of the border inside the outline that may have the background's colours; its inner
 # pixels count half, as thin legs have no others
+WIDTH = 1024  # texels; the height of a texture depends on the mesh
+TEXELS = 250.0  # per unit of the object frame
+SIDES = (2, 4, 8, 16, 24, 32)  # sides that a triangle in the image can have, in texels
+_SURE = 0.02  # squared reliability of a colour that counts as much as the colours of the vertices
+
+#: Colours [N, 3] in [0, 1] at points [N, 3] of a surface with normals [N, 3], and their reliability [N] in [0, 1].
+LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def color_mesh(
-    vertices: Tensor,
-    faces: Tensor,
+    mesh: tuple[Tensor, Tensor],
     view: View,
     colors: np.ndarray,
     mask: np.ndarray,
@@ -38,53 +48,48 @@ def color_mesh(
     """A surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if these are
     hidden, too, blurred colours of their neighbours.
 
-    vertices float32 [V, 3] in the object frame, faces int64 [F, 3]; view: the picture's camera; colors uint8
+    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]; view: the picture's camera; colors uint8
     [S, S, 3] and mask uint8 [S, S]: the picture, framed as in `fitting.camera`; mirror: float32 [3, 3], the reflection
     that maps the shape to itself, None without symmetry. textured: double the vertices along sharp edges, and add a
     texture image.
     """
-    picture = _Picture(vertices, faces, view, colors, mask)
+    picture = _seen(*mesh, view, colors, mask)
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        seen, weight = picture.look_up(points, normals)
+        seen, weight = picture(points, normals)
         if mirror is None:
             return seen, weight
-        other, its_weight = picture.look_up(points @ mirror.T, normals @ mirror.T)
+        other, its_weight = picture(points @ mirror.T, normals @ mirror.T)
         its_weight = (1 - weight) * its_weight  # a point's own colour comes first
         both = weight + its_weight
         mixed = weight[:, None] * seen + its_weight[:, None] * other
         return mixed / both.clamp(min=1e-6)[:, None], both
 
-    found = look_up(vertices, nmr.vertex_normals(vertices, faces))
-    surface = Surface(vertices, faces, _spread(*found, vertices, faces))
+    surface = Surface(*mesh, _spread(*look_up(mesh[0], nmr.vertex_normals(*mesh)), *mesh))
     return paint(sharpen(surface), look_up) if textured else surface
 
 
-class _Picture:
-    """A picture with the depth of the surface that it shows."""
+def _seen(vertices: Tensor, faces: Tensor, view: View, colors: np.ndarray, mask: np.ndarray) -> LookUp:
+    """The colours of a picture at the points of a surface that it shows."""
+    camera, size = view.cameras(), DEPTH_SIZE
+    depth_map = nmr.render_depth(view.place(vertices[None]), faces, camera, image_size=size, anti_aliasing=False)
+    pixels = torch.from_numpy(colors.astype(np.float32) / 255).permute(2, 0, 1)
+    inside = torch.from_numpy((mask > 127).astype(np.float32))[None]
+    reliable = sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in (1, BORDER)) / 2
 
-    def __init__(self, vertices: Tensor, faces: Tensor, view: View, colors: np.ndarray, mask: np.ndarray) -> None:
-        self.view, self.camera = view, view.cameras()
-        placed = view.place(vertices[None])
-        self.depth = nmr.render_depth(placed, faces, self.camera, image_size=DEPTH_SIZE, anti_aliasing=False)[None]
-        self.pixels = torch.from_numpy(colors.astype(np.float32) / 255).permute(2, 0, 1)[None]
-        inside = torch.from_numpy((mask > 127).astype(np.float32))[None, None]
-        self.trusted = sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in (1, BORDER)) / 2
-
-    def look_up(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours [N, 3] in [0, 1] at points of the surface, and their reliability [N] in [0, 1]."""
-        placed = self.view.place(points[None])
-        x, y, z = self.camera.transform(placed)[0].unbind(1)
-        grid = torch.stack([x, -y], 1)[None, None]
-        depth, trusted = (_sample(image, grid)[0, 0, 0] for image in (self.depth, self.trusted))
-        to_eye = F.normalize(self.camera.eye[0].float() - placed[0], dim=1)
+    def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        placed = view.place(points[None])
+        x, y, z = camera.transform(placed)[0].unbind(1)
+        grid, options = torch.stack([x, -y], 1)[None, None], {"padding_mode": "border", "align_corners": False}
+        found, depth, trusted = (
+            F.grid_sample(v[None], grid, **options)[0, :, 0] for v in (pixels, depth_map, reliable)
+        )
+        to_eye = F.normalize(camera.eye[0].float() - placed[0], dim=1)
         slant = (((normals * to_eye).sum(1) - GRAZING) / (0.6 - GRAZING)).clamp(0, 1)
-        visible = (z < depth + BEHIND) & (x.abs() < 1) & (y.abs() < 1)
-        return _sample(self.pixels, grid)[0, :, 0].T, visible * slant * trusted
+        visible = (z < depth[0] + BEHIND) & (x.abs() < 1) & (y.abs() < 1)
+        return found.T, visible * slant * trusted[0]
 
-
-def _sample(image: Tensor, grid: Tensor) -> Tensor:
-    return F.grid_sample(image, grid, padding_mode="border", align_corners=False)
+    return look_up
 
 
 def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
@@ -123,3 +128,58 @@ def _nearest_clear(points: np.ndarray, clear: np.ndarray, neighbours: coo_array)
             moved = points[here] + (low[other] + high[other] - low[hidden] - high[hidden]) / 2
             nearest[here] = there[cKDTree(points[there]).query(moved)[1]]
     return nearest
+
+
+def paint(surface: Surface, look_up: LookUp) -> Surface:
+    """The surface with a texture image. It needs colours of its vertices, which texels of low reliability get."""
+    height, uv, row, column, face, order, shares = _lay_out(surface.vertices[surface.faces].numpy())
+    corners = surface.faces[face[:, None], order]
+    normals = nmr.vertex_normals(surface.vertices, surface.faces)
+    values = (surface.vertices, normals, surface.colors)
+    points, normals, plain = ((v[corners] * shares[..., None]).sum(1) for v in values)
+    found, reliable = look_up(points, F.normalize(normals, dim=1))
+    share = (reliable.square() / (reliable.square() + _SURE))[:, None]
+    image = torch.ones(height, WIDTH, 3)
+    image[row, column] = (share * found + (1 - share) * plain).clamp(0, 1)
+    uv = uv / torch.tensor([WIDTH, -height]) + torch.tensor([0.0, 1.0])
+    return surface._replace(texture=Texture(image, uv))
+
+
+def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Lay triangles [F, 3, 3] out in an image.
+
+    Each rectangular cell of the image holds two triangles of the same size. Around a triangle one more texel continues
+    its colours, so that interpolation at its sides does not read another triangle. Returns the image's height; places
+    of all corners in texels, x right and y down, float32 [F, 3, 2]; and for each of N used texels row, column and face,
+    int64 [N], the corners of the face in the order of the shares, int64 [N, 3], and barycentric shares float32 [N, 3].
+    """
+    edges = np.linalg.norm(triangles - np.roll(triangles, 1, 1), axis=2)
+    order = (edges.argmin(1)[:, None] + np.arange(3)) % 3  # the shortest edge goes down from the first corner
+    kinds = np.searchsorted(SIDES[:-1], TEXELS * np.stack([edges.max(1), edges.min(1)], 1))
+    corners, texels, top = np.empty((len(triangles), 3, 2), np.float32), [], 0
+    for kind in np.unique(kinds, axis=0):
+        faces, sides = np.flatnonzero((kinds == kind).all(1)), np.take(SIDES, kind)
+        width, height = sides + 4
+        cells, across = -(-len(faces) // 2), WIDTH // width
+        left, low = np.arange(cells) % across * width, top + np.arange(cells) // across * height
+        top = low[-1] + height
+        first = 1 + sides * np.array([(0, 0), (1, 0), (0, 1)])
+        for k, own in enumerate((first, sides + 4 - first)):
+            own = own + np.stack([left, low], 1)[: len(faces[k::2]), None]
+            corners[faces[k::2, None], order[faces[k::2]]] = own
+        y, x = np.indices((height, width))
+        shares, others = _shares(x + 0.5, y + 0.5, sides), _shares(width - x - 0.5, height - y - 0.5, sides)
+        is_second = shares[..., 0] < others[..., 0]
+        shares = np.where(is_second[..., None], others, shares)
+        pairs = np.resize(faces, (cells, 2))[:, :, None, None]
+        face = np.where(is_second, pairs[:, 1], pairs[:, 0])
+        row, column, shares = low[:, None, None] + y, left[:, None, None] + x, np.broadcast_to(shares, (*face.shape, 3))
+        texels.append([each.reshape(row.size, -1) for each in (row, column, face, order[face], np.float32(shares))])
+    row, column, face, order, shares = (torch.from_numpy(np.concatenate(each)) for each in zip(*texels, strict=True))
+    return top, torch.from_numpy(corners), row[:, 0], column[:, 0], face[:, 0], order, shares
+
+
+def _shares(x: np.ndarray, y: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates [H, W, 3] of places in a cell, in its first triangle."""
+    b, c = (x - 1) / sides[0], (y - 1) / sides[1]
+    return np.stack([1 - b - c, b, c], -1)

@@ -60,7 +60,9 @@ def known_codes(method: MeshMethod, dataset: ViewDataset, others: Tensor | None 
     batches = [dataset.batch(part, voxels=False) for part in chosen.split(128)]
     classes, codes = torch.cat([b.class_ids for b in batches]), _directions(method, (b.images for b in batches))
     count = min(CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min()))
-    kinds = torch.stack([_centres(codes[classes == kind], count) for kind in range(dataset.num_classes)])
+    of_kinds = (codes[classes == kind].numpy() for kind in range(dataset.num_classes))
+    options = {"k": count, "minit": "points"}
+    kinds = torch.stack([torch.from_numpy(kmeans2(c, **options, rng=np.random.default_rng(0))[0]) for c in of_kinds])
     if others is None:
         return KnownCodes(kinds)
     return KnownCodes(kinds, *learn_others(codes, _directions(method, others.split(128))))
@@ -93,9 +95,4 @@ def learn_others(known: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _directions(method: MeshMethod, images: Iterable[Tensor]) -> Tensor:
-    return F.normalize(torch.cat([method.encode(part).float().cpu() for part in images]), dim=1)
-
-
-def _centres(directions: Tensor, count: int) -> Tensor:
-    rng = np.random.default_rng(0)
-    return torch.from_numpy(kmeans2(directions.numpy(), min(count, len(directions)), minit="points", rng=rng)[0])
+    return F.normalize(torch.cat([method.encode(part) for part in images]), dim=1)

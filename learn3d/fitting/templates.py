@@ -20,7 +20,7 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import ViewDataset
 from learn3d.fitting.camera import View, belief, minimize
-from learn3d.fitting.fit import Fit, Prediction, Progress, silent
+from learn3d.fitting.fit import Fit, Prediction, Progress
 from learn3d.methods import MeshMethod
 from learn3d.shapes import CATEGORIES, numbered_shape
 
@@ -54,6 +54,7 @@ class Templates(NamedTuple):
         return names, best.values
 
 
+@torch.no_grad()
 def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | None:
     """The templates of a training set; None if one of its categories has none.
 
@@ -61,34 +62,27 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
     names, and by their voxels, which must be those of the shape with the number in the name.
     """
     categories = [name.strip() for name in dataset.category.split(",")]
-    first = np.unique(np.asarray(dataset.object_ids), return_index=True)[1]  # an image of each object
-    found: list[list[tuple[int, int]]] = [[] for _ in categories]  # number and object of each shape
+    object_ids = np.asarray(dataset.object_ids)
+    numbers: list[list[int]] = [[] for _ in categories]
+    codes: list[list[Tensor]] = [[] for _ in categories]
     for item, name in enumerate(dataset.object_names):
         kind = 0 if dataset.class_ids is None else int(dataset.class_ids[item])
         match = re.fullmatch(rf"{categories[kind]}_(\d+)", name)
-        if match and dataset.voxels is not None and categories[kind] in CATEGORIES and len(found[kind]) < COUNT:
-            number = int(match[1])
-            vertices, faces = template(categories[kind], number)
-            voxels = dataset.batch(torch.from_numpy(first[item : item + 1])).voxels
+        if match and dataset.voxels is not None and categories[kind] in CATEGORIES and len(numbers[kind]) < COUNT:
+            views = torch.from_numpy(np.flatnonzero(object_ids == item))
+            vertices, faces = template(categories[kind], int(match[1]))
+            voxels = dataset.batch(views[:1]).voxels
             if nmr.metrics.voxel_iou(dataset.voxelize(vertices[None], faces), voxels) > 0.98:
-                found[kind].append((number, item))
-    count = min(map(len, found))
-    if not count:
+                of_views = F.normalize(method.encode(dataset.batch(views, voxels=False).images), dim=1)
+                numbers[kind].append(int(match[1]))
+                codes[kind].append(F.normalize(of_views.mean(0), dim=0))
+    if not (count := min(map(len, numbers))):
         return None
-    rows = torch.tensor([shapes[:count] for shapes in found])  # [N, M, 2]
-    codes = torch.stack([_mean_code(method, dataset, int(item)) for item in rows[..., 1].flatten()])
+    numbers = torch.tensor([of_kind[:count] for of_kind in numbers], dtype=torch.int32)
+    codes = torch.stack([code for of_kind in codes for code in of_kind[:count]])
     mean = codes.mean(0)
     axes = torch.linalg.svd(codes - mean, full_matrices=False).Vh[:AXES]
-    return Templates(
-        rows[..., 0].int(), ((codes - mean) @ axes.T).view(*rows.shape[:2], -1), torch.cat([mean[None], axes])
-    )
-
-
-@torch.no_grad()
-def _mean_code(method: MeshMethod, dataset: ViewDataset, item: int) -> Tensor:
-    views = torch.from_numpy(np.flatnonzero(np.asarray(dataset.object_ids) == item))
-    codes = method.encode(dataset.batch(views, voxels=False).images).float().cpu()
-    return F.normalize(F.normalize(codes, dim=1).mean(0), dim=0)
+    return Templates(numbers, ((codes - mean) @ axes.T).view(*numbers.shape, -1), torch.cat([mean[None], axes]))
 
 
 def template(category: str, number: int) -> tuple[Tensor, Tensor]:
@@ -101,12 +95,11 @@ def template(category: str, number: int) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def fit_template(
-    method: MeshMethod,
     templates: Templates,
     categories: Sequence[str],
     predicted: Prediction,
     mask: Tensor,
-    progress: Progress = silent,
+    progress: Progress = lambda *_: None,
 ) -> tuple[Fit, str]:
     """Fit a template to a framed mask float32 [64, 64]; also returns its category.
 
@@ -116,10 +109,10 @@ def fit_template(
     progress("shape", 0.3)
     names, nearness = templates.nearest(predicted.code[0], categories)
     shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
-    voxels = torch.cat([_voxels(shape, face) for shape, face in zip(shapes, faces, strict=True)])
-    alike = nmr.metrics.voxel_iou(voxels, _voxels(predicted.vertices[0], method.faces).expand_as(voxels))
+    voxels = torch.cat([_voxels(*mesh) for mesh in zip(shapes, faces, strict=True)])
+    alike = nmr.metrics.voxel_iou(voxels, _voxels(*predicted.shape[:2]).expand_as(voxels))
     prior = VOXELS * alike.float() + NEARNESS * nearness
-    views = predicted.view.select(torch.zeros(len(shapes), dtype=torch.int64))
+    views = predicted.shape.view.select(torch.zeros(len(shapes), dtype=torch.int64))
     best = (views.ious(shapes, faces, mask) + prior).topk(min(KEPT, len(shapes))).indices
     shapes, faces, prior = [shapes[i] for i in best], [faces[i] for i in best], prior[best]
     progress("stretch", 0.5)
@@ -141,7 +134,6 @@ def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
 
 def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> tuple[View, list[Tensor], Tensor]:
     """Stretch each shape along the three axes: fitted views and shapes, and how unequal the factors are, [N]."""
-    parameters = views.parameters()
     logs = torch.zeros(len(shapes), 3).requires_grad_()
 
     def stretched() -> list[Tensor]:
@@ -150,12 +142,11 @@ def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tenso
     def costs() -> Tensor:
         return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
 
-    def loss() -> Tensor:
-        ious = View.from_parameters(parameters).ious(stretched(), faces, mask)
+    def loss(views: View) -> Tensor:
+        ious = views.ious(stretched(), faces, mask)
         return (costs() + 0.1 * logs.square().sum(1) - ious).sum()
 
-    minimize(loss, [{"params": [*parameters, logs], "lr": 0.02}], STRETCH_STEPS)
-    return View.from_parameters(parameters), stretched(), costs()
+    return minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs), stretched(), costs()
 
 
 def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[View, Tensor]:
@@ -167,7 +158,7 @@ def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[Vi
         for t in place.unbind(1)
     )
     weights = torch.einsum("va,vb,vc->vabc", x, y, z)
-    lattice, parameters = torch.zeros(LATTICE, LATTICE, LATTICE, 3).requires_grad_(), view.parameters()
+    lattice = torch.zeros(LATTICE, LATTICE, LATTICE, 3).requires_grad_()
 
     def moves() -> Tensor:
         return (lattice + lattice.flip(0) @ MIRROR) / 2
@@ -175,9 +166,8 @@ def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[Vi
     def bent() -> Tensor:
         return vertices + torch.einsum("vabc,abcd->vd", weights, moves())
 
-    def loss() -> Tensor:
+    def loss(view: View) -> Tensor:
         rough = sum(moves().diff(dim=axis).square().sum() for axis in range(3)) + 0.1 * moves().square().sum()
-        return BENDING * rough - View.from_parameters(parameters).ious(bent()[None], faces, mask).sum()
+        return BENDING * rough - view.ious(bent()[None], faces, mask).sum()
 
-    minimize(loss, [{"params": [lattice], "lr": 0.01}, {"params": parameters, "lr": 0.005}], BENDING_STEPS)
-    return View.from_parameters(parameters), bent()
+    return minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice), bent()

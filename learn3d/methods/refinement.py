@@ -23,8 +23,10 @@ def refine(method: MeshMethod, images: Tensor, masks: Tensor, poses: Poses) -> M
     """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] at the B cameras of `poses`.
 
     Adam minimises soft IoU loss + 0.001 smoothness over the codes, which keeps shapes plausible, and then over the
-    vertices. Symmetric shapes stay symmetric.
+    vertices. Symmetric shapes stay symmetric. Raises ValueError if the method predicts voxels.
     """
+    if not isinstance(method, MeshMethod):
+        raise ValueError("only meshes can be fitted to masks, and this run predicts voxels; leave out --refine")
 
     def decode(codes: Tensor) -> Tensor:
         with method.autocast():

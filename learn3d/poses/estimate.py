@@ -18,11 +18,12 @@ Objects are assumed to be symmetric about x = 0: the view from azimuth -a is the
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -73,8 +74,7 @@ class PoseOptions:
         return self.steps * (self.restarts + STAGES) * self.repeats
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates:
+class Candidates(NamedTuple):
     """A x E candidate poses at one distance and field of view. Pose a * E + e has azimuth a and elevation e."""
 
     azimuth_deg: Tensor  # float32 [A]
@@ -82,38 +82,17 @@ class Candidates:
     distance: float
     half_fov_deg: float
 
-    def half_circle(self, copies: int, elevations: slice = slice(None)) -> nmr.LookAt:
-        """Cameras at the azimuths from 0 to 180 and the given elevations, repeated `copies` times."""
-        azimuth_deg = self.azimuth_deg[: len(self.azimuth_deg) // 2 + 1]
-        azimuth, elevation = torch.meshgrid(azimuth_deg, self.elevation_deg[elevations], indexing="ij")
-        angles = (elevation.flatten().repeat(copies), azimuth.flatten().repeat(copies))
-        return nmr.LookAt.from_angles(self.distance, *angles, half_fov_deg=self.half_fov_deg)
 
-
-@dataclass(frozen=True, eq=False)
-class Masks:
+class Masks(NamedTuple):
     """N masks, each with its possible elevations and its object."""
 
     masks: Tensor  # float32 [N, SIZE^2]
     allowed: Tensor  # bool [N, E]: possible elevations
     objects: Tensor  # int64 [N]: ids
 
-    def __getitem__(self, rows: Tensor) -> Masks:
-        return Masks(self.masks[rows], self.allowed[rows], self.objects[rows])
-
-    def __len__(self) -> int:
-        return len(self.masks)
-
-    def batches(self, rng: torch.Generator, steps: int) -> Iterator[tuple[Tensor, slice]]:
-        """Rows of each batch and the elevations to render. If elevations are known, a batch has a single one."""
-        one_each = bool((self.allowed.sum(1) == 1).all())
-        counts = self.allowed.sum(0).double()
-        for _ in range(steps):
-            rows, elevations = torch.arange(len(self)), slice(None)
-            if one_each:
-                e = int(torch.multinomial(counts, 1, generator=rng))
-                rows, elevations = torch.nonzero(self.allowed[:, e])[:, 0], slice(e, e + 1)
-            yield rows[torch.randint(len(rows), (_BATCH,), generator=rng)], elevations
+    def select(self, rows: Tensor) -> Masks:
+        """The masks `rows`."""
+        return Masks(*(part[rows] for part in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,24 +117,30 @@ def estimate(
     """
     rng = torch.Generator().manual_seed(options.seed)
     fitted = fitted[torch.randperm(len(fitted), generator=rng)[:MAX_FITTED].sort().values]
-    subset = data[fitted]
+    subset = data.select(fitted)
     neighbours = (Neighbours.of(subset, subset), Neighbours.of(data, subset))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
-        parts = [_part(subset, data, neighbours, candidates, options, rng, tick) for _ in range(options.repeats)]
+        create = functools.partial(Shapes, subset, candidates, options, rng, tick)
+        parts = [_estimate_once(options, create, data, *neighbours) for _ in range(options.repeats)]
     shifts = _common_frame([part.posterior.sum(2) for part in parts], rng)
     posteriors = [part.posterior.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True)]
     posterior = sum(posteriors) / len(parts)
     agreement = sum(part.agreement.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True))
     best = posterior.sum(2).argmax(1)
-    confidence = MAX_CONFIDENCE * near_mass(agreement, best)
-    if len(fitted) < MIN_IMAGES or _views_coincide(best, data.objects, options.azimuths):
+    confidence = MAX_CONFIDENCE * (_near(agreement, best) / agreement.sum(1).clamp_min(1e-9))
+    _, which = data.objects.unique(return_inverse=True)
+    views = torch.bincount(which * options.azimuths + best, minlength=options.azimuths * (int(which.max()) + 1))
+    views = views.view(-1, options.azimuths)[which]
+    pairs = int(views.sum()) - len(views)  # of views of an object
+    alike = pairs > 0 and int(_near(views, best).sum()) - len(views) > 0.5 * pairs  # from all sides
+    if len(fitted) < MIN_IMAGES or alike:
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
     front_votes = sum(part.front_votes for part in parts) / len(parts)
     typical = max(range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum()))
     shapes, weights = parts[typical].shapes, parts[typical].weights
     shapes.turns = (shapes.turns + shifts[typical] * TURNS // options.azimuths) % TURNS
-    return Estimate(posterior, confidence, *shapes.align(), weights, front_votes)
+    return Estimate(posterior, confidence, shapes.align(), shapes.network.faces, weights, front_votes)
 
 
 def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
@@ -166,8 +151,13 @@ def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
     return ((turns - turns[0]) % TURNS * quarter).tolist()
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
+def _near(mass: Tensor, azimuth: Tensor) -> Tensor:
+    """The part [N] of the masses [N, A] of all azimuths that is within NEAR_DEG of the azimuths of index int64 [N]."""
+    reach = math.floor(NEAR_DEG * mass.shape[1] / 360)
+    return mass.gather(1, (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]).sum(1)
+
+
+class _Part(NamedTuple):
     """One of several estimates, in a frame of its own."""
 
     posterior: Tensor  # float32 [N, A, E]
@@ -177,64 +167,52 @@ class _Part:
     front_votes: float
 
 
-def _part(
-    subset: Masks,
-    data: Masks,
-    neighbours: tuple[Neighbours, Neighbours],
-    candidates: Candidates,
-    options: PoseOptions,
-    rng: torch.Generator,
-    tick: Callable[[], object],
+def _estimate_once(
+    options: PoseOptions, create: Callable[[], Shapes], data: Masks, of_fitted: Neighbours, of_all: Neighbours
 ) -> _Part:
-    """Steps 1 to 4 on the masks `subset`, then the posteriors of all masks `data`.
+    """Steps 1 to 4 on the masks of the shapes that `create` makes, then the posteriors of all masks `data`.
 
-    neighbours: of `subset` and of `data`, both in `subset`.
+    of_fitted, of_all: the neighbours of the shapes' masks and of `data` among the shapes' masks.
     """
-    shapes = _mean_shape(subset, candidates, options, rng, tick)
-    shapes.codes = 0.3 * torch.randn(options.prototypes, CODE_SIZE, generator=rng)
+    starts = []
+    for _ in range(options.restarts):
+        starts.append(create())
+        starts[-1].fit(start=0.1, smoothness_weight=5e-4)
+    shapes = min(starts, key=Shapes.loss)
+    shapes.codes = 0.3 * torch.randn(options.prototypes, CODE_SIZE, generator=shapes.rng)
     shapes.turns = torch.zeros(options.prototypes, dtype=torch.int64)
     log_prior = None
     for stage in range(STAGES):
-        start = 0.03 if stage else 0.05
-        _train(shapes, subset, options, rng, start=start, smoothness_weight=3e-4, log_prior=log_prior, tick=tick)
-        values = shapes.all_distances(subset)
-        turns, front_votes = _turns(values, subset, rng)
+        shapes.fit(start=0.03 if stage else 0.05, smoothness_weight=3e-4, log_prior=log_prior)
+        values = shapes.all_distances(shapes.data)
+        turns, front_votes = _turns(values, shapes.data, shapes.rng)
         shapes.turns = (shapes.turns + turns) % TURNS
         own = _posteriors(-_turned(values, turns) / TEMPERATURE, options.prior)
-        smoothed = neighbours[0].smooth(own.sum(1), options.prior)
+        smoothed = of_fitted.smooth(own.sum(1), options.prior)
         log_prior = (smoothed + 1e-3).log()
-    chunks = (shapes.all_distances(data[rows]) for rows in torch.arange(len(data)).split(2048))
+    chunks = (shapes.all_distances(data.select(rows)) for rows in torch.arange(len(data.masks)).split(2048))
     alone = torch.cat([_posteriors(-values / TEMPERATURE, "free").sum(1) for values in chunks])
-    posterior = _normalize(alone**0.3 * (neighbours[1].message(smoothed) + 1e-3))
-    agreement = neighbours[1].message(own.sum(1)).sum(2)
+    posterior = _normalize(alone**0.3 * (of_all.message(smoothed) + 1e-3))
+    agreement = of_all.message(own.sum(1)).sum(2)
     return _Part(posterior, agreement, shapes, own.sum((2, 3)).mean(0), front_votes)
 
 
-def near_mass(mass: Tensor, azimuth: Tensor) -> Tensor:
-    """Share float [N] of the probability mass [N, A] within NEAR_DEG of the candidate azimuth of index int64 [N]."""
-    reach = math.floor(NEAR_DEG * mass.shape[1] / 360)
-    near = (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]
-    return mass.gather(1, near).sum(1) / mass.sum(1).clamp_min(1e-9)
-
-
-def _views_coincide(azimuth: Tensor, objects: Tensor, count: int) -> bool:
-    """Whether most pairs of views of an object got nearly equal azimuths, as if it looked alike from all sides."""
-    _, which = objects.unique(return_inverse=True)
-    views = torch.zeros(int(which.max()) + 1, count).index_put_(
-        (which, azimuth), torch.ones(len(which)), accumulate=True
-    )
-    number = views.sum(1, keepdim=True)
-    pairs = views * (number - 1)
-    reach = math.floor(NEAR_DEG * count / 360)
-    close = views * (sum(views.roll(shift, 1) for shift in range(-reach, reach + 1)) - 1)
-    return bool(pairs.sum() > 0 and close.sum() > 0.5 * pairs.sum())
-
-
 class Shapes:
-    """M shapes, symmetric about x = 0: a generator network, a code for each shape, and one offset for all."""
+    """M shapes, symmetric about x = 0: a generator network, a code for each shape, and one offset for all.
 
-    def __init__(self, candidates: Candidates, rng: torch.Generator) -> None:
-        self.candidates, self.network = candidates, GENERATORS["sphere-small"](symmetry="x")
+    They are fitted to the masks `data`. tick: called after each step.
+    """
+
+    def __init__(
+        self,
+        data: Masks,
+        candidates: Candidates,
+        options: PoseOptions,
+        rng: torch.Generator,
+        tick: Callable[[], object],
+    ) -> None:
+        self.data, self.candidates, self.options, self.rng, self.tick = data, candidates, options, rng, tick
+        self.network = GENERATORS["sphere-small"](symmetry="x")
         scale = torch.exp(torch.empty(3).uniform_(np.log(0.3), 0.0, generator=rng))
         self.base = 0.5 * self.network.place(self.network.sphere) * (scale - 1)
         self.codes = torch.zeros(1, CODE_SIZE)
@@ -249,22 +227,17 @@ class Shapes:
 
         Views from azimuths above 180 degrees are mirror images.
         """
-        count, azimuths = len(vertices), len(self.candidates.azimuth_deg)
-        cameras = self.candidates.half_circle(count, elevations)
-        repeated = vertices.repeat_interleave(len(cameras.eye) // count, 0)
+        azimuth_deg, elevation_deg, distance, half_fov_deg = self.candidates
+        count, half = len(vertices), len(azimuth_deg) // 2 + 1
+        azimuth, elevation = torch.meshgrid(azimuth_deg[:half], elevation_deg[elevations], indexing="ij")
+        angles = (elevation.flatten().repeat(count), azimuth.flatten().repeat(count))
+        cameras = nmr.LookAt.from_angles(distance, *angles, half_fov_deg=half_fov_deg)
+        repeated = vertices.repeat_interleave(azimuth.numel(), 0)
         right = nmr.render_silhouette(repeated, self.network.faces, cameras, image_size=SIZE)
-        right = right.reshape(count, azimuths // 2 + 1, -1, SIZE, SIZE)
+        right = right.reshape(count, half, -1, SIZE, SIZE)
         rendered = torch.cat([right, right[:, 1:-1].flip(1, 4)], 1)
-        values = distances(masks, rendered.flatten(3).flatten(0, 2)).reshape(len(masks), count, azimuths, -1)
+        values = distances(masks, rendered.flatten(3).flatten(0, 2)).reshape(len(masks), *rendered.shape[:3])
         return _turned(values, self.turns)
-
-    @torch.no_grad()
-    def align(self) -> tuple[Tensor, Tensor]:
-        """Vertices [M, V, 3] in the common frame, each shape turned by its `turns`, and faces [F, 3]."""
-        angle = self.turns * (2 * math.pi / TURNS)
-        cos, sin = angle.cos().round()[:, None], angle.sin().round()[:, None]
-        x, y, z = self.vertices().unbind(2)
-        return torch.stack([cos * x - sin * z, y, sin * x + cos * z], 2), self.network.faces
 
     @torch.no_grad()
     def all_distances(self, data: Masks) -> Tensor:
@@ -272,6 +245,50 @@ class Shapes:
         vertices = self.vertices()
         values = torch.cat([self.distances(part, vertices) for part in data.masks.split(1024)])
         return values.masked_fill(~data.allowed[:, None, None], float("inf"))
+
+    def fit(self, *, start: float, smoothness_weight: float, log_prior: Tensor | None = None) -> None:
+        """EM: the posteriors over shapes and poses follow from the IoU, then a gradient step fits the shapes.
+
+        The temperature falls from `start` to `TEMPERATURE`. log_prior: [N, A, E].
+        """
+        self.codes.requires_grad_()
+        groups = [{"params": self.network.parameters()}]
+        if len(self.codes) > 1:
+            groups.append({"params": [self.codes], "lr": 1e-2})
+        optimizer = torch.optim.Adam(groups, 4e-4)
+        (masks, allowed, _), steps = self.data, self.options.steps
+        rows, elevations, known = torch.arange(len(masks)), slice(None), bool((allowed.sum(1) == 1).all())
+        for step in range(steps):
+            if known:  # a batch has a single elevation
+                e = int(torch.multinomial(allowed.sum(0).double(), 1, generator=self.rng))
+                rows, elevations = torch.nonzero(allowed[:, e])[:, 0], slice(e, e + 1)
+            batch = rows[torch.randint(len(rows), (_BATCH,), generator=self.rng)]
+            vertices = self.vertices()
+            values = self.distances(masks[batch], vertices, elevations)
+            logits = -values.detach() / (start ** (1 - step / steps) * TEMPERATURE ** (step / steps))
+            if log_prior is not None:
+                logits = logits + log_prior[batch][:, None, :, elevations]
+            loss = (_posteriors(logits, self.options.prior) * values).sum((1, 2, 3)).mean()
+            total = loss + smoothness_weight * nmr.losses.smoothness_loss(vertices, self.network.edges)
+            optimizer.zero_grad()
+            total.backward()
+            optimizer.step()
+            self.tick()
+        self.codes.requires_grad_(False)
+
+    def loss(self) -> float:
+        """The mean silhouette loss over all masks."""
+        values = self.all_distances(self.data)
+        posterior = _posteriors(-values / TEMPERATURE, self.options.prior)
+        return float((posterior * values.nan_to_num(posinf=0.0)).sum((1, 2, 3)).mean())
+
+    @torch.no_grad()
+    def align(self) -> Tensor:
+        """Vertices [M, V, 3] in the common frame, each shape turned by its `turns`."""
+        angle = self.turns * (2 * math.pi / TURNS)
+        cos, sin = angle.cos().round()[:, None], angle.sin().round()[:, None]
+        x, y, z = self.vertices().unbind(2)
+        return torch.stack([cos * x - sin * z, y, sin * x + cos * z], 2)
 
 
 def _turned(values: Tensor, turns: Tensor) -> Tensor:
@@ -287,44 +304,6 @@ def distances(masks: Tensor, others: Tensor) -> Tensor:
     return 1 - common / (masks.sum(1)[:, None] + others.sum(1) - common).clamp_min(1e-6)
 
 
-def _train(
-    shapes: Shapes,
-    data: Masks,
-    options: PoseOptions,
-    rng: torch.Generator,
-    *,
-    start: float,
-    smoothness_weight: float,
-    log_prior: Tensor | None = None,
-    tick: Callable[[], object] = lambda: None,
-) -> None:
-    """EM: the posteriors over shapes and poses follow from the IoU, then a gradient step fits the shapes to the masks.
-
-    The temperature falls from `start` to `TEMPERATURE`. log_prior: [N, A, E].
-    """
-    shapes.codes.requires_grad_()
-    groups = [{"params": shapes.network.parameters()}]
-    if len(shapes.codes) > 1:
-        groups.append({"params": [shapes.codes], "lr": 1e-2})
-    optimizer = torch.optim.Adam(groups, 4e-4)
-    for step, (rows, elevations) in enumerate(data.batches(rng, options.steps)):
-        done = step / options.steps
-        temperature = start ** (1 - done) * TEMPERATURE**done
-        vertices = shapes.vertices()
-        values = shapes.distances(data.masks[rows], vertices, elevations)
-        logits = -values.detach() / temperature
-        if log_prior is not None:
-            logits = logits + log_prior[rows][:, None, :, elevations]
-        posterior = _posteriors(logits, options.prior)
-        loss = (posterior * values).sum((1, 2, 3)).mean()
-        total = loss + smoothness_weight * nmr.losses.smoothness_loss(vertices, shapes.network.edges)
-        optimizer.zero_grad()
-        total.backward()
-        optimizer.step()
-        tick()
-    shapes.codes.requires_grad_(False)
-
-
 def _posteriors(logits: Tensor, prior: str) -> Tensor:
     """Posterior [B, M, A, E] over shapes and poses. With the prior "uniform", all azimuths get about the same mass."""
     bias = torch.zeros(logits.shape[2], dtype=torch.float64)
@@ -337,23 +316,7 @@ def _posteriors(logits: Tensor, prior: str) -> Tensor:
     return torch.softmax(biased.flatten(1), 1).reshape(logits.shape)
 
 
-def _mean_shape(
-    data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, tick: Callable[[], object]
-) -> Shapes:
-    """Fit `options.restarts` mean shapes, and return the one with the smallest silhouette loss."""
-    found = []
-    for _ in range(options.restarts):
-        shapes = Shapes(candidates, rng)
-        _train(shapes, data, options, rng, start=0.1, smoothness_weight=5e-4, tick=tick)
-        values = shapes.all_distances(data)
-        posterior = _posteriors(-values / TEMPERATURE, options.prior)
-        loss = float((posterior * values.nan_to_num(posinf=0.0)).sum((1, 2, 3)).mean())
-        found.append((loss, shapes))
-    return min(found, key=lambda pair: pair[0])[1]
-
-
-@dataclass(frozen=True, eq=False)
-class Neighbours:
+class Neighbours(NamedTuple):
     """The n nearest masks of other objects, for each of N masks and for its mirror image."""
 
     rows: Tensor  # int64 [2, N, n]: of the masks, of their mirror images
@@ -362,22 +325,17 @@ class Neighbours:
     @classmethod
     def of(cls, data: Masks, known: Masks, kinds: Tensor | None = None, count: int = _NEIGHBOURS) -> Neighbours:
         """Neighbours of `data` among `known`: masks of other objects, and of other `kinds` (int64 [N]) if given."""
-        rows, weights = [], []
-        size = len(data.masks)
-        for mirrored in (False, True):
-            source = data.masks.reshape(-1, SIZE, SIZE).flip(2).flatten(1) if mirrored else data.masks
-            parts = []
-            for part in torch.arange(size).split(512):
-                values = distances(source[part], known.masks)
-                values[data.objects[part][:, None] == known.objects] = _FAR
-                shared = data.allowed[part].float() @ known.allowed.float().T
-                values[shared == 0] = _FAR
+        found = []
+        for source in (data.masks, data.masks.reshape(-1, SIZE, SIZE).flip(2).flatten(1)):
+            for part in torch.arange(len(source)).split(512):
+                far = data.objects[part][:, None] == known.objects
+                far |= data.allowed[part].float() @ known.allowed.float().T == 0
                 if kinds is not None:
-                    values[kinds[part][:, None] == kinds] = _FAR
-                parts.append(values.topk(min(count, values.shape[1]), 1, largest=False))
-            rows.append(torch.cat([p.indices for p in parts]))
-            weights.append(torch.exp(-torch.cat([p.values for p in parts]) / _NEIGHBOUR_SCALE))
-        return cls(torch.stack(rows), torch.stack(weights))
+                    far |= kinds[part][:, None] == kinds
+                values = distances(source[part], known.masks).masked_fill(far, _FAR)
+                found.append(values.topk(min(count, values.shape[1]), 1, largest=False))
+        values, rows = (torch.cat(part).view(2, len(data.masks), -1) for part in zip(*found, strict=True))
+        return cls(rows, torch.exp(-values / _NEIGHBOUR_SCALE))
 
     def message(self, posterior: Tensor) -> Tensor:
         """The weighted sum of the neighbours' posteriors [N', A, E], mirrored ones with azimuth -a: [N, A, E]."""

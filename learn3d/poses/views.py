@@ -1,4 +1,4 @@
-"""Estimates the poses of all images of a data set, and compares them with true poses."""
+"""Estimates the poses of all images of a data set, compares them with true poses, and draws a sheet of them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,18 @@ from learn3d.data.pose_table import MAX_CANDIDATES, PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.files import limits
 from learn3d.files.reading import MissingFile
+from learn3d.pictures.sheets import natural_colors, tile
+from learn3d.pictures.surfaces import Surface, draw_surface, orbit
 from learn3d.poses.estimate import MIN_IMAGES, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
 from learn3d.settings import checked
 
 MAX_ELEVATION_STEP_DEG = 15.0  # between neighbouring candidates
 DEFAULT_ELEVATION_DEG, DEFAULT_FOV_DEG = 30.0, 30.0
 MIN_CONFIDENCE = 0.5  # an image with less counts as doubtful
+COLUMNS = 12  # azimuths on the sheet, at most
+PROTOTYPES, ROWS = 6, 8  # rows of prototypes, and of images, at most
+TILE = 64  # side of a picture in pixels
+LEGEND = "columns: azimuths; first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
 _MIN_FRONT_VOTES = 0.8  # `Estimate.front_votes` of objects whose front and back differ
 
 
@@ -109,8 +115,7 @@ def estimate_views(
     elevation, distance, half_fov = _cameras(datasets, cameras)
     size = distance * torch.tan(half_fov.deg2rad())
     magnified = size / (distance.median() * torch.tan(half_fov.median().deg2rad()))
-    parts = magnified.split([len(dataset) for dataset in datasets])
-    masks = torch.cat([_masks(dataset, part) for dataset, part in zip(datasets, parts, strict=True)])
+    masks = _masks(datasets, magnified)
     shown = torch.nonzero(masks.sum(1) > 0.25)[:, 0]
     training = shown[shown < len(datasets[0])]
     if not len(training):
@@ -123,35 +128,22 @@ def estimate_views(
     if cameras.elevation is None:
         nearest = (elevation[:, None] - grid).abs().argmin(1)
         allowed = nearest[:, None] == torch.arange(len(grid))
-    starts = np.cumsum([0, *(dataset.num_objects for dataset in datasets)])
-    objects = torch.from_numpy(np.concatenate([d.object_ids + s for d, s in zip(datasets, starts, strict=False)]))
-    data = Masks(masks, allowed, objects.long())[shown]
+    data = Masks(masks, allowed, _objects(datasets)).select(shown)
     result = estimate(data, torch.searchsorted(shown, training), candidates, options, tick)
 
     posterior = torch.full((len(masks), len(azimuths), len(grid)), 1 / (len(azimuths) * len(grid)))
     posterior[shown] = result.posterior
     if cameras.elevation is None:
         posterior = posterior.sum(2, keepdim=True)  # the elevation of each image is known
-    heights_per_azimuth = posterior.shape[2]
-    confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
     weights, chosen = posterior.flatten(1).topk(min(MAX_CANDIDATES, posterior[0].numel()), 1)
     weights[:, kept:] = 0
-    heights = elevation[:, None].expand_as(weights) if cameras.elevation is None else grid[chosen % heights_per_azimuth]
-    table = PoseTable(
-        np.concatenate([fingerprints(dataset) for dataset in datasets]),
-        *(part.numpy().astype(np.float32) for part in (wrap_deg(azimuths[chosen // heights_per_azimuth]), heights)),
-        *(part.numpy() for part in (weights / weights.sum(1, keepdim=True), distance, half_fov, confidence)),
-    )
+    azimuth, height = chosen // posterior.shape[2], chosen % posterior.shape[2]
+    heights = elevation[:, None].expand_as(weights) if cameras.elevation is None else grid[height]
+    confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
+    columns = (wrap_deg(azimuths[azimuth]), heights, weights / weights.sum(1, keepdim=True))
+    columns = (part.numpy().astype(np.float32) for part in (*columns, distance, half_fov, confidence))
+    table = PoseTable(np.concatenate([fingerprints(dataset) for dataset in datasets]), *columns)
     return EstimatedViews(tuple(datasets), shown, candidates, result, table)
-
-
-def _masks(dataset: ViewDataset, factor: Tensor) -> Tensor:
-    """Masks float32 [M, SIZE^2] in 0 .. 1, each magnified by its factor; read in parts, as images may exceed memory."""
-    reduced = []
-    for rows in torch.arange(len(dataset)).split(1024):
-        masks = _magnify(torch.from_numpy(dataset.read_masks(rows.numpy())).float() / 255, factor[rows])
-        reduced.append(F.avg_pool2d(masks[:, None], MASK_SIZE // SIZE).flatten(1))
-    return torch.cat(reduced)
 
 
 def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[Tensor, Tensor, Tensor]:
@@ -178,14 +170,31 @@ def _column(datasets: Sequence[ViewDataset], name: str) -> Tensor:
     return torch.cat(columns)
 
 
-def _magnify(masks: Tensor, factor: Tensor) -> Tensor:
-    """Magnify each mask about the image centre: an approximate change of the distance or of the field of view."""
-    if bool((factor - 1).abs().max() < 1e-3):
-        return masks
-    theta = torch.zeros(len(masks), 2, 3)
-    theta[:, 0, 0] = theta[:, 1, 1] = 1 / factor
-    grid = F.affine_grid(theta, (len(masks), 1, MASK_SIZE, MASK_SIZE), align_corners=False)
-    return F.grid_sample(masks[:, None], grid, align_corners=False)[:, 0]
+def _objects(datasets: Sequence[ViewDataset]) -> Tensor:
+    """The object of each image, numbered through all data sets: int64 [N]."""
+    starts = np.cumsum([0, *(dataset.num_objects for dataset in datasets)])
+    ids = np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=False)])
+    return torch.from_numpy(ids).long()
+
+
+def _masks(datasets: Sequence[ViewDataset], factor: Tensor) -> Tensor:
+    """Masks float32 [N, SIZE^2] in 0 .. 1, read in parts, as images may exceed memory.
+
+    Each is magnified about its centre by its factor: an approximate change of the distance or of the field of view.
+    """
+    reduced, start = [], 0
+    for dataset in datasets:
+        for rows in torch.arange(len(dataset)).split(1024):
+            masks = torch.from_numpy(dataset.read_masks(rows.numpy()))[:, None].float() / 255
+            factors = factor[start : start + len(rows)]
+            if bool((factors - 1).abs().max() >= 1e-3):
+                theta = torch.zeros(len(rows), 2, 3)
+                theta[:, 0, 0] = theta[:, 1, 1] = 1 / factors
+                grid = F.affine_grid(theta, masks.shape, align_corners=False)
+                masks = F.grid_sample(masks, grid, align_corners=False)
+            reduced.append(F.avg_pool2d(masks, MASK_SIZE // SIZE).flatten(1))
+            start += len(rows)
+    return torch.cat(reduced)
 
 
 @dataclass(frozen=True)
@@ -228,8 +237,7 @@ def compare(views: EstimatedViews) -> Comparison:
     offset = float(offsets[torch.stack([(e + _up_to_half_turn(e)).mean() for e in turned]).argmin()])
     errors = wrap_deg(found + offset - true).abs()[views.shown]
     flips = (errors >= 150).double()
-    objects = torch.cat([torch.from_numpy(d.object_ids) + 10**6 * i for i, d in enumerate(views.datasets)])
-    _, which = objects[views.shown].unique(return_inverse=True)
+    _, which = _objects(views.datasets)[views.shown].unique(return_inverse=True)
     by_object = torch.bincount(which, flips) / torch.bincount(which)
     right, confidence = (errors <= NEAR_DEG).double(), views.result.confidence.double()
     bins = [torch.nonzero((10 * confidence).floor().clamp(max=9) == k)[:, 0] for k in range(10)]
@@ -241,3 +249,33 @@ def compare(views: EstimatedViews) -> Comparison:
 
 def _up_to_half_turn(errors: Tensor) -> Tensor:
     return torch.minimum(errors, 180 - errors)
+
+
+def draw_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarray:
+    """Uint8 [H, W, 3]: the most frequent prototypes, and below each azimuth images with about that estimate.
+
+    offset_deg: added to the azimuths of images and prototypes, as by `PoseTable.turned`.
+    """
+    (directions, heights, distance, half_fov), result = views.candidates, views.result
+    count = min(COLUMNS, len(directions))
+    azimuths = directions[torch.linspace(0, len(directions), count + 1)[:-1].long()]
+    middle = heights[len(heights) // 2 :][:1]
+    cameras = orbit(LookAtPoses(torch.full((1,), -offset_deg), middle, distance, half_fov), azimuths.tolist())
+    order = result.weights.argsort(descending=True)[:PROTOTYPES]
+    rows = [list(draw_surface(Surface(result.prototypes[m], result.faces), cameras, image_size=TILE)) for m in order]
+    places = [(dataset, i) for dataset in views.datasets for i in range(len(dataset))]
+    found = torch.from_numpy(views.table.azimuth_deg[:, 0])[views.shown] + offset_deg
+    columns = []
+    for azimuth in azimuths:
+        near = torch.nonzero(torch.remainder(found - azimuth + 180 / count, 360) < 360 / count)[:, 0]
+        chosen = near[torch.linspace(0, len(near) - 1, min(ROWS, len(near))).long()]
+        pictures = []
+        for row in views.shown[chosen].tolist():
+            dataset, index = places[row]
+            pictures.append(natural_colors(dataset.images[np.array([index])], inverted=dataset.inverted)[0])
+        columns.append(pictures + [None] * (ROWS - len(pictures)))
+    names = [f"prototype, {float(result.weights[m]):.0%}" for m in order] + ["images", *[""] * (ROWS - 1)]
+    titles = [f"{azimuth:g}°" for azimuth in azimuths.tolist()]
+    return tile(
+        [*rows, *map(list, zip(*columns, strict=True))], titles, tile_size=TILE, row_titles=names, rules=(len(rows),)
+    )

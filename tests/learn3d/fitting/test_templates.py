@@ -14,9 +14,9 @@ import trimesh
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.layouts import load_dataset
+from learn3d.fitting.coloring import paint
 from learn3d.fitting.smoothing import divide, sharpen, smooth
 from learn3d.fitting.templates import learn_templates, template
-from learn3d.fitting.texturing import paint
 from learn3d.make_data.config import DatasetConfig
 from learn3d.make_data.sharded import make_shards
 from learn3d.pictures.studio import photograph

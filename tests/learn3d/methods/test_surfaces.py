@@ -12,7 +12,7 @@ from learn3d.methods import DatasetInfo, create_method, refinement
 from learn3d.methods.refinement import refine
 from learn3d.methods.surfaces import grid_surface
 from learn3d.presets import PRESETS
-from learn3d.reconstruction import reconstruct, reconstruct_dataset
+from learn3d.reconstruction import reconstruct_dataset
 
 
 def test_surface_of_a_ball_is_where_the_ball_is() -> None:
@@ -98,4 +98,4 @@ def test_voxels_cannot_be_fitted(tiny_set) -> None:
     method = create_method(settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
     batch = tiny_set.batch(torch.tensor([0]))
     with pytest.raises(ValueError, match="leave out --refine"):
-        reconstruct(method, batch.images.numpy(), batch.masks, batch.poses)
+        refine(method, batch.images, batch.masks, batch.poses)
