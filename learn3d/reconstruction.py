@@ -81,14 +81,9 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
     tensors = checkpoint.load(path)[0]
-    known, templates = (list(map(tensors.get, names)) for names in (KNOWN_CODES, TEMPLATES))
-    return Model(
-        method,
-        config,
-        metadata.progress.object_share or MEAN_OBJECT_SIZE,
-        None if known[0] is None else KnownCodes(*known),
-        None if templates[0] is None else Templates(*templates),
-    )
+    stored = ((KnownCodes, KNOWN_CODES), (Templates, TEMPLATES))
+    parts = (kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored)
+    return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, *parts)
 
 
 def cut_out_pictures(model: Model, folder: Path) -> Tensor:
@@ -285,8 +280,7 @@ def reconstruct_picture(
         fitted = fit(method, predicted, mask, progress)
         mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
     progress("colours", 0.9)
-    picture = fine[:3].transpose(1, 2, 0), fine[3]
-    surface = color_mesh(mesh, fitted.view, *picture, mirror, textured=templates is not None)
+    surface = color_mesh(mesh, fitted.view, fine, mirror, textured=templates is not None)
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
 
 

@@ -37,29 +37,22 @@ LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def color_mesh(
-    mesh: tuple[Tensor, Tensor],
-    view: View,
-    colors: np.ndarray,
-    mask: np.ndarray,
-    mirror: Tensor | None = None,
-    *,
-    textured: bool = False,
+    mesh: tuple[Tensor, Tensor], view: View, picture: np.ndarray, mirror: Tensor | None = None, textured: bool = False
 ) -> Surface:
     """A surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if these are
     hidden, too, blurred colours of their neighbours.
 
-    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]; view: the picture's camera; colors uint8
-    [S, S, 3] and mask uint8 [S, S]: the picture, framed as in `fitting.camera`; mirror: float32 [3, 3], the reflection
-    that maps the shape to itself, None without symmetry. textured: double the vertices along sharp edges, and add a
-    texture image.
+    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the picture's camera. picture: R,
+    G, B and mask, uint8 [4, S, S], framed as in `fitting.camera`. mirror: float32 [3, 3], the reflection that maps the
+    shape to itself, None without symmetry. textured: double the vertices along sharp edges, and add a texture image.
     """
-    picture = _seen(*mesh, view, colors, mask)
+    look_up_seen = _seen(*mesh, view, picture)
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        seen, weight = picture(points, normals)
+        seen, weight = look_up_seen(points, normals)
         if mirror is None:
             return seen, weight
-        other, its_weight = picture(points @ mirror.T, normals @ mirror.T)
+        other, its_weight = look_up_seen(points @ mirror.T, normals @ mirror.T)
         its_weight = (1 - weight) * its_weight  # a point's own colour comes first
         both = weight + its_weight
         mixed = weight[:, None] * seen + its_weight[:, None] * other
@@ -69,12 +62,12 @@ def color_mesh(
     return paint(sharpen(surface), look_up) if textured else surface
 
 
-def _seen(vertices: Tensor, faces: Tensor, view: View, colors: np.ndarray, mask: np.ndarray) -> LookUp:
+def _seen(vertices: Tensor, faces: Tensor, view: View, picture: np.ndarray) -> LookUp:
     """The colours of a picture at the points of a surface that it shows."""
     camera, size = view.cameras(), DEPTH_SIZE
     depth_map = nmr.render_depth(view.place(vertices[None]), faces, camera, image_size=size, anti_aliasing=False)
-    pixels = torch.from_numpy(colors.astype(np.float32) / 255).permute(2, 0, 1)
-    inside = torch.from_numpy((mask > 127).astype(np.float32))[None]
+    pixels = torch.from_numpy(picture[:3].astype(np.float32) / 255)
+    inside = torch.from_numpy((picture[3:] > 127).astype(np.float32))
     reliable = sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in (1, BORDER)) / 2
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:

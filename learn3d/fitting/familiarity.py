@@ -17,7 +17,7 @@ from learn3d.methods import MeshMethod
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
 MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
-OTHER = 2.0  # `KnownCodes.resemblance` above which a picture is unknown
+OTHER = 2.0  # logit of the network above which a picture is unknown
 KNOWN_CODES = "known_codes", "hidden_layer", "output_layer"  # names of the tensors of `KnownCodes` in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
 _HIDDEN, _MEMBERS, _DROPOUT, _STEPS = 64, 2, 0.3, 300  # sizes of the classifiers, whose logits are averaged
@@ -35,18 +35,14 @@ class KnownCodes(NamedTuple):
         """The category whose codes are nearest to a code [C]."""
         return int(torch.stack([_distance(code, centres) for centres in self.kinds]).argmin())
 
-    def resemblance(self, code: Tensor) -> float:
-        """Logit of the probability that a code [C] is that of another object."""
+    def is_strange(self, code: Tensor) -> bool:
+        """Whether a code [C] is out of distribution: by the network if it was learnt, else by its distance to the
+        centres."""
+        if self.hidden is None:
+            return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
         hidden, output = self.hidden.float(), self.output.float()
         units = F.relu(hidden[:, :-1] @ (_SCALE * F.normalize(code, dim=0)) + hidden[:, -1])
-        return float(output[:-1] @ units + output[-1])
-
-    def is_strange(self, code: Tensor) -> bool:
-        """Whether a code [C] is out of distribution: by the classifiers if there are any, else by its distance to the
-        centres."""
-        if self.hidden is not None:
-            return self.resemblance(code) > OTHER
-        return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
+        return float(output[:-1] @ units + output[-1]) > OTHER
 
 
 def _distance(code: Tensor, centres: Tensor) -> Tensor:

@@ -57,15 +57,12 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     depth = -depth
     counts = [math.ceil(float(side) / 2 / cell) + _RIM for side in high - low]
     axes = [cell * torch.arange(-count, count + 1) for count in counts]
+    axes = [axis.view([-1 if n == m else 1 for m in range(3)]) for n, axis in enumerate(axes)]
     frame = cameras.transform(torch.eye(4, 3).expand(len(eyes), -1, -1)).float()  # the axes and the origin
-    outside = torch.full([len(axis) for axis in axes], -2.0 * cell)
+    outside = torch.full([2 * count + 1 for count in counts], -2.0 * cell)
     for image, (*steps, origin) in zip(depth, frame, strict=True):
         x, y, z = (
-            origin[k]
-            + sum(
-                a.reshape([-1 if n == m else 1 for m in range(3)]) * (steps[n][k] - origin[k])
-                for n, a in enumerate(axes)
-            )
+            origin[k] + sum(axis * (step[k] - origin[k]) for axis, step in zip(axes, steps, strict=True))
             for k in range(3)
         )
         column, row = (((value + 1) * (DEPTH_SIDE / 2)).long().clamp(0, DEPTH_SIDE - 1) for value in (x, -y))

@@ -27,8 +27,8 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from pydantic import Field
+from scipy import ndimage
 from torch import Tensor
 
 import nmr
@@ -446,7 +446,7 @@ def _peaks(masks: Tensor) -> Tensor:
     rows = torch.arange(SIZE, dtype=torch.float32)[:, None]
     centre = (shown * rows).sum((1, 2)) / shown.sum((1, 2)).clamp_min(1)
     top = shown.float().argmax(1).float()
-    outline = torch.where(shown.any(1), centre[:, None] - top, 0.0)[:, None]
-    side = _PEAK_WIDTH // 2
-    eroded = -F.max_pool1d(F.pad(-outline, (side, side)), _PEAK_WIDTH, 1)
-    return (outline - F.max_pool1d(F.pad(eroded, (side, side), value=-SIZE), _PEAK_WIDTH, 1))[:, 0]
+    outline = torch.where(shown.any(1), centre[:, None] - top, 0.0).numpy()
+    size = {"size": (1, _PEAK_WIDTH), "mode": "constant"}
+    eroded = ndimage.grey_erosion(outline, **size, cval=0.0)
+    return torch.from_numpy(outline - ndimage.grey_dilation(eroded, **size, cval=-SIZE))

@@ -124,21 +124,20 @@ def estimate_views(
     grid = torch.linspace(*span, 1 + int(np.ceil((span[1] - span[0]) / MAX_ELEVATION_STEP_DEG)))
     azimuths = torch.arange(options.azimuths) * (360 / options.azimuths)
     candidates = Candidates(azimuths, grid, float(distance.median()), float(half_fov.median()))
-    allowed = torch.ones(len(masks), len(grid), dtype=torch.bool)
-    if cameras.elevation is None:
-        nearest = (elevation[:, None] - grid).abs().argmin(1)
-        allowed = nearest[:, None] == torch.arange(len(grid))
+    own_elevation = cameras.elevation is None  # the elevation of each image is known
+    nearest = (elevation[:, None] - grid).abs().argmin(1)
+    allowed = (nearest[:, None] == torch.arange(len(grid))) | (not own_elevation)
     data = Masks(masks, allowed, _objects(datasets)).select(shown)
     result = estimate(data, torch.searchsorted(shown, training), candidates, options, tick)
 
     posterior = torch.full((len(masks), len(azimuths), len(grid)), 1 / (len(azimuths) * len(grid)))
     posterior[shown] = result.posterior
-    if cameras.elevation is None:
-        posterior = posterior.sum(2, keepdim=True)  # the elevation of each image is known
+    if own_elevation:
+        posterior = posterior.sum(2, keepdim=True)
     weights, chosen = posterior.flatten(1).topk(min(MAX_CANDIDATES, posterior[0].numel()), 1)
     weights[:, kept:] = 0
     azimuth, height = chosen // posterior.shape[2], chosen % posterior.shape[2]
-    heights = elevation[:, None].expand_as(weights) if cameras.elevation is None else grid[height]
+    heights = elevation[:, None].expand_as(weights) if own_elevation else grid[height]
     confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
     columns = (wrap_deg(azimuths[azimuth]), heights, weights / weights.sum(1, keepdim=True))
     columns = (part.numpy().astype(np.float32) for part in (*columns, distance, half_fov, confidence))
