@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,9 @@ def test_deodr_must_draw_what_we_draw(monkeypatch):
     with ExitStack() as stack:
         (program,) = bench.deodr_programs(work, 1, stack).values()
         assert 0 < program()[0]
-        monkeypatch.setattr(bench, "deodr", lambda faces, *rest, make=bench.deodr: make(faces.flip(1), *rest))
+        monkeypatch.setattr(
+            bench, "deodr", lambda work, draw=bench.deodr: draw(replace(work, faces=work.faces.flip(1)))
+        )
         with pytest.raises(SystemExit, match="nmr and deodr draw different images"):  # the far side
             bench.deodr_programs(work, 1, stack)
 
