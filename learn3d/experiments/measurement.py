@@ -126,23 +126,13 @@ def evaluate_runs(
                 note(f"warning: {means['hollow']:.1%} of the meshes reach beyond the voxel grid and count as hollow")
             if means["mmd"] is None:
                 note(f"warning: {NO_MMD}")
-            result = Result(
-                checkpoint=str(file),
-                method=label,
-                preset=config.preset,
-                category=name,
-                data=str((data or config.data).resolve()),
-                command=command_line(config),
-                iterations=config.iterations,
-                step=metadata.progress.step,
-                seed=config.seed,
-                seconds=metadata.progress.seconds,
-                versions=metadata.versions,
-                images=len(evaluation.view_ids),
-                objects=_means_by_object(evaluation, dataset) if dataset.voxels is not None else [],
-                **means,
-            )
-            results.append(result)
+            about = {"checkpoint": str(file), "method": label, "preset": config.preset, "category": name}
+            about |= {"data": str((data or config.data).resolve()), "command": command_line(config)}
+            about |= {"iterations": config.iterations, "seed": config.seed, "versions": metadata.versions}
+            about |= {"step": metadata.progress.step, "seconds": metadata.progress.seconds}
+            about["images"] = len(evaluation.view_ids)
+            objects = _means_by_object(evaluation, dataset) if dataset.voxels is not None else []
+            results.append(Result(**about, **means, objects=objects))
     return results
 
 
@@ -191,6 +181,5 @@ def class_means(results: Iterable[Result]) -> list[dict[str, Any]]:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    """The mean; None if a value is missing."""
     values = list(values)
     return None if None in values else sum(values) / len(values)

@@ -101,17 +101,16 @@ def write_report(
 
 
 def _check_same_images(runs: Sequence[Run], data: Path | None) -> None:
-    first = runs[0].dataset
-    classes = list(dict.fromkeys(run.dataset.category for run in runs))
-    if len(classes) > 1 or "," in classes[0]:
+    classes = dict.fromkeys(run.dataset.category for run in runs)
+    if len(classes) > 1 or "," in next(iter(classes)):
         raise ValueError(f"a report is about one class, and these runs are of {', '.join(classes)}; give --category")
-    folders = {str(data or run.metadata.config.data.resolve()) for run in runs}
+    folders = sorted({str(data or run.metadata.config.data.resolve()) for run in runs})
     if len(folders) > 1:
-        folders = ", ".join(sorted(folders))
-        raise ValueError(f"these runs were trained on different data ({folders}); give --data to measure all on one")
-    for run in runs[1:]:
-        same = run.dataset.object_names == first.object_names
-        if not (same and np.array_equal(run.dataset.object_ids, first.object_ids)):
+        read = ", ".join(folders)
+        raise ValueError(f"these runs were trained on different data ({read}); give --data to measure all on one")
+    images = [(run.dataset.object_names, run.dataset.object_ids.tolist()) for run in runs]
+    for run, read in zip(runs, images, strict=True):
+        if read != images[0]:
             raise ValueError(f"{run.label} and {runs[0].label} read different images of this data; report them apart")
 
 

@@ -43,15 +43,12 @@ def tile(
         draw.text((left + column * step + half, HEADER - 4), title, fill=_TEXT, anchor="ms", font=font)
     for row, title in enumerate(row_titles):
         draw.text((left - 2 * MARGIN, top + row * step + half), title, fill=_TEXT, anchor="rm", font=font)
-    for row in rules:
-        height = top + row * step - MARGIN // 2
+    for height in (top + row * step - MARGIN // 2 for row in rules):
         draw.line([(0, height), (sheet.width, height)], fill=_RULE)
     for r, row in enumerate(rows):
         for c, picture in enumerate(row):
-            if picture is not None:
-                image = Image.fromarray(picture)
-                if image.size != (tile_size, tile_size):
-                    image = image.resize((tile_size, tile_size), Image.Resampling.BICUBIC)
+            if picture is not None:  # `resize` copies a picture that has the size already
+                image = Image.fromarray(picture).resize((tile_size, tile_size), Image.Resampling.BICUBIC)
                 sheet.paste(image, (left + c * step, top + r * step))
     return np.asarray(sheet)
 
@@ -111,13 +108,10 @@ def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.
 def draw_sheet(splits: Mapping[str, Sequence[list[np.ndarray]]], views: int) -> np.ndarray:
     """The contact sheet of a data set with `views` views of each object (see `LEGEND`): uint8 [H, W, 3].
 
-    splits: for each split rows by `make_row`, of which at most 6 are drawn.
+    splits: for each split up to `ROWS` rows by `make_row`.
     """
-    rows, names = [], []
-    for split, of_split in splits.items():
-        chosen = np.unique(np.linspace(0, len(of_split) - 1, ROWS).astype(int)) if of_split else ()
-        rows += [of_split[i] for i in chosen]
-        names += [split, *[""] * (len(chosen) - 1)][: len(chosen)]
+    rows = [row for of_split in splits.values() for row in of_split]
+    names = ["" if number else split for split, of_split in splits.items() for number in range(len(of_split))]
     titles = [*(f"view {view}" for view in _shown_views(views)), "mask of 0", "voxels"]
     return tile(rows, titles, tile_size=CELL, row_titles=names, rules=[r for r, name in enumerate(names) if name])
 

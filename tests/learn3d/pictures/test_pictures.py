@@ -204,7 +204,7 @@ def test_contact_sheets_name_their_columns_and_splits() -> None:
     rgb, alpha = np.full((24, 64, 64, 3), 255, np.uint8), np.zeros((24, 64, 64), np.uint8)
     row = make_row(rgb, alpha, np.zeros((32, 32, 32), bool))
     assert len(row) == 10 and len(make_row(rgb[:3], alpha[:3], np.zeros((32, 32, 32), bool))) == 5
-    sheet = draw_sheet({"train": [row] * 9, "val": [], "test": [row]}, 24)
+    sheet = draw_sheet({"train": [row] * 6, "val": [], "test": [row]}, 24)
     left = sheet.shape[1] - 10 * 68 - 4
     assert sheet.shape[0] == 18 + 7 * 68 + 4 and left > 10
     titles = [(sheet[:17, left + 68 * k : left + 68 * (k + 1)] < 100).any() for k in range(10)]
