@@ -159,7 +159,7 @@ def test_curves_are_those_of_the_log(page, runs, read_metrics) -> None:
     [
         ("--output {tmp}/page.html", "give at least one run"),
         ("{run} {tmp}/no --output {tmp}/page.html", "there is no checkpoint"),
-        ("{run} --category chair --output {tmp}/page.html", "chair"),
+        ("{run} --category chair --output {tmp}/page.html", "is missing"),
         ("{run} --indices 24 --output {tmp}/page.html", "indices must lie in 0 .. 23"),
         ("{run} --objects 101 --output {tmp}/page.html", "of 1 to 100 images, got 101"),
     ],
