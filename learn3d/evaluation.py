@@ -111,7 +111,7 @@ def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, 
     def occupied(definition: Definition) -> Tensor:
         """Bool [B, 32, 32, 32] in the data set's axes."""
         if isinstance(shapes, Meshes):
-            return dataset.voxelize(shapes.vertices, shapes.faces, definition)
+            return dataset.convention.voxelize(shapes.vertices, shapes.faces, definition)
         if dataset.convention.cube_side != 1.0:
             name = dataset.convention.name
             raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {name} voxels")

@@ -25,7 +25,6 @@ from learn3d.data.framing import (
     largest_region,
     mask_box,
     read_photo,
-    read_picture,
     threshold_mask,
 )
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
@@ -177,7 +176,7 @@ def _read(
     """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path` or from `find`."""
     searched = find is not None and mask_path is None
     side = _PLAIN_SIDE if find is threshold_mask else limits.IMAGE_SIDE  # a box is in pixels of the file
-    colors, mask = read_picture(path, side) if searched else read_photo(path, mask_path)
+    colors, mask = read_photo(path, max_side=side) if searched else read_photo(path, mask_path)
     if searched and (mask is None or find is not threshold_mask):  # a box counts even if the file has transparency
         mask, more = largest_region(find(colors))
         if more:

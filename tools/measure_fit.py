@@ -40,7 +40,8 @@ def main(data: Path, category: str, layout: Layout = "kato", run: Path | None = 
             template, kind = fit_template(model.templates, model.categories, predicted, mask)
             boxed = template._replace(vertices=torch.from_numpy(fit_to_box(template.vertices.numpy())))
             shapes = (predicted.shape, fit(model.method, predicted, mask), boxed)
-            grids = [dataset.voxelize(shape.vertices[None].clamp(-0.499, 0.499), shape.faces) for shape in shapes]
+            voxelize = dataset.convention.voxelize
+            grids = [voxelize(shape.vertices[None].clamp(-0.499, 0.499), shape.faces) for shape in shapes]
             voxels = [float(nmr.metrics.voxel_iou(grid, batch.voxels)) for grid in grids]
             error_deg = wrap_deg(template.view.azimuth_deg - azimuths_deg(batch.poses))
             right = float(error_deg.abs()) < 20, kind == name, recognize(model, predicted.code[0])[1] is not None

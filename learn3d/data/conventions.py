@@ -99,10 +99,9 @@ def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
     parallel axes.
     """
     axes = {s + a: np.float64(-1 if s else 1) * row for s in ("", "-") for a, row in zip("xyz", np.eye(3), strict=True)}
-    if up not in axes or front not in axes:
-        raise ValueError(f"up and front must be one of {sorted(axes)}, got up={up!r}, front={front!r}")
-    if up[-1] == front[-1]:
-        raise ValueError(f"up and front must be two different axes, got up={up!r}, front={front!r}")
+    if up not in axes or front not in axes or up[-1] == front[-1]:
+        wanted = f"two different axes, each one of {sorted(axes)}"
+        raise ValueError(f"up and front must be {wanted}; got up={up!r}, front={front!r}")
     return np.stack([np.cross(axes[up], axes[front]), axes[up], -axes[front]]) + 0.0
 
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 import nmr
-from learn3d.data.conventions import VOXEL_SIZE, Definition, VoxelConvention
+from learn3d.data.conventions import VOXEL_SIZE, VoxelConvention
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.framing import Crops
 from learn3d.data.poses import LookAtPoses, PoseCandidates, Poses
@@ -135,8 +135,8 @@ class ViewDataset:
         """The properties that methods need; None for an unknown mirror plane or solidity."""
         features = 0 if self.poses is None else self.poses.num_features
         cube_side = None if self.voxels is None else self.convention.cube_side
-        known = self.num_views, self.inverted, self.num_classes, features, mirror_plane_deg, cube_side
-        return DatasetInfo(*known, solidity)
+        sizes = self.num_views, self.inverted, self.num_classes, features
+        return DatasetInfo(*sizes, mirror_plane_deg, cube_side, solidity)
 
     def read(self, samples: np.ndarray) -> tuple[np.ndarray | None, ...]:
         """The images, masks and depth of the samples `samples`, int64 [B], as they are stored."""
@@ -172,22 +172,17 @@ class ViewDataset:
             depth=None if depth is None else depth_of_levels(depth, poses),
         )
 
-    def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
-        """Occupancy bool [B, 32, 32, 32] of meshes in the data set's voxel axes, see `VoxelConvention.voxelize`."""
-        return self.convention.voxelize(vertices, faces, definition)
-
     def digest(self, *, voxels: bool = True) -> int:
         """CRC-32 of images, masks, poses and classes, and of voxels if wanted. Arrays on disk count by checksums."""
-        fields = () if self.poses is None else dataclasses.fields(self.poses)
-        poses = [np.asarray(getattr(self.poses, field.name)) for field in fields]
+        poses = () if self.poses is None else vars(self.poses).values()
         parts = [self.images, self.masks, self.depth, *poses, self.view_ids, self.object_ids, self.class_ids]
         if self.candidates is not None:
             parts += [self.candidates.weights, self.candidates.poses.azimuth_deg, self.candidates.view_ids]
         crc = 0
         for part in parts + [self.voxels] * voxels:
             if part is not None:
-                is_stored = isinstance(part, DiskArray)
-                crc = zlib.crc32(part.digest().to_bytes(4, "little") if is_stored else np.ascontiguousarray(part), crc)
+                stored = np.array(part.digest(), "<u4") if isinstance(part, DiskArray) else part
+                crc = zlib.crc32(np.ascontiguousarray(stored), crc)
         return crc
 
     def check_masks(self) -> str:

@@ -30,23 +30,16 @@ _MEMORY_PER_PIXEL = 40  # bytes, for masking and framing
 _PIXELS_PER_SECOND = 2e7
 
 
-def read_photo(path: Path, mask_path: Path | None = None) -> tuple[np.ndarray, np.ndarray]:
+def read_photo(
+    path: Path, mask_path: Path | None = None, max_side: int | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Read colours uint8 [H, W, 3] and mask uint8 [H, W] of an image with a mask file or with transparency.
 
     Both are turned upright (EXIF). The mask is the transparency of the mask file if it has any, else its grey values:
-    white is the object. Raises FileNotFoundError, and ValueError for unreadable files, a missing mask and different
-    sizes.
+    white is the object. max_side: the image is reduced if a side has more pixels, and its mask is None if it has no
+    transparency. Raises FileNotFoundError, and ValueError for unreadable files, a missing mask and different sizes.
     """
-    return sandbox.read(_read, Path(path), mask_path, wanted="a photograph")
-
-
-def read_picture(path: Path, max_side: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read colours uint8 [H, W, 3] and transparency uint8 [H, W] of an image, upright; None if nothing is transparent.
-
-    The image is reduced if a side has more than `max_side` pixels. Raises FileNotFoundError, and ValueError for
-    unreadable files.
-    """
-    return sandbox.read(_read_picture, Path(path), max_side, wanted="a photograph")
+    return sandbox.read(_read, Path(path), mask_path, max_side, wanted="a photograph")
 
 
 class Framed(NamedTuple):
@@ -60,7 +53,7 @@ class Framed(NamedTuple):
 
 def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
     """Read, check and frame a photograph (`frame`); for the sandbox."""
-    colors, mask = _read(path, mask_path)
+    colors, mask = _read(path, mask_path, None)
     try:
         check_mask(mask)
     except ValueError as error:
@@ -71,27 +64,25 @@ def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
     return Framed(*frame(colors, mask, size), object_size, touches_border)
 
 
-def _read_picture(path: Path, max_side: int) -> tuple[np.ndarray, np.ndarray | None]:
-    image = _open_photo(path)
-    alpha = _transparency(image)
-    image = image.convert("RGBA")
-    image.thumbnail((max_side, max_side))
-    pixels = np.asarray(image)
-    return pixels[..., :3], None if alpha is None else pixels[..., 3]
-
-
-def _read(path: Path, mask_path: Path | None) -> tuple[np.ndarray, np.ndarray]:
-    image = _open_photo(path)
+def _read(path: Path, mask_path: Path | None, max_side: int | None) -> tuple[np.ndarray, np.ndarray | None]:
+    image = _open(path)
+    if image.mode.startswith(("I", "F")):  # Pillow would clamp values above 255
+        raise DamagedFile(path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
     mask_image = image if mask_path is None else _open(mask_path)
-    mask = _transparency(mask_image)
-    if mask is None and mask_path is None:
-        wanted = "cut it out, or give a mask (reconstruct: --box, --masks, --plain-background)"
-        raise DamagedFile(path, f"has no transparency and no mask: {wanted}")
-    mask = np.asarray(mask_image.convert("L")) if mask is None else mask
     if mask_image.size != image.size:
         photo, other = (f"{i.width}x{i.height} pixels" for i in (image, mask_image))
         raise DamagedFile(path, f"has {photo}, its mask {mask_path} {other}; is one of them rotated by 90 degrees?")
-    return np.asarray(image.convert("RGBA"))[..., :3], mask
+    mask = np.asarray(mask_image.convert("RGBA"))[..., 3] if mask_image.has_transparency_data else None
+    if mask is None or mask.min() == 255:  # nothing is transparent
+        mask = None if mask_path is None else np.asarray(mask_image.convert("L"))
+    if mask is None and max_side is None:
+        wanted = "cut it out, or give a mask (reconstruct: --box, --masks, --plain-background)"
+        raise DamagedFile(path, f"has no transparency and no mask: {wanted}")
+    image = image.convert("RGBA")
+    if max_side is not None:
+        image.thumbnail((max_side, max_side))
+        mask = None if mask is None else np.asarray(image)[..., 3]
+    return np.asarray(image)[..., :3], mask
 
 
 def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
@@ -160,13 +151,6 @@ def frame(colors: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, 
     return shrink(np.dstack([np.rint((255 - colors) * alpha), mask]).transpose(2, 0, 1).astype(np.float32), size)
 
 
-def _open_photo(path: Path) -> Image.Image:
-    image = _open(path)
-    if image.mode.startswith(("I", "F")):  # Pillow would clamp values above 255
-        raise DamagedFile(path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
-    return image
-
-
 def _open(path: Path) -> Image.Image:
     """The image, turned upright by its EXIF data."""
     image = open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
@@ -175,14 +159,6 @@ def _open(path: Path) -> Image.Image:
         return ImageOps.exif_transpose(image)
     except Exception:  # Pillow raises various errors for damaged EXIF data; the image itself is sound
         return image
-
-
-def _transparency(image: Image.Image) -> np.ndarray | None:
-    """The alpha channel uint8 [H, W]; None if nothing is transparent."""
-    if not image.has_transparency_data:
-        return None
-    alpha = np.asarray(image.convert("RGBA"))[..., 3]
-    return None if alpha.min() == 255 else alpha
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,11 +177,9 @@ class Crops:
     def from_images(cls, images: Sequence[np.ndarray], boxes: np.ndarray, size: int) -> Crops:
         """Cut the regions from M images uint8 [H, W, 3]; boxes float [M, 4] overlap their images."""
         boxes = np.asarray(boxes, np.float64)
-        pixels, regions = [], []
-        for image, box in zip(images, boxes, strict=True):
-            left, top, right, bottom = bounds(box, LARGEST, image.shape[1], image.shape[0])
-            pixels.append(image[top:bottom, left:right].copy())
-            regions.append((left, top, right, bottom))
+        regions = [bounds(box, LARGEST, *image.shape[1::-1]) for image, box in zip(images, boxes, strict=True)]
+        pairs = zip(images, regions, strict=True)
+        pixels = [image[top:bottom, left:right].copy() for image, (left, top, right, bottom) in pairs]
         return cls(pixels, np.array(regions, np.int64), boxes, size)
 
     @classmethod

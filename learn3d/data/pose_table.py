@@ -23,7 +23,6 @@ from learn3d.files.sandbox import read
 from learn3d.files.writing import replacing
 
 _WANTED = "a table that learn3d estimate-poses wrote"
-_DTYPES = {"fingerprint": np.dtype(np.uint64)}  # the other arrays are float32
 MAX_CANDIDATES = 64
 
 
@@ -43,19 +42,17 @@ class PoseTable:
         count, shape = len(self.fingerprint), self.azimuth_deg.shape
         if not count or len(shape) != 2 or not 1 <= shape[1] <= MAX_CANDIDATES:
             raise ValueError(f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {MAX_CANDIDATES}, got {shape}")
-        for field in dataclasses.fields(self):
-            values = getattr(self, field.name)
-            dtype = _DTYPES.get(field.name, np.dtype(np.float32))
-            wanted = (count, shape[1]) if field.name in ("azimuth_deg", "elevation_deg", "weights") else (count,)
+        for name, values in vars(self).items():
+            dtype = np.dtype(np.uint64 if name == "fingerprint" else np.float32)
+            wanted = (count, shape[1]) if name in ("azimuth_deg", "elevation_deg", "weights") else (count,)
             if (values.dtype, values.shape) != (dtype, wanted):
-                raise ValueError(f"{field.name} must be {dtype} {list(wanted)}, got {values.dtype} {values.shape}")
+                raise ValueError(f"{name} must be {dtype} {list(wanted)}, got {values.dtype} {values.shape}")
             if not np.isfinite(values).all():
-                raise ValueError(f"{field.name} has values that are not finite")
+                raise ValueError(f"{name} has values that are not finite")
+            if name in ("weights", "confidence") and not 0 <= values.min() <= values.max() <= 1.001:
+                raise ValueError(f"{name} must lie in 0 .. 1")
         if not self.poses(np.arange(count)).in_range().all():
             raise ValueError("some of its cameras are impossible (elevation, distance or field of view)")
-        for name in ("weights", "confidence"):
-            if not ((values := getattr(self, name)) >= 0).all() or not (values <= 1.001).all():
-                raise ValueError(f"{name} must lie in 0 .. 1")
         if not np.allclose(self.weights.sum(axis=1), 1, atol=1e-3):
             raise ValueError("the weights of the candidates of an image must add up to 1")
 

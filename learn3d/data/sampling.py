@@ -10,7 +10,7 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -24,19 +24,10 @@ GROUP_SIZE = 5  # views per object of sampling "groups"
 VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_SIZE, "classes": 1}
 
 
-class BatchOptions(Protocol):
-    """The options of a `TrainConfig` that its batches depend on."""
-
-    sampling: Sampling
-    batch_size: int
-    augment: Sequence[Augmentation]
-    seed: int
-    iterations: int
-
-
-def batches(dataset: ViewDataset, options: BatchOptions, start: int = 1) -> Iterator[Batch]:
+def batches(dataset: ViewDataset, options: Any, start: int = 1) -> Iterator[Batch]:
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
+    options: `sampling`, `batch_size`, `augment`, `seed` and `iterations`, as in `TrainConfig`.
     A thread reads the images of the next batch during a step.
     """
     sample = functools.partial(sample_indices, dataset, options.sampling, options.batch_size, options.seed)

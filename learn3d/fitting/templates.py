@@ -72,7 +72,7 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
             views = torch.from_numpy(np.flatnonzero(object_ids == item))
             vertices, faces = template(categories[kind], int(match[1]))
             voxels = dataset.batch(views[:1]).voxels
-            if nmr.metrics.voxel_iou(dataset.voxelize(vertices[None], faces), voxels) > 0.98:
+            if nmr.metrics.voxel_iou(dataset.convention.voxelize(vertices[None], faces), voxels) > 0.98:
                 of_views = F.normalize(method.encode(dataset.batch(views, voxels=False).images), dim=1)
                 numbers[kind].append(int(match[1]))
                 codes[kind].append(F.normalize(of_views.mean(0), dim=0))

@@ -44,7 +44,7 @@ class Constant(FixedMethod):
 
 def with_truth(dataset: ViewDataset, shape: Meshes) -> ViewDataset:
     """The data set with the voxels of one mesh as the truth of every object."""
-    voxels = dataset.voxelize(shape.vertices, shape.faces).numpy()
+    voxels = dataset.convention.voxelize(shape.vertices, shape.faces).numpy()
     return dataclasses.replace(dataset, voxels=np.repeat(voxels, dataset.num_objects, axis=0))
 
 
@@ -150,7 +150,7 @@ def test_images_without_iou_are_left_out(tiny_set) -> None:
 
 def test_meshes_beyond_the_grid_are_counted(tiny_set) -> None:
     beyond = egg(shift=(0.1, 0.0, 0.0))
-    whole, opened = (tiny_set.voxelize(mesh.vertices, mesh.faces) for mesh in (egg(), beyond))
+    whole, opened = (tiny_set.convention.voxelize(mesh.vertices, mesh.faces) for mesh in (egg(), beyond))
     assert opened.sum() < 0.7 * whole.sum(), "an open shape has no inside"
     assert evaluate(Constant(beyond), tiny_set).means["hollow"] == 1
 

@@ -51,17 +51,17 @@ VAL_SHARE, TEST_SHARE = 0.1, 0.2  # shares of the objects if the table has no sp
 
 @checked
 class Photo:
-    """One row of the table."""
+    """One row of the table. Its numbers may be given as text."""
 
     line: int
     file: Path
     mask: Path | None
-    azimuth_deg: Annotated[float, Field(gt=-limits.ANGLE_DEG, lt=limits.ANGLE_DEG)] | None
-    elevation_deg: Annotated[float, Field(gt=-90, lt=90)] | None
-    distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])] | None
-    fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None
     object: str
     split: Literal[(None, *SPLITS)]
+    azimuth_deg: Annotated[float, Field(strict=False, gt=-limits.ANGLE_DEG, lt=limits.ANGLE_DEG)] | None = None
+    elevation_deg: Annotated[float, Field(strict=False, gt=-90, lt=90)] | None = None
+    distance: Annotated[float, Field(strict=False, gt=0.5, lt=limits.DISTANCE[1])] | None = None
+    fov_deg: Annotated[float, Field(strict=False, gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None = None
 
 
 def load(
@@ -243,14 +243,7 @@ def _photo(table: Path, line: int, row: dict[str, Any], masks: dict[str, Path], 
             mask=masks.get(file.stem),
             object=values.get("object") or file.stem,
             split=values.get("split") or None,
-            **{name: _number(values[name]) if name in values else None for name in NUMBERS},
+            **{name: values[name] for name in NUMBERS if name in values},
         )
     except ValueError as error:
         raise DamagedFile(table, f"line {line}: {error}") from None
-
-
-def _number(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text

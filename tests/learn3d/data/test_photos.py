@@ -135,7 +135,7 @@ def test_photos_without_objects_are_objects_of_their_own(chairs: Path) -> None:
 
 def test_the_split_of_an_object_is_a_matter_of_its_name(made: Path) -> None:
     table = made / "chair" / "poses.csv"
-    rows = [photos.Photo(k, Path(f"{k}.jpg"), None, 0.0, 0.0, 3.0, 40.0, f"object{k}", None) for k in range(200)]
+    rows = [photos.Photo(k, Path(f"{k}.jpg"), None, f"object{k}", None, 0.0, 0.0, 3.0, 40.0) for k in range(200)]
     one = split_objects(table, rows)
     assert [list(one.values()).count(split) for split in ("train", "val", "test")] == [140, 20, 40]
     assert split_objects(table, rows[::-1]) == one
@@ -170,16 +170,16 @@ def test_a_direction_without_training_photos_gets_the_nearest_class() -> None:
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("azimuth_deg", "12,5", "azimuth_deg must be a valid number, got '12,5'"),
-        ("fov_deg", "nan", "fov_deg must be a finite number, got nan"),
-        ("elevation_deg", "90", "elevation_deg must be less than 90, got 90"),
-        ("distance", "0.3", "distance must be greater than 0.5, got 0.3"),
+        ("azimuth_deg", "12,5", "azimuth_deg must be a valid number, .* got '12,5'"),
+        ("fov_deg", "nan", "fov_deg must be a finite number, got 'nan'"),
+        ("elevation_deg", "90", "elevation_deg must be less than 90, got '90'"),
+        ("distance", "0.3", "distance must be greater than 0.5, got '0.3'"),
         ("split", "training", "split must be .*'train', 'val' or 'test', got 'training'"),
         ("file", "", "it must name a file in images/, got ''"),
         ("file", "../secret.png", "it must name a file in images/, got '../secret.png'"),
         ("file", "/etc/passwd", "it must name a file in images/, got '/etc/passwd'"),
         ("file", "chair000_0.jpg", "chair000_0.jpg is in two lines"),
-        ("fov_deg", "x" * 100_000, "fov_deg must be a valid number, got 'x{100,300}"),
+        ("fov_deg", "x" * 100_000, "fov_deg must be a valid number, .* got 'x{100,300}"),
     ],
     ids=range(10),
 )

@@ -91,7 +91,7 @@ def test_masks_cameras_and_voxels(made):
             relative = error / torch.minimum(*shifted)
             assert relative.max() < 0.5 and relative.mean() < 0.25, (split, relative)
             if dataset.voxels is not None:
-                voxels = dataset.voxelize(vertices, faces)[0].numpy()
+                voxels = dataset.convention.voxelize(vertices, faces)[0].numpy()
                 assert (voxels == dataset.voxels[number]).all()
             if dataset.points is not None:
                 low, high = vertices.numpy().min(0), vertices.numpy().max(0)

@@ -58,7 +58,9 @@ def test_every_format_round_trips_through_the_reader(tmp_path, folder):
     assert sorted(names) == ["box0.obj", "box1.off", "box2.ply", "box3.stl", "box4.glb", "more/torus.PLY"]
     for number, name in enumerate(names):
         vertices, faces = placed(folder / name)
-        assert torch.equal(dataset.voxelize(vertices, faces)[0], torch.from_numpy(dataset.voxels[number])), name
+        assert torch.equal(dataset.convention.voxelize(vertices, faces)[0], torch.from_numpy(dataset.voxels[number])), (
+            name
+        )
         alpha = nmr.render_silhouette(vertices, faces, view_poses(torch.arange(24)).cameras(), image_size=64)
         np.testing.assert_array_equal(images[number, :, 3], np.rint(255 * alpha.numpy()), err_msg=name)
     brightest, alpha = images[:, :, :3].max(axis=2), images[:, :, 3]  # colours are stored inverted
@@ -95,7 +97,7 @@ def test_only_training_objects_get_scaled_copies(tmp_path, folder):
     assert report.counts == {"train": 9, "val": 1, "test": 2} and len(set(report.objects["train"])) == 9
     dataset, _ = load(tmp_path / "data")
     name = json.loads((tmp_path / "data" / "03001627_card.json").read_text())["splits"]["train"][0]
-    own = dataset.voxelize(*placed(folder / name))[0].numpy()
+    own = dataset.convention.voxelize(*placed(folder / name))[0].numpy()
     np.testing.assert_array_equal(dataset.voxels[0], own)
     assert not np.array_equal(dataset.voxels[1], own) and not np.array_equal(dataset.voxels[1], dataset.voxels[2])
     for voxels in dataset.voxels:  # every copy fills the box again
