@@ -77,16 +77,14 @@ class AngleBins:
 
 
 def training_classes(
-    cells: np.ndarray, directions: np.ndarray, training_cells: np.ndarray, training_directions: np.ndarray
+    views: tuple[np.ndarray, np.ndarray], training: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Class int64 [M] in 0 .. K-1 of each view, and the cells int64 [K] of the classes: those with training views.
 
-    A view in another cell gets the class of the training view with the nearest direction, that is the largest dot
-    product. cells: int64 [M]. directions: float [M, D]. training_cells: int64 [T]. training_directions: float [T, D].
+    views: their cells int64 [M] and directions float [M, D]. training: those of the training views. A view in another
+    cell gets the class of the training view with the nearest direction, that is the largest dot product.
     """
-    kept = np.unique(training_cells)
-    unseen = ~np.isin(cells, kept)
-    nearest = (directions[unseen] @ training_directions.T).argmax(axis=1)
-    cells = cells.copy()
-    cells[unseen] = training_cells[nearest]
+    cells, unseen = views[0].copy(), ~np.isin(views[0], training[0])
+    cells[unseen] = training[0][(views[1][unseen] @ training[1].T).argmax(axis=1)]
+    kept = np.unique(training[0])
     return np.searchsorted(kept, cells), kept

@@ -8,9 +8,9 @@ classes are 24 cells of azimuth.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NoReturn
 
 from learn3d.data.conventions import KATO, LayoutProperties
-from learn3d.data.dataset import ViewDataset
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.reading import STRICT, Findings, MissingFile
 
@@ -18,11 +18,10 @@ PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
 BINS = AngleBins.parse("15x70:-10:60")
 
 
-def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> ViewDataset | None:
+def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> NoReturn:
     """Raise MissingFile, as only shards exist."""
-    raise MissingFile(
-        Path(folder), f"has no shards of {category}, {split}; make them: learn3d make-dataset --layout around --shards"
-    )
+    hint = "make them: learn3d make-dataset --layout around --shards"
+    raise MissingFile(Path(folder), f"has no shards of {category}, {split}; {hint}")
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from learn3d.data.categories import find_splits
+from learn3d.data.categories import find_splits, synset_of
 from learn3d.data.conventions import VOXEL_SIZE, LayoutProperties, VoxelConvention
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import SMALLEST, Crops, bounds
@@ -41,8 +41,7 @@ IMAGE_SIZE = 224
 CATEGORIES = ("aeroplane", "car", "chair")
 FILES = {"train": ("train", "imagenet"), "val": ("val",), "test": ("val",)}
 CELL_DEG = 45
-_CELLS = 360 // CELL_DEG
-_OTHER_NAMES = {"airplane": "aeroplane", "02691156": "aeroplane", "02958343": "car", "03001627": "chair"}
+_CELLS = (360 // CELL_DEG,) * 3
 _X_RIGHT = np.diag([-1.0, 1.0, 1.0])
 _WANTED = "an npz file of Pascal3D+ as packed by the authors of view prior learning"
 _SHAPES = {  # other arrays -> shape of an item
@@ -106,16 +105,15 @@ def rotation_cells(rotations: np.ndarray) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Gimbal lock")
         angles = Rotation.from_matrix(rotations).as_euler("yzx", degrees=True)
-    cells = np.floor((np.round(angles, 3) + 180) / CELL_DEG).astype(np.int64).clip(0, _CELLS - 1)
-    return (cells[:, 0] * _CELLS + cells[:, 1]) * _CELLS + cells[:, 2]
+    cells = np.floor((np.round(angles, 3) + 180) / CELL_DEG).astype(np.int64).clip(0, _CELLS[0] - 1)
+    return np.ravel_multi_index(cells.T, _CELLS)
 
 
 def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Class int64 [M] in 0 .. K-1 of each rotation [M, 3, 3], and the K names. Classes are cells of `training`."""
     # The trace of A^T B grows as the angle between the rotations A and B falls.
-    flat, training_flat = rotations.reshape(-1, 9), training.reshape(-1, 9)
-    ids, kept = training_classes(rotation_cells(rotations), flat, rotation_cells(training), training_flat)
-    middle = [[-180 + CELL_DEG * (c // _CELLS**k % _CELLS + 0.5) for k in (2, 1, 0)] for c in kept]
+    ids, kept = training_classes(*((rotation_cells(r), r.reshape(-1, 9)) for r in (rotations, training)))
+    middle = -180 + CELL_DEG * (np.stack(np.unravel_index(kept, _CELLS), axis=1) + 0.5)
     return ids, tuple(f"y {y:g}°, z {z:g}°, x {x:g}°" for y, z, x in middle)
 
 
@@ -127,10 +125,10 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
 
 def class_name(category: str) -> str:
     """The name of a category in Pascal3D+, from this name, Kato's name or the synset id; ValueError for others."""
-    name = _OTHER_NAMES.get(category, category)
-    if name not in CATEGORIES:
-        raise ValueError(f"Pascal3D+ has the categories {', '.join(CATEGORIES)}; got {category!r}")
-    return name
+    for name in CATEGORIES:
+        if synset_of(name) == synset_of(category):
+            return name
+    raise ValueError(f"Pascal3D+ has the categories {', '.join(CATEGORIES)}; got {category!r}")
 
 
 def _paths(folder: Path | str, category: str, split: str) -> list[Path]:

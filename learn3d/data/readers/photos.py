@@ -144,12 +144,13 @@ def choose_bins(poses: LookAtPoses) -> AngleBins:
 def view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray, tuple[str, ...]]:
     """Class int64 [M] in 0 .. K-1 of each of M poses, and the K names. Classes are the cells of `training`."""
     bins = choose_bins(training)
-    cells, training_cells = (bins.ids(p).numpy() for p in (poses, training))
-    eyes, training_eyes = (
-        nmr.cameras.points_from_angles(1.0, p.elevation_deg, p.azimuth_deg).numpy() for p in (poses, training)
-    )
-    ids, kept = training_classes(cells, eyes, training_cells, training_eyes)
     names = bins.names()
+
+    def describe(poses: LookAtPoses) -> tuple[np.ndarray, np.ndarray]:
+        eyes = nmr.cameras.points_from_angles(1.0, poses.elevation_deg, poses.azimuth_deg)
+        return bins.ids(poses).numpy(), eyes.numpy()
+
+    ids, kept = training_classes(describe(poses), describe(training))
     return ids, tuple(names[k] for k in kept)
 
 

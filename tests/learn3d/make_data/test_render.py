@@ -58,9 +58,8 @@ def test_every_format_round_trips_through_the_reader(tmp_path, folder):
     assert sorted(names) == ["box0.obj", "box1.off", "box2.ply", "box3.stl", "box4.glb", "more/torus.PLY"]
     for number, name in enumerate(names):
         vertices, faces = placed(folder / name)
-        assert torch.equal(dataset.convention.voxelize(vertices, faces)[0], torch.from_numpy(dataset.voxels[number])), (
-            name
-        )
+        own = dataset.convention.voxelize(vertices, faces)[0]
+        assert torch.equal(own, torch.from_numpy(dataset.voxels[number])), name
         alpha = nmr.render_silhouette(vertices, faces, view_poses(torch.arange(24)).cameras(), image_size=64)
         np.testing.assert_array_equal(images[number, :, 3], np.rint(255 * alpha.numpy()), err_msg=name)
     brightest, alpha = images[:, :, :3].max(axis=2), images[:, :, 3]  # colours are stored inverted
