@@ -17,10 +17,8 @@ from learn3d.data.layouts import Layout, check_folder, load_dataset
 from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
-from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.debian.models import FetchConfig, fetch_debian_models
-from learn3d.make_data.render import make_dataset
-from learn3d.make_data.sharded import make_shards
+from learn3d.make_data.debian.models import fetch_debian_models
+from learn3d.make_data.render import DatasetConfig, make_dataset, make_shards
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.views import (
@@ -37,7 +35,7 @@ from learn3d.terminal import is_watched, note, say
 
 
 class MakeDataset(Command):
-    """Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of a published one.
+    """Render a data set from a folder of meshes or procedural shapes, in the layout of a published one.
 
     Examples:
       learn3d make-dataset --output data --category chair --source my_chairs --augment 5
@@ -61,11 +59,14 @@ class FetchDebianModels(Command):
       learn3d fetch-debian-models --output models
     """
 
-    config: FetchConfig
+    output: Path
+    """Folder to write; it must not exist."""
+    packages_dir: Path | None = None
+    """Folder for the .deb files; missing ones are downloaded into it (default: a temporary folder)."""
 
     def run(self) -> None:
-        say(fetch_debian_models(self.config, progress=is_watched()).summary())
-        say(f"written to {self.config.output}")
+        say(fetch_debian_models(self.output, self.packages_dir, progress=is_watched()).summary())
+        say(f"written to {self.output}")
 
 
 class CheckDataset(Command):

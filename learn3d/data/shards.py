@@ -46,7 +46,7 @@ from learn3d.settings import checked
 SET_FILE = "set.json"
 SHARD_BYTES = 2**28  # approximate size of the images in a shard
 _FILES = 5 * "[0-9]" + "*.safetensors"
-_REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes from `make_data.sharded`
+_REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes from `make_data.render`
 _ARRAYS = ("images", "masks", "depth", "voxels", "points")
 _DTYPES = {  # name of a tensor -> names of its dtype in safetensors and NumPy; all others are float32
     **dict.fromkeys(("images", "masks", "depth"), ("U8", np.uint8)),

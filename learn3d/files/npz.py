@@ -24,11 +24,6 @@ from learn3d.files.reading import open_file
 _BYTES_PER_SECOND = 3e7  # a tenth of the speed of decompression
 
 
-def keys(path: Path) -> list[str]:
-    """Names of the arrays of an npz file."""
-    return [name.removesuffix(".npy") for name in _archive(path).namelist()]
-
-
 def read(path: Path, key: str, max_bytes: int | None = None) -> np.ndarray:
     """The array `key`, of numbers or bools. Raises ValueError for other arrays and larger ones.
 
@@ -102,7 +97,7 @@ def _archive(path: Path) -> zipfile.ZipFile:
     return _cached(path, status.st_ino, status.st_mtime_ns, status.st_size)
 
 
-@functools.lru_cache(maxsize=1)  # a mesh pack is read array by array; its file status is the key for changes
+@functools.lru_cache(maxsize=1)  # files are read array by array; the file status is the key for changes
 def _cached(path: Path, *_: int) -> zipfile.ZipFile:
     return zipfile.ZipFile(open_file(path, limits.ARRAY_BYTES, "an npz file"))
 

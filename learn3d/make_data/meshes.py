@@ -1,57 +1,165 @@
-"""Sources of meshes: a folder of files, a mesh pack (npz) or the procedural generator."""
+"""Settings of `learn3d make-dataset`, and the meshes of each split: files of a folder, or generated shapes."""
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
+from trimesh import Trimesh
 
-from learn3d.files import npz, sandbox
+from learn3d.data import conventions
+from learn3d.data.categories import SPLITS, synset_of
 from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
+from learn3d.make_data.writers import WRITERS, WrittenLayout
+from learn3d.settings import Count, FilePath, Rare, Weight, checked
 from learn3d.shapes import CATEGORIES, numbered_shape
 
 MAX_FACES = 1_000_000
-Source = Callable[[], RawMesh]  # reads one mesh, or raises ValueError if its file is damaged; can be pickled
-_PACK = "an npz file with v0, f0, v1, f1, ... and no pickled objects"
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+Amount = Annotated[int, Field(ge=0)]
+WITHOUT_EFFECT = {"output", "overwrite", "shards", "jobs"}  # options that do not change the content of the files
 
 
-def list_sources(source: Path) -> dict[str, Source]:
-    """The meshes of a folder (by relative path, sorted) or of a mesh pack (by number).
+@checked
+class DatasetConfig:
+    """One category of a data set: its meshes, its layout and its splits. The same settings give the same bytes."""
 
-    A pack is an npz file with v0 float [V, 3], f0 int [F, 3], v1, f1, ... Raises FileNotFoundError if there is no such
-    file or folder, ValueError if it holds no mesh.
+    output: FilePath
+    """Folder for the files. It may hold other categories, too."""
+    category: str
+    """Name of the category. File names have a synset id instead of each of Kato's 13 names."""
+    layout: WrittenLayout = "kato"
+    """Published data set whose file layout and viewpoints are used, see docs/data-sets.md."""
+    views: Count | None = None
+    """Views of each object (default: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos and around; kato and dvr
+    always have 24)."""
+    source: FilePath | None = None
+    """Folder of meshes, searched recursively (default: shapes from --procedural)."""
+    procedural: Amount = 0
+    """Number of shapes from the procedural generator, instead of meshes from files or together with them."""
+    test: Weight | None = None
+    """Share (below 1, at least 4 meshes) or number of the meshes for the test split (default: 0.2; pascal3d has no test
+    split)."""
+    val: Weight | None = None
+    """Share or number of the meshes for the validation split, 0 for none (default: 0.1, for pascal3d 0.2; r2n2 has no
+    validation split)."""
+    augment: Amount = 0
+    """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75 .. 1.25. With --source,
+    shapes of --procedural get none."""
+    up: Axis = "y"
+    """Axis of the mesh files that points up."""
+    front: Axis | None = None
+    """Axis of the mesh files that faces the camera of view 0 (default: x, or y if x is up; z for procedural shapes)."""
+    seed: Rare[Amount] = 0
+    """Seed of the splits, scales, colours, views and procedural shapes."""
+    overwrite: bool = False
+    """Replace files of this category that are already in the folder."""
+    shards: bool = False
+    """Write shards, for data sets that exceed the memory (docs/scale.md). Only for the layouts kato and around. If the
+    command is interrupted, run it again: it continues."""
+    jobs: Count = 1
+    """Number of processes, each of which makes one shard at a time."""
+
+    def __post_init__(self) -> None:
+        if self.source is None and self.procedural == 0:
+            raise ValueError("give --source (a folder of meshes), --procedural (a number), or both")
+        if self.source and self.procedural and (self.up, self.front_axis) != ("y", "z"):
+            raise ValueError("with --procedural, meshes of --source must have its axes: --up y --front z")
+        writer = WRITERS[self.layout]
+        if self.shards and writer.join is None:
+            raise ValueError(
+                f"shards need the layout kato or around, not {self.layout}; make the data set without --shards, and "
+                "convert it (learn3d convert-dataset)"
+            )
+        if not self.shards and (self.jobs > 1 or writer.write is None):
+            raise ValueError("--jobs and the layout around are for shards: add --shards")
+        synset_of(self.category)
+        conventions.mesh_to_object(self.up, self.front_axis)
+        for name in ("views", "test", "val"):
+            value = getattr(writer, f"default_{name}")
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+            if value == 0 and getattr(self, name) != 0:
+                raise ValueError(f"the layout {self.layout} has no {name} split; leave {name} at 0")
+        if writer.views is None and self.views != writer.default_views:
+            raise ValueError(f"the layout {self.layout} has {writer.default_views} views per object, not {self.views}")
+        if writer.fixed_splits and (self.test != writer.default_test or self.augment):
+            raise ValueError(
+                f"the splits of the layout {self.layout} are fixed: the first 80 % of the sorted ids are for training; "
+                "leave test at 0.2 and augment at 0, or choose another layout"
+            )
+
+    @property
+    def front_axis(self) -> str:
+        """Axis of the mesh files that faces the camera of view 0."""
+        return self.front or ("z" if self.procedural else "y" if self.up.endswith("x") else "x")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings that determine the files, as JSON values."""
+        settings = {name: value for name, value in asdict(self).items() if name not in WITHOUT_EFFECT}
+        return settings | {"source": self.source and self.source.name}
+
+
+@dataclass(frozen=True)
+class Item:
+    """A mesh to render."""
+
+    number: int  # index among all meshes; it seeds scale, colour and views
+    name: str  # name of the object, valid as a file name
+    split: str
+    file: str  # name of the mesh in its source
+    read: Callable[[], RawMesh | Trimesh]  # raises ValueError if the file is damaged; can be pickled
+    copies: int  # objects that are made of it
+
+
+def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
+    """The meshes of each of the splits train, val and test. Raises ValueError if there are none to train on."""
+    if config.procedural and config.category not in CATEGORIES:
+        raise ValueError(f"the procedural generator makes {', '.join(CATEGORIES)}; got category {config.category!r}")
+    found = mesh_files(config.source) if config.source else {}
+    sources = {name: partial(read_mesh, found[name]) for name in sorted(found)}
+    for i in range(config.procedural):
+        sources[f"{config.category}_{i:05d}"] = partial(numbered_shape, config.category, config.seed, i)
+    augmented = len(found) or config.procedural
+    names, files = object_names(sources), list(sources)
+    numbers = split_objects(len(files), config.test, config.val, config.seed)
+
+    def item(number: int, split: str) -> Item:
+        copies = 1 + config.augment if split == "train" and number < augmented else 1
+        return Item(number, names[number], split, files[number], sources[files[number]], copies)
+
+    return {split: [item(number, split) for number in numbers[split].tolist()] for split in SPLITS}
+
+
+def mesh_files(folder: Path) -> dict[str, Path]:
+    """The mesh files in a folder and below by their relative paths. Raises ValueError if there are none."""
+    if found := {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.suffix.lower() in EXTENSIONS}:
+        return found
+    raise ValueError(f"there is no mesh in {folder}; give a folder of meshes ({', '.join(EXTENSIONS)})")
+
+
+def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
+    """Object numbers int64 of each split: a random permutation, cut into test, val and train.
+
+    `test` and `val` are counts, or shares below 1. A share gives at least 4 objects, or an equal part of few objects.
+    With test = 0.2 and val = 0, test is `default_rng(seed).permutation(count)[:max(4, round(0.2 * count))]`.
+    Raises ValueError if no object is left for training.
     """
-    if source.is_dir():
-        files = {p.relative_to(source).as_posix(): p for p in source.rglob("*") if p.suffix.lower() in EXTENSIONS}
-        found = {name: functools.partial(read_mesh, files[name]) for name in sorted(files)}
-    elif source.suffix == ".npz":
-        count = sum(bool(re.fullmatch(r"v\d+", key)) for key in sandbox.read(npz.keys, source, wanted=_PACK))
-        found = {f"{i:0{len(str(count - 1))}d}": functools.partial(_packed, source, i) for i in range(count)}
-    else:
-        kind = ValueError if source.exists() else FileNotFoundError
-        raise kind(f"the source must be a folder of meshes or a mesh pack (.npz), got {source}")
-    if not found:
-        raise ValueError(f"there is no mesh in {source}; it must be {_PACK}, or a folder of {', '.join(EXTENSIONS)}")
-    return found
-
-
-def _packed(path: Path, number: int) -> RawMesh:
-    return RawMesh(*(sandbox.read(npz.read, path, f"{kind}{number}", wanted=_PACK) for kind in "vf"))
-
-
-def procedural_sources(category: str, count: int, seed: int) -> dict[str, Source]:
-    """`count` shapes of the procedural generator; shape i depends on the seed and i alone."""
-    if category not in CATEGORIES:
-        raise ValueError(f"the procedural generator makes {', '.join(CATEGORIES)}; got category {category!r}")
-    return {f"{category}_{i:05d}": functools.partial(_procedural, category, seed, i) for i in range(count)}
-
-
-def _procedural(category: str, seed: int, number: int) -> RawMesh:
-    shape = numbered_shape(category, seed, number)
-    return RawMesh(shape.vertices, shape.faces)
+    least = min(4, count // (1 + (test > 0) + (val > 0)))
+    sizes = [int(part) if part >= 1 else max(least * (part > 0), round(part * count)) for part in (test, val)]
+    if sum(sizes) >= count:
+        raise ValueError(
+            f"test ({sizes[0]}) and val ({sizes[1]}) leave none of the {count} meshes to train on; give more meshes, "
+            "or a smaller test or val"
+        )
+    order = np.random.default_rng(seed).permutation(count)
+    return dict(zip(("test", "val", "train"), np.split(order, np.cumsum(sizes)), strict=True))
 
 
 def object_names(files: Iterable[str]) -> list[str]:
@@ -67,13 +175,9 @@ def object_names(files: Iterable[str]) -> list[str]:
     return list(names.values())
 
 
-def check(mesh: RawMesh) -> RawMesh:
-    """The mesh without unused vertices, as float64 and int64. Raises ValueError if it cannot be rendered."""
+def check(mesh: RawMesh | Trimesh) -> RawMesh:
+    """The mesh without unused vertices. Raises ValueError if it cannot be rendered."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    numbers = vertices.dtype.kind in "fiu" and faces.dtype.kind in "iu"
-    if not numbers or vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-        shapes = f"{vertices.dtype} {list(vertices.shape)}, {faces.dtype} {list(faces.shape)}"
-        raise ValueError(f"not a triangle mesh: wanted vertices float [V, 3] and faces int [F, 3], got {shapes}")
     if not 0 < len(faces) <= MAX_FACES:
         raise ValueError(f"too large: {len(faces)} faces, the limit is {MAX_FACES}" if len(faces) else "no faces")
     if faces.min() < 0 or faces.max() >= len(vertices):

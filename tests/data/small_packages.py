@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.make_data.debian.models import FetchConfig, Report, fetch_debian_models
+from learn3d.make_data.debian.models import Report, fetch_debian_models
 
 CATALOGUE = "PluginFurnitureCatalog.properties"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
@@ -90,4 +90,4 @@ def entry(name: str, stem: str, **more: str) -> dict:
 
 def fetch(folder: Path, debs: Path | None) -> Report:
     """The recipe on a folder of packages."""
-    return fetch_debian_models(FetchConfig(output=folder, packages_dir=debs), progress=False)
+    return fetch_debian_models(folder, debs, progress=False)

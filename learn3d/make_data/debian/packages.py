@@ -1,180 +1,183 @@
-"""Reads files from Debian packages without installing them, and meshes in their formats OBJ and AC3D.
+"""What is taken from Debian's packages: furniture from Sweet Home 3D's catalogues, airplanes from FlightGear's models.
 
-trimesh does not read AC3D. From OBJ it makes a fan of each polygon, which fills the gaps of concave polygons such as
-the backs of some chairs. These readers return positions and triangles only.
+A catalogue (.sh3f) is a zip archive with a properties file (name#N, model#N, modelRotation#N, ...) and one OBJ per
+model. AI aircraft are AC3D files (.ac) with XML files beside them.
 """
 
 from __future__ import annotations
 
+import io
 import re
-import subprocess
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
-from pathlib import Path
-from typing import NamedTuple
+import zipfile
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import PurePosixPath
 
 import numpy as np
+import trimesh
+from scipy.spatial.distance import cdist
+
+from learn3d.files.formats import RawMesh
+from learn3d.make_data.debian.formats import read_ac3d, read_obj
+
+#: Facts about a model of a package, which are columns of index.csv, with `stem`, the file name to use without suffix;
+#: and a function that reads it (y up, front +z), or raises ValueError.
+Model = tuple[dict[str, str], Callable[[], RawMesh]]
+
+# The first pattern found in an entry's English name, in lower case, gives its category; None skips the entry.
+FURNITURE_RULES: tuple[tuple[str, str | None], ...] = (
+    (r"\b(switch|racket|bat|fan|freezer|wheelchair|ottoman|swinging|opened|skylight|tablet|flashlight)\b", None),
+    (r"\b(knife|towel|clothes|hat|cd|wine|speech) .*\b(stand|rack|unit)\b|washbasin|changing table|extension", None),
+    (r"candle|artwork", None),
+    (r"\b(lamp|lantern|chandelier|lamppost|(light|lights|spotlight|strip)$)", "lamp"),
+    (r"\b(sofa|couch|settee)\b", "sofa"),
+    (r"\b(chair|armchair|stool|class seat)\b", "chair"),
+    (r"\b(bedside table|night ?stand|tv stand)\b", "cabinet"),
+    (r"\b(table|desk|workbench)\b", "table"),
+    (r"\b(corner |cube )?shelf( (cherry|maple))?$", None),  # a board on the wall
+    (r"\b(cabinet|cupboard|wardrobe|bookcase|dresser|sideboard|locker|commode|chest|closet)\b", "cabinet"),
+    (r"\b(drawers?|shelves|bookshelves|shelving|shelf|rack)\b", "cabinet"),
+)
+# Models with misleading names: two bedside ends of beds, a bathroom with its basin, two boards on a wall.
+SKIPPED_MODELS = ("comodinoSinistro", "comodinoSinistroCiliegio", "bathroomFurniture", "shelving")
+SKIPPED_SECTIONS = ("Characters", "Doors and windows", "Staircases", "Vehicles")
 
 
-class Candidate(NamedTuple):
-    """A model in a package."""
-
-    category: str
-    title: str
-    author: str
-    licence: str
-    source: str  # path inside the package
-    stem: str  # file name to use, without suffix
-    read: Callable[[], tuple[np.ndarray, np.ndarray]]  # vertices float64 [V, 3] (y up, front +z), faces int64 [F, 3]
+def furniture_category(name: str, section: str = "") -> str | None:
+    """Category of a catalogue entry from its English name and its section; None if the entry is skipped."""
+    if section in SKIPPED_SECTIONS:
+        return None
+    return next((category for pattern, category in FURNITURE_RULES if re.search(pattern, name.lower())), None)
 
 
-def get_package(name: str, folder: Path) -> Path:
-    """The .deb file of a package in `folder`. If it is missing, apt-get downloads it, which needs no root rights.
+def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
+    """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
+    entries: defaultdict[int, dict[str, str]] = defaultdict(dict)  # N -> entry; general properties under 0
+    for key, number, value in re.findall(r"^\s*(\w+)(?:#(\d+))?\s*=[^\S\n]*(.*)$", text, re.MULTILINE):
+        value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
+        entries[int(number or 0)][key] = value
+    general = entries.pop(0, {})
+    return general, [entries[number] for number in sorted(entries)]
 
-    Raises ValueError if apt-get fails, OSError if it is not installed.
+
+def place_furniture(vertices: np.ndarray, entry: Mapping[str, str]) -> np.ndarray:
+    """Vertices [V, 3] turned by the entry's modelRotation (nine numbers by rows, p' = R p) and stretched to its box.
+
+    The box is width x height x depth along x, y, z, as Sweet Home 3D draws it: y up, the front towards +z.
     """
-    if not any(folder.glob(f"{name}_*.deb")):
-        result = subprocess.run(["apt-get", "download", "-q", name], cwd=folder, capture_output=True, text=True)
-        if result.returncode != 0:
-            raise ValueError(
-                f"apt-get could not download {name} ({result.stderr.strip()}); run `apt-get update` as root, enable "
-                "the component non-free if the package is in it, or put the .deb file into the folder --packages-dir"
-            )
-    return max(folder.glob(f"{name}_*.deb"), key=lambda path: [*map(int, re.findall(r"\d+", path.name))])
+    if "modelRotation" in entry:
+        vertices = vertices @ np.array(entry["modelRotation"].split(), dtype=np.float64).reshape(3, 3).T
+    if all(key in entry for key in ("width", "height", "depth")):
+        extents = np.ptp(vertices, axis=0)
+        if (extents > 0).all():
+            vertices = vertices * ([float(entry[key]) for key in ("width", "height", "depth")] / extents)
+    return vertices
 
 
-def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    """The regular files of a .deb file whose paths (relative to /) end in one of `suffixes`: path -> content.
+def furniture_models(files: Mapping[str, bytes]) -> Iterator[Model]:
+    """The pieces of furniture of every catalogue of a package, by catalogue and entry number."""
+    for path in sorted(path for path in files if path.endswith(".sh3f")):
+        archive, catalogue = zipfile.ZipFile(io.BytesIO(files[path])), PurePosixPath(path)
+        general, entries = read_catalogue(archive.read("PluginFurnitureCatalog.properties").decode("latin-1"))
+        for entry in entries:
+            model = PurePosixPath(entry.get("model", "").removeprefix("/"))
+            category = furniture_category(entry.get("name", ""), entry.get("category", ""))
+            if category is not None and model.stem not in SKIPPED_MODELS:
+                facts = {
+                    "category": category,
+                    "title": entry["name"],
+                    "author": entry.get("creator", ""),
+                    "licence": " ".join(entry.get("license", general.get("license", "see the package")).split()),
+                    "source": f"{catalogue.name}!/{model}",
+                    "stem": f"{catalogue.stem}-{model.stem}",
+                }
+                yield facts, partial(_read_furniture, archive, str(model), entry)
 
-    Raises ValueError for a damaged file, OSError if dpkg-deb is not installed.
+
+def _read_furniture(archive: zipfile.ZipFile, model: str, entry: Mapping[str, str]) -> RawMesh:
+    if not model.lower().endswith(".obj") or model not in archive.namelist():
+        raise ValueError("the catalogue has no OBJ file of it")
+    mesh = read_obj(archive.read(model).decode("latin-1"))
+    return RawMesh(place_furniture(mesh.vertices, entry), mesh.faces)
+
+
+AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft/"
+# Paths below AI/Aircraft that are no airplanes, or only a part of one.
+NOT_AIRPLANES = re.compile(
+    r"balloon|ferry|ship|heli|vehicle|truck|bluebird|shuttle|flash2a|(^|/)(lights?|refuel\w*)/|"
+    r"(light(?!ning)|flare|/flash\.|beacon|strobe|toggle|/nav[lr]?\.|navback|taxi\.|wheel|tank|probe|refuel|exhaust|"
+    r"banner|pilot|engine|gear|ssme|oms)[^/]*$",
+    re.IGNORECASE,
+)
+# Names of objects in a file that draw motion, light or smoke, or the pilot; they are skipped.
+EFFECTS = re.compile(
+    r"prop.*dis[ck]|prplr-disk|disque.?helice|giro.?helice|(?<!ou)blur|prop.*(fast|slow)|(fast|slow)prop|"
+    r"halo|glow|flare|^flash\d*$|recog$|flame|burner|cond?ens|chute$|light-?cone|banner|noshadow|"
+    r"^pilot($|[-_])|helmet",
+    re.IGNORECASE,
+)
+MIN_DISC = 0.09  # diameter of a propeller disc over the longest side of the airplane
+DETACHED = 2e-3  # distance, over the longest side, at which a quadrilateral is not joined to other parts
+
+
+def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:
+    """The parts without propeller discs and detached quadrilaterals: textures on them draw motion, light or vapour.
+
+    A disc, or the square with its texture, is a part with a round or square outline that is wider than MIN_DISC. Its
+    depth along the flight direction x is below 3 % of its diameter. A detached quadrilateral is a part of one or two
+    triangles farther than DETACHED from all others, except from its own reverse side.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        if subprocess.run(["dpkg-deb", "--extract", package, folder], capture_output=True).returncode != 0:
-            raise ValueError(f"{package} cannot be read as a Debian package; download it again")
-        found = [path for path in Path(folder).rglob("*") if path.as_posix().endswith(suffixes)]
-        regular = [path for path in found if path.is_file() and not path.is_symlink()]
-        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in regular}
+    corners = [part.vertices[np.unique(part.faces)] for part in parts]
+    size = np.ptp(np.concatenate(corners), axis=0).max()
+
+    def is_disc(part: RawMesh, own: np.ndarray) -> bool:
+        x, y, z = np.ptp(own, axis=0)
+        area = trimesh.triangles.area(part.vertices[part.faces]).sum()
+        return max(y, z) > max(MIN_DISC * size, x / 0.03) and min(y, z) > 0.8 * max(y, z) and area > 0.55 * y * z
+
+    def is_alone(own: np.ndarray) -> bool:
+        middle = own.mean(axis=0)
+        others = [points for points in corners if np.abs(points.mean(axis=0) - middle).max() > DETACHED * size]
+        return min((cdist(points, own).min() for points in others), default=0) > DETACHED * size
+
+    found = zip(parts, corners, strict=True)
+    return [part for part, own in found if not is_disc(part, own) and not (len(part.faces) <= 2 and is_alone(own))]
 
 
-class Part(NamedTuple):
-    """One object of an AC3D file, in the frame of the file."""
-
-    vertices: np.ndarray  # float64 [V, 3]
-    faces: np.ndarray  # int64 [F, 3]
-
-
-def read_obj(text: str) -> Part:
-    """Vertices and triangles of a Wavefront OBJ text; ValueError if it is malformed."""
-    rows, polygons = [], []
-    for line in text.splitlines():
-        fields = line.split() or [""]
-        if fields[0] == "v":
-            rows.append(fields[1:4])
-        elif fields[0] == "f" and len(fields) > 3:
-            indices = [int(field.split("/", 1)[0]) for field in fields[1:]]
-            polygons.append([i - 1 if i > 0 else len(rows) + i for i in indices])
-    vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    return Part(vertices, triangulate(polygons, vertices))
-
-
-def read_ac3d(text: str, skip: Callable[[str], object]) -> list[Part]:
-    """Objects of an AC3D text with at least one polygon, placed by the `loc` and `rot` of their ancestors.
-
-    Skips lines (surface types 1 and 2), and objects with a name that `skip` accepts, with their children. Frame of
-    FlightGear's models: nose towards -x, y up, left wing towards +z. Raises ValueError if the text is not AC3D or
-    incomplete.
-    """
-    lines = (line for line in map(str.strip, text.splitlines()) if line)  # some exporters add blank lines
-    if not next(lines, "").startswith("AC3D"):
-        raise ValueError("not an AC3D file: it does not start with AC3D")
-    try:
-        return list(_read_objects(lines, 1, np.eye(3), np.zeros(3), skip))
-    except (RuntimeError, IndexError) as error:  # a generator turns StopIteration into a RuntimeError
-        raise ValueError("the AC3D file ends in the middle of an object") from error
+def aircraft_models(files: Mapping[str, bytes]) -> Iterator[Model]:
+    """The airplanes among the files of the package, by path."""
+    texts = {p.removeprefix(AIRCRAFT): text.decode("latin-1") for p, text in files.items() if p.startswith(AIRCRAFT)}
+    authors: dict[tuple[str, str], str] = {}  # (folder, name of a model file in it) -> author
+    for path, text in texts.items():
+        if path.endswith(".xml") and (author := re.search(r"<author>([^<]+)</author>", text)):
+            name = " ".join(author[1].split())
+            for model in re.findall(r"<path>([^<]+)</path>", text):
+                key = path.split("/", 1)[0], PurePosixPath(model.strip()).name
+                authors[key] = min(authors.get(key, name), name)
+    for path in sorted(path for path in texts if path.endswith(".ac") and not NOT_AIRPLANES.search(path)):
+        folder, stem = path.split("/", 1)[0], PurePosixPath(path).stem
+        facts = {
+            "category": "airplane",
+            "title": f"{folder} {stem}",
+            "author": authors.get((folder, PurePosixPath(path).name), "the FlightGear team"),
+            "licence": "GPL-2+",
+            "source": AIRCRAFT + path,
+            "stem": stem if folder.lower() in stem.lower() else f"{folder}-{stem}",
+        }
+        yield facts, partial(_read_aircraft, texts[path])
 
 
-def _read_objects(
-    lines: Iterator[str], count: int, rotation: np.ndarray, translation: np.ndarray, skip: Callable[[str], object]
-) -> Iterator[Part]:
-    """The next `count` objects with their children. The parent's frame is v @ rotation [3, 3] + translation [3]."""
-    for _ in range(count):
-        if not any(line.startswith("OBJECT") for line in lines):
-            return
-        name, vertices, polygons, kind, key = "", np.zeros((0, 3)), [], -1, ""
-        turn, shift = np.eye(3), np.zeros(3)
-        while key != "kids":
-            key, _, value = next(lines).partition(" ")
-            if key == "name":
-                name = value.strip('"')
-            elif key == "data":
-                next(lines)  # free text, which may look like a key
-            elif key == "loc":
-                shift = np.array(value.split(), dtype=np.float64)
-            elif key == "rot":
-                turn = np.array(value.split(), dtype=np.float64).reshape(3, 3)
-            elif key == "numvert":
-                rows = [next(lines).split()[:3] for _ in range(int(value))]
-                vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
-            elif key == "SURF":
-                kind = int(value, 16) & 0xF
-            elif key == "refs":
-                polygon = [int(next(lines).split()[0]) for _ in range(int(value))]
-                if kind == 0 and len(polygon) > 2:
-                    polygons.append(polygon)
-        turn, shift = turn @ rotation, shift @ rotation + translation
-        children = list(_read_objects(lines, int(value), turn, shift, skip))
-        if not skip(name):
-            placed = vertices @ turn + shift
-            yield from [Part(placed, triangulate(polygons, placed))] if polygons else []
-            yield from children
+def _read_aircraft(text: str) -> RawMesh:
+    parts = remove_effects(read_ac3d(text, skip=EFFECTS.search))
+    vertices, faces = trimesh.util.append_faces([part.vertices for part in parts], [part.faces for part in parts])
+    # from FlightGear's frame (nose -x, y up, left wing +z) to front +z, y up, left +x
+    return RawMesh(np.stack([vertices[:, 2], vertices[:, 1], -vertices[:, 0]], axis=1), faces)
 
 
-def triangulate(polygons: Sequence[Sequence[int]], vertices: np.ndarray) -> np.ndarray:
-    """Triangles int64 [F, 3] of simple polygons, convex or not; ValueError if an index is outside of `vertices`.
-
-    A polygon is cut into a fan from its first corner if that does not fold over, else by its ears.
-    """
-    by_size: dict[int, list[Sequence[int]]] = {}
-    for polygon in polygons:
-        if min(polygon) < 0 or max(polygon) >= len(vertices):
-            raise ValueError(f"polygon {polygon} refers to a missing vertex; there are {len(vertices)}")
-        by_size.setdefault(len(polygon), []).append(polygon)
-    triangles = [np.empty((0, 3), dtype=np.int64)]
-    for size in sorted(by_size):
-        corners = np.array(by_size[size], dtype=np.int64)  # [P, size]
-        points = vertices[corners]
-        points = points - points[:, :1]
-        normals = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # Newell's method: right for concave ones
-        fan = np.stack([np.zeros(size - 2, dtype=np.int64), np.arange(1, size - 1), np.arange(2, size)], axis=1)
-        areas = np.cross(points[:, 1:-1], points[:, 2:])
-        folded = ((areas * normals[:, None]).sum(axis=2) < 0).any(axis=1)
-        triangles.append(corners[~folded][:, fan].reshape(-1, 3))
-        triangles += [corners[i][np.array(_cut_ears(points[i], normals[i]))] for i in np.flatnonzero(folded)]
-    return np.concatenate(triangles)
-
-
-def _cut_ears(points: np.ndarray, normal: np.ndarray) -> list[tuple[int, int, int]]:
-    """N - 2 triangles of a polygon [N, 3], by ear clipping in the coordinate plane of its largest projection."""
-    axis = int(np.abs(normal).argmax())
-    u, v = (axis + 1) % 3, (axis + 2) % 3
-    flat = points[:, [u, v] if normal[axis] >= 0 else [v, u]]  # counter-clockwise
-
-    def left_of(a: int, b: int, others: int | list[int]) -> np.ndarray:
-        """Twice the signed area of the triangles from a to b to each of the others: positive on the left."""
-        (x, y), to = flat[b] - flat[a], flat[others] - flat[a]
-        return x * to[..., 1] - y * to[..., 0]
-
-    corners, triangles = list(range(len(points))), []
-    while len(corners) > 3:
-        for at, j in enumerate(corners):
-            i, k = corners[at - 1], corners[(at + 1) % len(corners)]
-            inside = (left_of(i, j, corners) >= 0) & (left_of(j, k, corners) >= 0) & (left_of(k, i, corners) >= 0)
-            own = (flat[corners][:, None] == flat[[i, j, k]]).all(axis=2).any(axis=1)
-            if left_of(i, j, k) > 0 and not (inside & ~own).any():
-                triangles.append((i, j, k))
-                del corners[at]
-                break
-        else:
-            break  # the polygon crosses itself and has no ear: the rest becomes a fan
-    return triangles + [(corners[0], *pair) for pair in pairwise(corners[1:])]
+#: What is found in each package; the one from non-free is optional.
+PACKAGES = {
+    "sweethome3d-furniture": furniture_models,
+    "sweethome3d-furniture-nonfree": furniture_models,
+    "flightgear-data-ai": aircraft_models,
+}

@@ -4,21 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from learn3d.make_data.writers.around import AroundWriter
-from learn3d.make_data.writers.kato import DvrWriter, KatoWriter
-from learn3d.make_data.writers.photographs import Pascal3dWriter, PhotosWriter
-from learn3d.make_data.writers.shapenet import KarWriter, R2n2Writer
-from learn3d.make_data.writers.writer import RenderedObject, Writer
+from learn3d.make_data.writers.kato import AROUND, DVR, KATO
+from learn3d.make_data.writers.photographs import PASCAL3D, PHOTOS
+from learn3d.make_data.writers.shapenet import KAR, R2N2
 
-__all__ = ["WRITERS", "RenderedObject", "Writer", "WrittenLayout"]
-
-WRITERS: dict[str, type[Writer]] = {
-    "kato": KatoWriter,
-    "dvr": DvrWriter,
-    "kar": KarWriter,
-    "r2n2": R2n2Writer,
-    "pascal3d": Pascal3dWriter,
-    "photos": PhotosWriter,
-    "around": AroundWriter,
-}
+WRITERS = {"kato": KATO, "dvr": DVR, "kar": KAR, "r2n2": R2N2, "pascal3d": PASCAL3D, "photos": PHOTOS, "around": AROUND}
 WrittenLayout = Literal[tuple(WRITERS)]  # a layout may have a reader only

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import functools
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,68 +12,45 @@ import torch
 from PIL import Image
 
 import nmr
-from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.data.readers.pascal3d import PASCAL3D, class_name
-from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer, distances, uniform, write_png
+from learn3d.data.poses import RotationPoses
+from learn3d.data.readers import pascal3d
+from learn3d.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer, random_views, uniform, write_png
 
-FILES = ("train", "imagenet", "val")  # training images go to the first two alternately
 HEIGHTS, WIDTHS = (160, 300), (200, 400)  # ranges for photographs, in pixels
 SHARES = (0.5, 0.9)  # range of the side of the rendering over the shorter side of the photograph
 
 
-class Pascal3dWriter(Writer):
-    """`{class}_{train,imagenet,val}.npz`, with renderings on out-of-focus backgrounds as photographs.
+def _write_pascal3d(objects: Iterable[RenderedObject], category: str, folder: Path, _: Path) -> None:
+    """Write `{class}_{train,imagenet,val}.npz`, with renderings on out-of-focus backgrounds as photographs.
 
-    All rotations are proper (determinant 1), so the object frame is right-handed: x to the front, y up, z to the left
-    as seen from the front. Objects are symmetric about z = 0, as the symmetric generator requires. Half the diagonal of
-    the bounding box is 1, so that a rotated object stays in [-1, 1].
+    Training images go to the first two files alternately. Raises ValueError if there is only one.
     """
-
-    image_size = 224
-    default_views = 8
-    default_test = 0.0
-    default_val = 0.2
-    convention = PASCAL3D
-    turn = WORLD_FROM_OBJECT
-    diagonal = 2.0
-
-    def __init__(self, folder: Path, category: str) -> None:
-        super().__init__(folder, category)
-        self._rows: list[dict] = []
-        self._val_rows: list[dict] = []
-
-    @staticmethod
-    def paths(category: str) -> tuple[str, ...]:
-        return tuple(f"{class_name(category)}_{name}.npz" for name in FILES)
-
-    def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> RotationPoses:
-        """Any azimuth, elevations in -10 .. 40, tilts up to 15 degrees: the poses of hand-held cameras."""
-        ranges = ((-180.0, 180.0), (-10.0, 40.0), (-15.0, 15.0))
-        azimuth_deg, elevation_deg, tilt_deg = (uniform(rng, limits, count) for limits in ranges)
-        look = nmr.LookAt.from_angles(1.0, torch.from_numpy(elevation_deg), torch.from_numpy(azimuth_deg))
-        upright = look.projection(torch.float64).matrix[:, :, :3].numpy() * np.array([[1.0], [-1.0], [1.0]])
-        cos, sin = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
-        roll = np.tile(np.eye(3), (count, 1, 1))
-        roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = cos, -sin, sin, cos
-        return RotationPoses(roll @ upright @ self.turn.T)  # rows: the right, up and away of the image
-
-    def write(self, item: RenderedObject) -> None:
+    rows, val_rows = [], []
+    for item in objects:
         for rgba, rotation in zip(item.rgba(), item.poses.rotation.numpy(), strict=True):
             row = _photograph(rgba, item.rng)
             row |= {"rotation_matrices": rotation * np.float32([[-1], [1], [1]]), "voxels": item.voxels}
-            (self._val_rows if item.split == "val" else self._rows).append(row)
+            (val_rows if item.split == "val" else rows).append(row)
+    if len(rows) == 1:
+        raise ValueError("the layout pascal3d needs two pictures or more for training; give more meshes or views")
+    for path, part in zip(PASCAL3D.paths(category), (rows[::2], rows[1::2], val_rows), strict=True):
+        if part:
+            images = np.empty(len(part), dtype=object)
+            images[:] = [row.pop("images") for row in part]
+            stacked = {key: np.stack([row[key] for row in part]) for key in part[0]}
+            np.savez_compressed(folder / path, images=images, **stacked)
 
-    def finish(self, output: Path, objects: dict[str, list[str]]) -> None:
-        if len(self._rows) < 2:
-            raise ValueError("the layout pascal3d needs two pictures or more for training; give more meshes or views")
-        for path, rows in zip(
-            self.paths(self.category), (self._rows[::2], self._rows[1::2], self._val_rows), strict=True
-        ):
-            if rows:
-                images = np.empty(len(rows), dtype=object)
-                images[:] = [row.pop("images") for row in rows]
-                stacked = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
-                np.savez_compressed(self.folder / path, images=images, **stacked)
+
+def _pascal3d_views(vertices: np.ndarray, count: int, rng: np.random.Generator) -> RotationPoses:
+    """Any azimuth, elevations in -10 .. 40, tilts up to 15 degrees: the poses of hand-held cameras."""
+    ranges = ((-180.0, 180.0), (-10.0, 40.0), (-15.0, 15.0))
+    azimuth_deg, elevation_deg, tilt_deg = (uniform(rng, limits, count) for limits in ranges)
+    look = nmr.LookAt.from_angles(1.0, torch.from_numpy(elevation_deg), torch.from_numpy(azimuth_deg))
+    upright = look.projection(torch.float64).matrix[:, :, :3].numpy() * np.array([[1.0], [-1.0], [1.0]])
+    cos, sin = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
+    roll = np.tile(np.eye(3), (count, 1, 1))
+    roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = cos, -sin, sin, cos
+    return RotationPoses(roll @ upright @ WORLD_FROM_OBJECT.T)  # rows: the right, up and away of the image
 
 
 def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -93,40 +72,48 @@ def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndar
     return {"images": np.asarray(photo), "images_ref": reference, "bounding_boxes": box}
 
 
-class PhotosWriter(Writer):
-    """Objects on out-of-focus backgrounds, RGB 256 x 256, with anti-aliased masks and `poses.csv`. No voxels."""
+#: All rotations are proper (determinant 1), so the object frame is right-handed: x to the front, y up, z to the left as
+#: seen from the front. Objects are symmetric about z = 0, as the symmetric generator requires. Half the diagonal of the
+#: bounding box is 1, so that a rotated object stays in [-1, 1].
+PASCAL3D = Writer(
+    paths=lambda category: tuple(f"{pascal3d.class_name(category)}_{n}.npz" for n in ("train", "imagenet", "val")),
+    write=_write_pascal3d,
+    views=_pascal3d_views,
+    image_size=224,
+    default_views=8,
+    default_test=0.0,
+    default_val=0.2,
+    convention=pascal3d.PASCAL3D,
+    turn=WORLD_FROM_OBJECT,
+    diagonal=2.0,
+)
 
-    image_size = 256
-    default_views = 12
 
-    def __init__(self, folder: Path, category: str) -> None:
-        super().__init__(folder, category)
-        self._rows = [("file", "azimuth_deg", "elevation_deg", "distance", "fov_deg", "object", "split")]
-
-    @staticmethod
-    def paths(category: str) -> tuple[str, ...]:
-        return (category,)
-
-    def views(self, vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-        """Any azimuth, elevations in -10 .. 50, a random lens for each image; images hold the whole object."""
-        azimuth_deg, elevation_deg = uniform(rng, (-180.0, 180.0), count), uniform(rng, (-10.0, 50.0), count)
-        half_fov_deg = uniform(rng, (12.0, 25.0), count)  # lenses of 84 .. 38 mm on a square of 36 mm
-        return LookAtPoses(azimuth_deg, elevation_deg, distances(rng, vertices, half_fov_deg), half_fov_deg)
-
-    def write(self, item: RenderedObject) -> None:
-        poses, folder = item.poses, self.folder / self.category
-        behind = np.stack([photo_background(self.image_size, self.image_size, item.rng) for _ in item.rgb])
-        images = over(item, behind)
+def _write_photos(objects: Iterable[RenderedObject], category: str, root: Path, _: Path) -> None:
+    """Write objects on out-of-focus backgrounds as RGB images, with anti-aliased masks and `poses.csv`; no voxels."""
+    folder, size = root / category, PHOTOS.image_size
+    folder.mkdir()
+    table = [("file", "azimuth_deg", "elevation_deg", "distance", "fov_deg", "object", "split")]
+    for item in objects:
+        poses = item.poses
+        images = over(item, np.stack([photo_background(size, size, item.rng) for _ in item.rgb]))
         numbers = np.stack([poses.azimuth_deg, poses.elevation_deg, poses.distance, 2 * poses.half_fov_deg], axis=1)
         for k, (image, mask, row) in enumerate(zip(images, item.alpha, numbers, strict=True)):
             file = f"{item.name}_{k:02d}.png"
             write_png(folder / "images" / file, image)
             write_png(folder / "masks" / file, mask)
-            self._rows.append((file, *(f"{value:.4f}" for value in row), item.name, item.split))
+            table.append((file, *(f"{value:.4f}" for value in row), item.name, item.split))
+    with (folder / "poses.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(table)
 
-    def finish(self, output: Path, objects: dict[str, list[str]]) -> None:
-        with open(self.folder / self.category / "poses.csv", "w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(self._rows)
+
+PHOTOS = Writer(
+    paths=lambda category: (category,),
+    write=_write_photos,
+    views=functools.partial(random_views, (-10.0, 50.0), (12.0, 25.0)),  # lenses of 84 .. 38 mm on a square of 36 mm
+    image_size=256,
+    default_views=12,
+)
 
 
 def over(item: RenderedObject, backgrounds: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ def sources(tmp_path_factory):
     return write_meshes(tmp_path_factory.mktemp("meshes"))
 
 
-@pytest.fixture(scope="module", params=[name for name, writer in WRITERS.items() if not writer.only_shards])
+@pytest.fixture(scope="module", params=[name for name, writer in WRITERS.items() if writer.write])
 def made(request, sources, tmp_path_factory):
     """A data set of each layout."""
     output = tmp_path_factory.mktemp("data")

@@ -17,8 +17,7 @@ from learn3d.data.layouts import load_dataset
 from learn3d.fitting.coloring import paint
 from learn3d.fitting.smoothing import divide, sharpen, smooth
 from learn3d.fitting.templates import learn_templates, template
-from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.sharded import make_shards
+from learn3d.make_data.render import DatasetConfig, make_shards
 from learn3d.pictures.studio import photograph
 from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import Model, load_model, mesh_bytes, reconstruct_picture

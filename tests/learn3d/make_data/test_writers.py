@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.poses import Poses
-from learn3d.make_data.writers import WRITERS, RenderedObject
+from learn3d.make_data.writers import WRITERS
 from learn3d.make_data.writers.photographs import over
+from learn3d.make_data.writers.writer import RenderedObject
 
 SYNSET = "03001627"
 
@@ -90,8 +91,7 @@ def read_image(path: Path) -> np.ndarray:
 
 def views(layout: str, radius: float, count: int, seed: int) -> Poses:
     """The cameras of a layout around an object of that radius."""
-    writer = WRITERS[layout](Path("unused"), "chair")
-    return writer.views(np.array([[radius, 0.0, 0.0]]), count, np.random.default_rng(seed))
+    return WRITERS[layout].views(np.array([[radius, 0.0, 0.0]]), count, np.random.default_rng(seed))
 
 
 def test_kar(tmp_path, folder):

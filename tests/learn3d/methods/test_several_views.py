@@ -17,8 +17,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices
 from learn3d.evaluation import evaluate
 from learn3d.losses import depth_loss
-from learn3d.make_data.config import DatasetConfig
-from learn3d.make_data.sharded import make_shards
+from learn3d.make_data.render import DatasetConfig, make_shards
 from learn3d.methods import create_method
 from learn3d.methods.many_views import ManyViews
 from learn3d.methods.method import DatasetInfo, check_groups

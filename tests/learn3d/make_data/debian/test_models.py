@@ -12,11 +12,17 @@ import pytest
 import trimesh
 from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text, box, catalogue, deb, entry, fetch
 
-from learn3d.make_data.debian import packages
-from learn3d.make_data.debian.aircraft import is_airplane_file, remove_effects
-from learn3d.make_data.debian.furniture import furniture_category, place_furniture, read_catalogue
+from learn3d.files.formats import RawMesh
+from learn3d.make_data.debian import models
+from learn3d.make_data.debian.formats import read_ac3d, read_obj, triangulate
 from learn3d.make_data.debian.models import clean_mesh, surface_grid
-from learn3d.make_data.debian.packages import Part, read_ac3d, read_obj, triangulate
+from learn3d.make_data.debian.packages import (
+    NOT_AIRPLANES,
+    furniture_category,
+    place_furniture,
+    read_catalogue,
+    remove_effects,
+)
 
 
 @pytest.fixture
@@ -99,7 +105,7 @@ def test_requests_that_are_refused_leave_nothing_behind(debs: Path, tmp_path: Pa
 
 
 def test_packages_are_downloaded_if_they_are_not_there(
-    debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    debs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     real = subprocess.run
 
@@ -111,11 +117,12 @@ def test_packages_are_downloaded_if_they_are_not_there(
         shutil.copy(next(debs.glob(f"{command[-1]}_*")), options["cwd"])
         return subprocess.CompletedProcess(command, 0, "", "")
 
-    monkeypatch.setattr(packages.subprocess, "run", run)
+    monkeypatch.setattr(models.subprocess, "run", run)
     missing = {"sweethome3d-furniture-nonfree"}
     report = fetch(tmp_path / "out", None)
     assert [model["title"] for model in report.models] == ["Plane plane", "Oak chair", "Table"]
-    assert "Unable to locate package p" in report.summary() and "the component non-free" in report.summary()
+    said = capsys.readouterr().err
+    assert "Unable to locate package p" in said and "the component non-free" in said
     missing.add("flightgear-data-ai")
     with pytest.raises(ValueError, match="--packages-dir"):
         fetch(tmp_path / "other", None)
@@ -123,18 +130,18 @@ def test_packages_are_downloaded_if_they_are_not_there(
 
 def test_clean_mesh_welds_and_drops() -> None:
     corners, quads = box((0, 0, 0), (2, 1, 1))
-    vertices = np.concatenate([corners[triangulate(quads, corners)].reshape(-1, 3), [[99, 99, 99]]])
-    mesh = clean_mesh(vertices, np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]]))
+    vertices = np.concatenate([corners[triangulate(corners, quads).faces].reshape(-1, 3), [[99, 99, 99]]])
+    mesh = clean_mesh(RawMesh(vertices, np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]])))
     assert (mesh.vertices.shape, mesh.faces.shape, mesh.is_watertight) == ((8, 3), (12, 3), True)
     np.testing.assert_allclose(mesh.bounds, [[-0.5, -0.25, -0.25], [0.5, 0.25, 0.25]], atol=1e-12)
     for corner, message in (((2, 0, 0), "no face has an area"), ((0, 1, 0), "flat")):
         with pytest.raises(ValueError, match=message):
-            clean_mesh(np.array([[0, 0, 0], [1, 0, 0], corner], float), np.array([[0, 1, 2]]))
+            clean_mesh(RawMesh(np.array([[0, 0, 0], [1, 0, 0], corner], float), np.array([[0, 1, 2]])))
 
 
 def test_surface_grid_of_a_box() -> None:
     corners, quads = box((0, 0, 0), (2, 1.2, 0.8))
-    faces = triangulate(quads, corners)
+    faces = triangulate(corners, quads).faces
     shell = np.ones((8, 8, 8), bool)
     shell[1:-1, 1:-1, 1:-1] = False
     np.testing.assert_array_equal(surface_grid(corners, faces, 8, per_axis=True), shell)
@@ -170,7 +177,7 @@ def test_furniture_category(name: str, category: str | None) -> None:
     ],
 )
 def test_airplane_files(path: str, whole: bool) -> None:
-    assert is_airplane_file(path) == whole
+    assert (NOT_AIRPLANES.search(path) is None) == whole
 
 
 def test_catalogue_text() -> None:
@@ -186,9 +193,8 @@ def test_furniture_is_turned_and_stretched() -> None:
     np.testing.assert_allclose(placed[1], [6, 1, -5])
 
 
-def part(low: tuple, high: tuple) -> Part:
-    corners, quads = box(low, high)
-    return Part(corners, triangulate(quads, corners))
+def part(low: tuple, high: tuple) -> RawMesh:
+    return triangulate(*box(low, high))
 
 
 def test_effects_are_found_by_shape() -> None:
@@ -197,8 +203,8 @@ def test_effects_are_found_by_shape() -> None:
     blade, wing = part((-5, -1, -0.1), (-4.99, 1, 0.1)), part((-1, -0.01, -1), (1, 0, 1))
     square = np.array([[9.0, 0, 0], [9, 1, 0], [9, 1, 1], [9, 0, 1]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    vapour, twin = Part(square, faces), Part(square, faces[:, ::-1])
-    panel = Part(square - [4, 0, 0], faces)  # touches the body's edge
+    vapour, twin = RawMesh(square, faces), RawMesh(square, faces[:, ::-1])
+    panel = RawMesh(square - [4, 0, 0], faces)  # touches the body's edge
     panel.vertices[0] = [5, 0, 5]
     kept = remove_effects([body, disc, fan, blade, wing, vapour, twin, panel])
     assert [id(one) for one in kept] == [id(one) for one in (body, fan, blade, wing, panel)]
@@ -233,7 +239,7 @@ def test_concave_polygons_keep_their_area(start: int) -> None:
     ell = np.roll([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]], start, axis=0)
     for outline, expected in ((arrow, 4.0), (ell, 5.0), (ell[::-1], 5.0)):
         vertices = np.column_stack([outline, outline[:, 0]]).astype(float)  # in the plane z = x
-        faces = triangulate([list(range(len(outline)))], vertices)
+        faces = triangulate(vertices, [list(range(len(outline)))]).faces
         assert len(faces) == len(outline) - 2
         assert area(vertices, faces) == pytest.approx(expected * np.sqrt(2))
         before = np.cross(vertices, np.roll(vertices, -1, axis=0)).sum(axis=0)
@@ -242,9 +248,9 @@ def test_concave_polygons_keep_their_area(start: int) -> None:
 
 
 def test_obj_text() -> None:
-    vertices, faces = read_obj("# c\nv 0 0 0\nv 1 0 0 1 1 1\nv 0 1 0\ng x\nf 1/2/3 -2//1 3\nf 1 2\nl 1 2\n")
-    np.testing.assert_array_equal(vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    np.testing.assert_array_equal(faces, [[0, 1, 2]])
+    mesh = read_obj("# c\nv 0 0 0\nv 1 0 0 1 1 1\nv 0 1 0\ng x\nf 1/2/3 -2//1 3\nf 1 2\nl 1 2\n")
+    np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2]])
     for text in ("v 0 0\nv 1 2 3", "v 0 0 0\nf 1 2 4", "v 0 0 0\nf 1 1 -9", "f 1 2 x"):
         with pytest.raises(ValueError, match=r"inhomogeneous|refers to a missing vertex|invalid literal"):
             read_obj(text)

@@ -18,14 +18,14 @@ from lopsided_meshes import write_meshes
 
 from learn3d.data import shards
 from learn3d.data.layouts import load_dataset
-from learn3d.make_data import sharded
+from learn3d.make_data import render
 from learn3d.make_data.render import DatasetConfig, make_dataset
 
 MAKE = """
 import sys
 from learn3d import commands
-from learn3d.make_data import sharded
-sharded.OBJECTS_PER_SHARD = 2
+from learn3d.make_data import render
+render.OBJECTS_PER_SHARD = 2
 if __name__ == "__main__":
     sys.exit(commands.main("make-dataset", *sys.argv[1:]))
 """
@@ -35,14 +35,14 @@ NUMBERS = {"category": "chair", "procedural": 4, "augment": 1, "test": 1, "val":
 @pytest.fixture
 def config(tmp_path, monkeypatch) -> DatasetConfig:
     """Two objects in a shard: two shards to train on, one each to validate and to test."""
-    monkeypatch.setattr(sharded, "OBJECTS_PER_SHARD", 2)
+    monkeypatch.setattr(render, "OBJECTS_PER_SHARD", 2)
     return DatasetConfig(output=tmp_path / "shards", **NUMBERS, shards=True, jobs=2)
 
 
 @pytest.fixture
 def here(monkeypatch) -> None:
     """Shards are made in this process: starting Python and torch takes seconds."""
-    monkeypatch.setattr(sharded, "run_tasks", stub_work.run_tasks_here)
+    monkeypatch.setattr(render, "run_tasks", stub_work.run_tasks_here)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -52,7 +52,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_the_objects_and_the_report_are_those_of_one_process(config, tmp_path, capsys) -> None:
     report = make_dataset(DatasetConfig(output=tmp_path / "one", **NUMBERS), progress=False)
-    assert sharded.make_shards(config) == 0
+    assert render.make_shards(config) == 0
     out, err = capsys.readouterr()
     assert [*out.splitlines()[:2], "[4/4] " in err] == [*report.text().splitlines()[:2], True]
     assert "train 1: 2 objects" in (config.output / "03001627" / "train-00001.log").read_text()
@@ -66,16 +66,16 @@ def test_the_objects_and_the_report_are_those_of_one_process(config, tmp_path, c
 
 
 def test_a_second_call_makes_nothing_and_other_settings_are_refused(config, here, capsys) -> None:
-    assert sharded.make_shards(config) == 0
+    assert render.make_shards(config) == 0
     before = contents(config.output)
-    assert sharded.make_shards(config) == 0
+    assert render.make_shards(config) == 0
     assert "4 shards, 0 to be made" in capsys.readouterr().err
     assert contents(config.output) == before
     with pytest.raises(ValueError, match="were made with another seed; repeat those settings"):
-        sharded.make_shards(dataclasses.replace(config, seed=1))
+        render.make_shards(dataclasses.replace(config, seed=1))
     photograph = config.output / "03001627" / "photograph.png"
     photograph.write_bytes(b"mine")
-    assert sharded.make_shards(dataclasses.replace(config, seed=1, overwrite=True)) == 0
+    assert render.make_shards(dataclasses.replace(config, seed=1, overwrite=True)) == 0
     assert photograph.read_bytes() == b"mine", "only shards are replaced"
     assert contents(config.output) != before
 
@@ -87,12 +87,12 @@ def test_bad_meshes_are_listed_and_another_list_of_meshes_is_refused(tmp_path, h
     for name in ("a.obj", "zz.ply"):
         (folder / name).write_text("v 0 0\n")
     config = DatasetConfig(output=tmp_path / "shards", category="mug", source=folder, test=1, val=0, shards=True)
-    assert sharded.make_shards(config) == 0
+    assert render.make_shards(config) == 0
     out = capsys.readouterr().out
     assert ", 2 skipped" in out and "skipped a.obj" in out and "skipped zz.ply" in out
     (folder / "a.obj").rename(folder / "zzz.obj")
     with pytest.raises(ValueError, match="were made with another list of meshes"):
-        sharded.make_shards(config)
+        render.make_shards(config)
 
 
 @pytest.mark.slow
@@ -101,7 +101,7 @@ def test_a_killed_call_is_continued(config, here, tmp_path, monkeypatch) -> None
     """Killed with its workers, or stopped, at several moments, the same command ends with the same files."""
     config = dataclasses.replace(config, procedural=24)  # enough that no call ends before its signal
     whole = dataclasses.replace(config, output=tmp_path / "whole")
-    assert sharded.make_shards(whole) == 0
+    assert render.make_shards(whole) == 0
     monkeypatch.undo()
     (tmp_path / "make.py").write_text(MAKE)
     words = ["--output", str(config.output), "--shards", "--jobs", "2"]
