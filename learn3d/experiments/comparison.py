@@ -23,7 +23,6 @@ RESAMPLES = 2000
 Cells = list[list[str]]
 Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
 
-LABELS = {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19", "mmd": "mmd"}
 NOTES = (
     "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
     "again). ±: 95 % intervals over seeds (Student's t).\n\nThe paper's figures are for reference: they are on its own "
@@ -82,29 +81,26 @@ def make_report(
         counts = [f"step {result.step}", str(result.iterations), str(config.batch_size), str(result.images)]
         minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
         trained.append([run.name, *counts, *figures(vars(result)), minutes, result.commit])
-        words = {"data": "DATA", "category": "CATEGORY", "seed": "SEED"}
+        words = {"data": "DATA", "category": "CATEGORY", "seed": "SEED", "poses": "OUTPUT/poses/CATEGORY-seedSEED.npz"}
         words["output"] = f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED"
-        if config.poses:
-            words["poses"] = "OUTPUT/poses/CATEGORY-seedSEED.npz"
         commands[command_line(config, **words)] = None
     categories = list(dict.fromkeys(run.config.category for run in runs))
     columns = {name: [name] for name in categories} | {MEAN: categories}
-    measures = ["mmd"] if table.measure == "mmd" else ["voxel_iou", "voxel_iou_kato19"]
-
-    def sides(variant: str | None) -> list[Side]:
-        return [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
-
+    measures = {"mmd": "mmd"} if table.measure == "mmd" else {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19"}
     baseline = table.rows[table.baseline].variant
     main, differences = [["method", "", *columns]], [["method", *columns]]
     for label, row in select_rows(request).items():
+        ours, theirs = (
+            [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
+            for variant in (row.variant, baseline)
+        )
         if row.printed:
-            main.append(
-                [label, f"paper ({row.about})", *(_format_printed(row.printed, c, categories) for c in columns)]
-            )
+            printed = [_format_printed(row.printed, column, categories) for column in columns]
+            main.append([label, f"paper ({row.about})", *printed])
         if row.variant:
-            main += [[label, f"here ({LABELS[m]})", *(_compare(m, s) for s in sides(row.variant))] for m in measures]
+            main += [[label, f"here ({name})", *(_compare(m, side) for side in ours)] for m, name in measures.items()]
         if row.variant and row.variant != baseline:
-            pairs = zip(sides(row.variant), sides(baseline), strict=True)
+            pairs = zip(ours, theirs, strict=True)
             differences.append([label, *(_compare(table.measure, *pair) for pair in pairs)])
     tables = {"main": main, "differences": differences, "runs": trained}
     missing = [run.name for run in runs if run not in done]

@@ -73,10 +73,9 @@ def write_report(
 ) -> int:
     """Measure runs on a split as `learn3d evaluate` does, and write the page; returns its size in bytes.
 
-    `data` and `category` default to those of the training, `labels` to the names of the presets. objects: number of
-    objects whose shapes are shown, from the best to the worst, each in an image of typical IoU. indices: images to show
-    instead (object * views + view). Raises ValueError or OSError, before anything is measured, if a checkpoint or its
-    data is missing, and ValueError for runs on several categories or on different images.
+    objects: number of objects whose shapes are shown, from the best to the worst, each in an image of typical IoU.
+    indices: images to show instead (object * views + view). The other options are those of `open_runs`. Raises
+    ValueError or OSError, before anything is measured, for missing files, several categories or different images.
     """
     if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
         raise ValueError(f"the page can show the shapes of 1 to {MOST_SHOWN} images, got {count}")
