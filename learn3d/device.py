@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -20,12 +21,8 @@ def resolve_precision(precision: Literal["auto", "bf16", "fp32"], device: str) -
         return precision
     if device == "cuda":
         return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "fp32"
-    try:
-        with open(CPUINFO) as file:
-            flags = next((line.split(":", 1)[1].split() for line in file if line.startswith("flags")), [])
-    except OSError:
-        flags = []
-    return "bf16" if {"avx512_bf16", "amx_bf16"} & set(flags) else "fp32"
+    flags = Path(CPUINFO).read_text() if Path(CPUINFO).exists() else ""
+    return "bf16" if "avx512_bf16" in flags or "amx_bf16" in flags else "fp32"
 
 
 def autocast(device: torch.device | str, precision: Literal["bf16", "fp32"]) -> torch.autocast:

@@ -10,7 +10,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import ParamSpec, TextIO
 
 P = ParamSpec("P")
@@ -90,21 +90,14 @@ def align(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-@dataclass
-class Stop:
-    """A request to stop."""
-
-    name: str = ""  # the signal that asked to stop; "" if none did
-
-
 @contextlib.contextmanager
-def stop_on_signal() -> Iterator[Stop]:
-    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop; a second SIGINT interrupts at once.
+def stop_on_signal() -> Iterator[SimpleNamespace]:
+    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop: the attribute `name` of the context, "" before.
 
-    SIGHUP comes when the terminal is closed; if it is ignored (nohup), it stays ignored. Does nothing outside the main
-    thread, because only this one can handle signals.
+    A second SIGINT interrupts at once. SIGHUP comes when the terminal is closed; if it is ignored (nohup), it stays
+    ignored. Does nothing outside the main thread, because only this one can handle signals.
     """
-    stop, previous = Stop(), {}
+    stop, previous = SimpleNamespace(name=""), {}
 
     def handle(number: int, _: object) -> None:
         if stop.name and number == signal.SIGINT:

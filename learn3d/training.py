@@ -17,8 +17,7 @@ from learn3d.methods.method import MeshMethod
 from learn3d.poses.updates import update_poses, update_steps
 from learn3d.runs import folder as run_folder
 from learn3d.runs.log import RunLog, check_log
-from learn3d.runs.state import Run, describe_images
-from learn3d.runs.summary import Summary, describe_run
+from learn3d.runs.run import Run, Summary, describe_images
 from learn3d.runs.threads import ThreadTuner
 from learn3d.terminal import stop_on_signal
 from learn3d.validation import draw, validate
@@ -53,7 +52,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         run = Run(config, method, info, describe_images(train_set), train_set.candidates)
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
         if progress.step == config.iterations:
-            return Summary.of(config, progress, started)
+            return Summary(folder, progress, True, time.monotonic() - started)
         estimated = train_set.candidates is not None and isinstance(method, MeshMethod)
         updates = update_steps(config.iterations, config.pose_updates if estimated else 0)
         before, start = progress.seconds, progress.step + 1
@@ -66,7 +65,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         ):
             for warning in filter(None, (*notes, empty_masks)):
                 log.say(f"warning: {warning}")
-            log.say(describe_run(run, progress, train_set, val_set, threads))
+            log.say(run.describe(progress, train_set, val_set, threads))
             for step, batch in enumerate(batches(train_set, config, start), start):
                 step_began = time.monotonic()
                 losses = method.take_step(batch, step)
@@ -93,7 +92,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                     then = run_folder.resume_command(folder)
                     log.say(f"stopped by {stopped_by} after step {step}; continue with: {then}")
                     break
-    return Summary.of(config, progress, started)
+    return Summary(folder, progress, progress.step == config.iterations, time.monotonic() - started)
 
 
 def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:

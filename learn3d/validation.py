@@ -13,7 +13,7 @@ from learn3d.pictures.sheets import save_png
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.folder import PICTURES
 from learn3d.runs.log import RunLog
-from learn3d.runs.state import Run
+from learn3d.runs.run import Run
 
 PICTURE_ROWS = 8
 

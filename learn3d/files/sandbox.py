@@ -1,8 +1,8 @@
 """A sandbox for untrusted files: worker processes that may crash, hang or run out of memory.
 
-`read` and `read_all` run functions in workers, with limits of memory (on Linux), processor time and elapsed time. They
-start on demand, one for each core, and read many files each. A failure becomes a `DamagedFile` or `MissingFile` with
-the name of the file, and a dead worker is replaced. This module imports neither torch nor scipy, so that a worker
+`read` and `read_all` run functions in workers, with limits of memory (on Linux), processor time and elapsed time. Two
+more than there are cores start on demand, and read many files each. A failure becomes a `DamagedFile` or `MissingFile`
+with the name of the file, and a dead worker is replaced. This module imports neither torch nor scipy, so that a worker
 starts in a tenth of a second. It needs a POSIX system.
 """
 
@@ -22,7 +22,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, Pipe, wait
+from multiprocessing.connection import Connection, Pipe
 from multiprocessing.reduction import recv_handle, send_handle
 from pathlib import Path
 from typing import Any
@@ -68,57 +68,26 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
     """The results of each group of calls, in order, computed on all cores.
 
     A worker takes a whole group, for example the files of one object. The result for a bad file is a DamagedFile or
-    MissingFile. Two groups per core are read ahead, at most.
+    MissingFile. Two groups more than there are cores are read ahead, at most.
     """
-    groups, tasks, most = iter(groups), deque(), cores()
+    groups, running, most = iter(groups), deque(), cores() + 2
     try:
         while True:
-            busy = {task.worker.connection: task for task in tasks if task.results is None}
-            if len(busy) < most and len(tasks) < 2 * most and (calls := next(groups, None)) is not None:
-                tasks.append(_Task(list(calls)))
-            elif tasks and tasks[0].results is not None:
-                yield tasks.popleft().results
-            elif busy:
-                for connection in wait(busy):
-                    busy[connection].receive()
-            else:
+            while len(running) < most and (calls := next(groups, None)) is not None:
+                running.append((_start(list(calls)), list(calls)))
+            if not running:
                 return
+            results = _finish(*running[0])
+            running.popleft()
+            yield results
     finally:  # after an interruption some workers are still busy
-        for task in tasks:
-            if task.results is None:
-                task.worker.end()
+        for worker, _ in running:
+            worker.end()
 
 
 def cores() -> int:
-    """The number of cores that this process may use, which is the number of workers."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-class _Task:
-    """A group of calls in a worker."""
-
-    def __init__(self, calls: list[Call]) -> None:
-        self.calls, self.results, self.worker = calls, None, _idle_worker()
-        with contextlib.suppress(OSError):  # if the worker has died, `receive` finds out
-            self.worker.connection.send((os.getcwd(), calls))
-
-    def receive(self) -> None:
-        """Receive the results of the worker; if it has died, find the file at fault."""
-        try:
-            self.results, grown = self.worker.receive()
-            self.worker.end() if grown else _idle.append(self.worker)
-        except (EOFError, OSError, pickle.UnpicklingError):
-            status = self.worker.end()
-            single = len(self.calls) == 1
-            self.results = [self._fault(status)] if single else [next(read_all([[call]]))[0] for call in self.calls]
-
-    def _fault(self, status: int) -> DamagedFile:
-        (call,) = self.calls
-        fault = {
-            -signal.SIGXCPU: f"takes more than {call.seconds:g} seconds of processor time",
-            -signal.SIGALRM: f"was stopped after {call.timeout:g} seconds",
-        }.get(status, f"crashed its process (status {status})")
-        return DamagedFile(call.path, f"reading it {fault}; expected {call.wanted}. {FETCH_AGAIN}")
 
 
 class _Worker:
@@ -134,15 +103,6 @@ class _Worker:
             self.process = subprocess.Popen(command, pass_fds=[end], env={**os.environ, **_ONE_THREAD}, **silent)
         _workers.add(self)
 
-    def receive(self) -> tuple[list[Any], bool]:
-        """The results of its calls, and whether the process has grown by more than `_GROWTH`."""
-        data, sizes, grown = self.connection.recv()
-        buffers = []
-        for size in sizes:
-            with open(recv_handle(self.connection), "r+b") as file:
-                buffers.append(memoryview(mmap.mmap(file.fileno(), size)))
-        return pickle.loads(data, buffers=buffers), grown
-
     def end(self) -> int:
         """Kill the process. Returns its exit status."""
         _workers.discard(self)
@@ -151,13 +111,39 @@ class _Worker:
         return self.process.wait()
 
 
-def _idle_worker() -> _Worker:
+def _start(calls: list[Call]) -> _Worker:
+    """Send calls to an idle worker, or to a new one."""
     while _idle:
         worker = _idle.pop()
         if worker.process.poll() is None:
-            return worker
+            break
         worker.end()  # it died while it was idle
-    return _Worker()
+    else:
+        worker = _Worker()
+    with contextlib.suppress(OSError):  # if the worker has died, `_finish` finds out
+        worker.connection.send((os.getcwd(), calls))
+    return worker
+
+
+def _finish(worker: _Worker, calls: list[Call]) -> list[Any]:
+    """Wait for the results of a worker; if it dies, find the file at fault."""
+    buffers = []
+    try:
+        data, sizes, grown = worker.connection.recv()
+        for size in sizes:
+            with open(recv_handle(worker.connection), "r+b") as file:
+                buffers.append(memoryview(mmap.mmap(file.fileno(), size)))
+        worker.end() if grown else _idle.append(worker)
+        return pickle.loads(data, buffers=buffers)
+    except (EOFError, OSError, pickle.UnpicklingError):
+        status = worker.end()
+    if len(calls) > 1:
+        return [next(read_all([[call]]))[0] for call in calls]
+    fault = {
+        -signal.SIGXCPU: f"takes more than {calls[0].seconds:g} seconds of processor time",
+        -signal.SIGALRM: f"was stopped after {calls[0].timeout:g} seconds",
+    }.get(status, f"crashed its process (status {status})")
+    return [DamagedFile(calls[0].path, f"reading it {fault}; expected {calls[0].wanted}. {FETCH_AGAIN}")]
 
 
 _workers: set[_Worker] = set()  # all living workers

@@ -18,7 +18,7 @@ from learn3d.terminal import stop_on_signal
 def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; at the end the file there is renamed to `path`.
 
-    After an exception the temporary file is removed; a killed process leaves it (`remove_partials`). sync: the file is
+    After an exception the temporary file is removed; a killed process leaves it. sync: the file is
     complete even after a power failure. Raises OSError if `path` is a folder, a pipe or a device.
     """
     path = Path(path)
@@ -69,13 +69,6 @@ def check_target(path: Path, option: str, *, folder: bool = False) -> None:
             pass
     except OSError as error:
         raise OSError(f"cannot write {path}: {error.strerror or error}; give another {option}") from error
-
-
-def remove_partials(*folders: Path) -> None:
-    """Remove the temporary files that a killed process left in these folders."""
-    for folder in folders:
-        for path in folder.glob(".*.partial"):
-            path.unlink(missing_ok=True)
 
 
 def give_second_name(path: Path, name: Path) -> None:

@@ -27,7 +27,7 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.device import resolve_precision
 from learn3d.files import writing
-from learn3d.files.reading import parse_json
+from learn3d.files.reading import DamagedFile, parse_json
 from learn3d.methods import DatasetInfo, Method, create_method
 from learn3d.settings import Count, NonNegative, Share, checked, split_names
 
@@ -43,25 +43,19 @@ def versions() -> dict[str, str | None]:
 
 
 def _git_commit() -> str | None:
-    """Commit of the checkout of this file ("-dirty" if it has changes), or the one that the package was built from."""
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
+    """The commit that the package was built from, or of the checkout of this file ("-dirty" if it has changes)."""
+    built_from = Path(__file__).parents[1] / "commit.txt"  # CMakeLists.txt writes it
+    if built_from.exists():
+        return built_from.read_text().strip() or None
+    command = ["git", "-C", str(built_from.parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)
-        return git("rev-parse", "HEAD") + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
-        built_from = Path(__file__).parents[1] / "commit.txt"  # CMakeLists.txt writes it
-        return (built_from.read_text().strip() if built_from.exists() else "") or None
+        return None
 
 
+_USE_ANOTHER = "use another checkpoint of the run"
 AnyStep = Annotated[int, Field(ge=0, le=10**9)]
-
-
-class DamagedError(ValueError):
-    """A checkpoint that is truncated or changed, or a file of another kind."""
 
 
 @checked
@@ -88,7 +82,7 @@ class Metadata:
     config: Annotated[TrainConfig, _from_dict(config_from_dict)]
     info: Annotated[DatasetInfo, _from_dict(lambda values: DatasetInfo(**values))]
     progress: Annotated[Progress, _from_dict(lambda values: Progress(**values))]
-    data: str  # `runs.state.describe_images` of the training images
+    data: str  # `runs.run.describe_images` of the training images
     versions: dict[str, str | None]  # `versions` of the code that wrote the file
 
 
@@ -122,36 +116,14 @@ def _checksum(text: str, tensors: dict[str, Tensor]) -> str:
     return f"{crc:08x}"
 
 
-def load(path: Path) -> tuple[dict[str, Tensor], Metadata]:
+def load(path: Path, which: str = "last", *, with_tensors: bool = True) -> tuple[dict[str, Tensor], Metadata]:
     """Read the tensors, on the CPU, and the metadata of a checkpoint, and verify their checksum.
 
-    Raises DamagedError if the file is truncated, changed or of another kind; ValueError if it is missing or from
+    path: a file, or a run folder with the checkpoint `which`. with_tensors: if False, neither tensors nor checksum are
+    read. Raises DamagedFile if the file is truncated, changed or of another kind; ValueError if it is missing or from
     another version of learn3d; OSError if it cannot be read.
     """
-    header, tensors = _read(path, with_tensors=True)
-    if _checksum(header["learn3d"], tensors) != header.get("crc32"):
-        raise DamagedError(
-            f"{path} has changed since it was written (another CRC-32); use another checkpoint of the run"
-        )
-    return tensors, _parse(path, header["learn3d"])
-
-
-def load_metadata(path: Path, which: str = "last") -> Metadata:
-    """The metadata of a checkpoint file, or of the checkpoint `which` of a run folder, without reading its tensors.
-
-    The checksum is not verified. Raises the errors of `load`.
-    """
     path = find(path, which)
-    return _parse(path, _read(path, with_tensors=False)[0]["learn3d"])
-
-
-def find(path: Path, which: str = "last") -> Path:
-    """The checkpoint file of a run folder (`which`: last or best), or `path` itself if it is a file."""
-    path = Path(path)
-    return path / f"{which}.safetensors" if path.is_dir() else path
-
-
-def _read(path: Path, *, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
     if not path.is_file():
         held = "last.safetensors and, from the first validation that measured an IoU, best.safetensors"
         raise ValueError(f"there is no checkpoint {path}; a run folder holds {held}")
@@ -160,29 +132,37 @@ def _read(path: Path, *, with_tensors: bool) -> tuple[dict[str, str], dict[str, 
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()} if with_tensors else {}
     except (SafetensorError, ValueError) as error:
-        raise DamagedError(f"{path} is damaged or was cut short ({error}); use another checkpoint of the run") from None
+        raise DamagedFile(path, f"is damaged or was cut short ({error}); {_USE_ANOTHER}") from None
     if "learn3d" not in header:
-        raise DamagedError(f"{path} is a safetensors file, but not a checkpoint of learn3d")
-    return header, tensors
-
-
-def _parse(path: Path, text: str) -> Metadata:
+        raise DamagedFile(path, "is a safetensors file, but not a checkpoint of learn3d")
+    text = header["learn3d"]
+    if with_tensors and _checksum(text, tensors) != header.get("crc32"):
+        raise DamagedFile(path, f"has changed since it was written (another CRC-32); {_USE_ANOTHER}")
     try:
-        return Metadata(**parse_json(text))
+        return tensors, Metadata(**parse_json(text))
     except (TypeError, ValueError) as error:  # TypeError: not a JSON object
         raise ValueError(f"{path} is no checkpoint of this version of learn3d: {error}") from None
+
+
+def load_metadata(path: Path, which: str = "last") -> Metadata:
+    """Read only the metadata of a checkpoint, see `load`."""
+    return load(path, which, with_tensors=False)[1]
+
+
+def find(path: Path, which: str = "last") -> Path:
+    """The checkpoint file of a run folder (`which`: last or best), or `path` itself if it is a file."""
+    path = Path(path)
+    return path / f"{which}.safetensors" if path.is_dir() else path
 
 
 def load_method(
     path: Path, which: str = "last", *, device: str = "cpu", precision: str = "fp32"
 ) -> tuple[Method, TrainConfig, Metadata]:
-    """Open the checkpoint `which` of a run folder, or a checkpoint file, for evaluation or reconstruction.
+    """Open a checkpoint for evaluation or reconstruction, see `load`.
 
-    Returns the method in evaluation mode, with its EMA weights if it has any; its configuration; the metadata. Raises
-    the errors of `load`.
+    Returns the method in evaluation mode, with its EMA weights if it has any; its configuration; the metadata.
     """
-    path = find(path, which)
-    tensors, metadata = load(path)
+    tensors, metadata = load(path, which)
     how = {"device": device, "precision": resolve_precision(precision, device), "seed": 0}
     with torch.random.fork_rng(devices=[]):
         method = create_method(metadata.config.settings, metadata.info, **how)
@@ -220,11 +200,8 @@ def load_data(
 
 def network_tensors(method: Method) -> dict[str, Tensor]:
     """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>."""
-    return {
-        f"network.{name}.{key}": tensor
-        for name, network in method.networks.items()
-        for key, tensor in network.state_dict().items()
-    }
+    networks = method.networks.items()
+    return {f"network.{name}.{key}": value for name, net in networks for key, value in net.state_dict().items()}
 
 
 def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network") -> None:
@@ -259,10 +236,10 @@ def restore_optimizer(
     shape, and is copied to its parameter's memory layout.
     """
     parameters = [(p, group.get("fused")) for group in optimizer.param_groups for p in group["params"]]
-    state: dict[int, dict[str, Tensor]] = {index: {} for index in range(len(parameters))}
+    state: dict[int, dict[str, Tensor]] = {}
     for place, value in starting_with(f"optimizer.{name}.", tensors).items():
         index, _, key = place.partition(".")
-        if not index.isdecimal() or int(index) not in state:
+        if not index.isdecimal() or int(index) >= len(parameters):
             raise ValueError(f"{source} does not fit the optimizer {name}: {place} belongs to no parameter")
         parameter, fused = parameters[int(index)]
         wanted = torch.Size() if key == "step" else parameter.shape
@@ -270,6 +247,5 @@ def restore_optimizer(
             came = f"{place} is {list(value.shape)}, wanted {list(wanted)}"
             raise ValueError(f"{source} does not fit the optimizer {name}: {came}")
         like = parameter if value.shape == parameter.shape else value
-        state[int(index)][key] = torch.empty_like(like, dtype=value.dtype, device="cpu").copy_(value)
-    state = {index: values for index, values in state.items() if values}
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+        state.setdefault(int(index), {})[key] = torch.empty_like(like, dtype=value.dtype, device="cpu").copy_(value)
+    optimizer.load_state_dict(optimizer.state_dict() | {"state": state})

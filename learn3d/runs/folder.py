@@ -22,8 +22,6 @@ from pathlib import Path
 
 import filelock
 
-from learn3d.files import writing
-
 CONFIG, METRICS, METRICS_CSV, WANDB_ID = "config.json", "metrics.jsonl", "metrics.csv", "wandb.txt"
 LAST, PREVIOUS, BEST = "last.safetensors", "previous.safetensors", "best.safetensors"
 PICTURES, TENSORBOARD, LOCK = "pictures", "tensorboard", ".lock"
@@ -36,12 +34,9 @@ WRITTEN += (METRICS_CSV, WANDB_ID, CONFIG)
 def lock_folder(folder: Path) -> Iterator[None]:
     """Context that makes the folder and locks it; a folder that is empty at the end is removed.
 
-    The operating system releases the lock when the process ends, even if it is killed. Raises ValueError if `folder` is
-    a file, OSError if another process holds the lock or the folder cannot be written to.
+    The operating system releases the lock when the process ends, even if it is killed. Raises OSError if another
+    process holds the lock, or if the folder cannot be written to.
     """
-    folder = Path(folder)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"output {folder} is a file; give a folder for the run")
     lock = filelock.FileLock(folder / LOCK, timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -99,8 +94,7 @@ def remove_old_run(folder: Path, overwrite: bool) -> None:
 
 def remove_partials(folder: Path) -> None:
     """Remove the half-written files of a killed run; those of safetensors are named .tmp??????."""
-    writing.remove_partials(folder, folder / PICTURES)
-    for path in folder.glob(".tmp??????"):
+    for path in [p for name in (".*.partial", f"{PICTURES}/.*.partial", ".tmp??????") for p in folder.glob(name)]:
         path.unlink()
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import importlib.util
 import json
 import os
 import sys
 import time
+import types
 import uuid
 from collections import deque
 from collections.abc import Mapping
@@ -26,7 +28,7 @@ SECONDS_BETWEEN_LINES = 30.0
 MEAN_OVER = 20  # steps over which shown losses are averaged
 
 
-class RunLog:
+class RunLog(contextlib.ExitStack):
     """The log of a run, a context manager. Metrics of steps after `start`, from before an interruption, are dropped.
 
     On a terminal it shows a progress bar with the losses and the time left; elsewhere it prints a line now and then.
@@ -34,27 +36,20 @@ class RunLog:
     """
 
     def __init__(self, config: TrainConfig, *, start: int) -> None:
-        folder, kind, self.start, self.total = config.output, config.log, start, config.iterations
+        super().__init__()
+        self.start, self.total = start, config.iterations
         self._recent: dict[str, deque[float]] = {}
-        _drop_after(folder / METRICS, start)
-        self._metrics = open(folder / METRICS, "ab")
-        self._bar = tqdm(total=self.total, initial=start, unit="step", dynamic_ncols=True) if is_watched() else None
-        self._writer: _Csv | _TensorBoard | _Wandb | None = None
+        _drop_after(config.output / METRICS, start)
+        self._metrics = self.enter_context(open(config.output / METRICS, "ab"))
+        self._bar, self._writer = None, None
+        if is_watched():
+            self._bar = self.enter_context(tqdm(total=self.total, initial=start, unit="step", dynamic_ncols=True))
         try:
-            self._writer = _Wandb(folder, config) if kind == "wandb" else _WRITERS[kind](folder, start)
+            self._writer = _open_writer(config, start)
+            self.callback(self._writer.close)
         except (ImportError, TypeError, AttributeError) as error:  # missing, or in conflict with other packages
-            self.say(f"warning: {kind} does not work ({error}); metrics go to {METRICS} only")
+            self.say(f"warning: {config.log} does not work ({error}); metrics go to {METRICS} only")
         self._started = self._last_line = time.monotonic()
-
-    def __enter__(self) -> RunLog:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-        self._metrics.close()
-        if self._writer is not None:
-            self._writer.close()
 
     def step(self, step: int, losses: Mapping[str, float]) -> None:
         """Show the progress after a step."""
@@ -81,12 +76,12 @@ class RunLog:
         self._metrics.write(json.dumps({"step": step, "split": split, **values}).encode() + b"\n")
         self._metrics.flush()
         if self._writer is not None:
-            self._writer.add_numbers(step, _numbers(step, split, **values))
+            _add_numbers(self._writer, step, split, **values)
 
     def picture(self, step: int, name: str, rgb: np.ndarray) -> None:
         """Pass a picture uint8 [H,W,3] to the writer."""
         if self._writer is not None:
-            self._writer.add_picture(step, name, rgb)
+            self._writer.add_image(name, rgb, step, dataformats="HWC")
 
     def say(self, text: str) -> None:
         """Print a line without breaking the progress bar."""
@@ -106,82 +101,64 @@ def check_log(config: TrainConfig) -> None:
         raise ValueError("log 'wandb' needs the package wandb: pip install wandb, or choose csv or tensorboard")
 
 
-def _numbers(step: int, split: str = "", **values: Any) -> dict[str, float]:
-    """The numbers in a line of metrics.jsonl, named <split>/<name>."""
-    return {f"{split}/{name}": value for name, value in values.items() if isinstance(value, (int, float))}
+def _open_writer(config: TrainConfig, start: int) -> Any:
+    """The second log: TensorBoard's SummaryWriter, or an object with its methods."""
+    if config.log == "csv":
+        return _Csv(config.output)
+    if config.log == "wandb":
+        return _open_wandb(config)
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(config.output / TENSORBOARD), purge_step=start + 1)
+
+
+def _add_numbers(writer: Any, step: int, split: str, **values: Any) -> None:
+    """Pass the numbers in a line of metrics.jsonl to a writer."""
+    for name, value in values.items():
+        if isinstance(value, (int, float)):
+            writer.add_scalar(f"{split}/{name}", value, step)
 
 
 class _Csv:
     """metrics.csv: a row for each number, with the columns step, name, value. Earlier rows come from metrics.jsonl."""
 
-    def __init__(self, folder: Path, start: int) -> None:
+    def __init__(self, folder: Path) -> None:
         writing.write_bytes(folder / METRICS_CSV, b"step,name,value\n", sync=True)
         self._file = open(folder / METRICS_CSV, "a")
+        self.close = self._file.close
         for values in map(json.loads, (folder / METRICS).read_bytes().splitlines()):
-            self.add_numbers(values["step"], _numbers(**values))
+            _add_numbers(self, **values)
 
-    def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
-        self._file.writelines(f"{step},{name},{value}\n" for name, value in values.items())
+    def add_scalar(self, name: str, value: float, step: int) -> None:
+        self._file.write(f"{step},{name},{value}\n")
 
-    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None:
+    def add_image(self, name: str, rgb: np.ndarray, step: int, dataformats: str) -> None:
         """Do nothing: a table holds no pictures."""
 
     def flush(self) -> None:
         self._file.flush()
         os.fsync(self._file.fileno())
 
-    def close(self) -> None:
-        self._file.close()
 
-
-class _TensorBoard:
-    """The folder tensorboard/ of the run."""
-
-    def __init__(self, folder: Path, start: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        self._writer = SummaryWriter(str(folder / TENSORBOARD), purge_step=start + 1)
-        self.flush, self.close = self._writer.flush, self._writer.close
-
-    def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
-        for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
-
-    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None:
-        self._writer.add_image(name, rgb, step, dataformats="HWC")
-
-
-_WRITERS = {"csv": _Csv, "tensorboard": _TensorBoard}
-
-
-class _Wandb:
+def _open_wandb(config: TrainConfig) -> types.SimpleNamespace:
     """A run in the project learn3d at Weights & Biases, which ignores steps that it already has."""
+    import wandb
 
-    def __init__(self, folder: Path, config: TrainConfig) -> None:
-        import wandb
-
-        path = folder / WANDB_ID
-        if not path.is_file():
-            writing.write_bytes(path, uuid.uuid4().hex[:8].encode())
-        self._image = wandb.Image
-        options = {"id": path.read_text(), "resume": "allow", "config": config_to_dict(config)}
-        try:
-            self._run = wandb.init(project="learn3d", name=folder.name, **options)
-        except wandb.Error as error:
-            advice = "call `wandb login`, or choose csv or tensorboard"
-            raise ValueError(f"log 'wandb' cannot begin a run ({error}); {advice}") from None
-
-    def add_numbers(self, step: int, values: Mapping[str, float]) -> None:
-        self._run.log(dict(values), step=step)
-
-    def add_picture(self, step: int, name: str, rgb: np.ndarray) -> None:
-        self._run.log({name: self._image(rgb)}, step=step)
-
-    def flush(self) -> None:
-        """Do nothing: wandb writes in its own process."""
-
-    def close(self) -> None:
-        self._run.finish()
+    path = config.output / WANDB_ID
+    if not path.is_file():
+        writing.write_bytes(path, uuid.uuid4().hex[:8].encode())
+    options = {"id": path.read_text(), "resume": "allow", "config": config_to_dict(config)}
+    try:
+        run = wandb.init(project="learn3d", name=config.output.name, **options)
+    except wandb.Error as error:
+        advice = "call `wandb login`, or choose csv or tensorboard"
+        raise ValueError(f"log 'wandb' cannot begin a run ({error}); {advice}") from None
+    return types.SimpleNamespace(
+        add_scalar=lambda name, value, step: run.log({name: value}, step=step),
+        add_image=lambda name, rgb, step, dataformats: run.log({name: wandb.Image(rgb)}, step=step),
+        flush=lambda: None,  # wandb writes in its own process
+        close=run.finish,
+    )
 
 
 def _drop_after(path: Path, step: int) -> None:
@@ -191,9 +168,8 @@ def _drop_after(path: Path, step: int) -> None:
     """
     kept = []
     for line in path.read_bytes().splitlines() if path.is_file() else []:
-        try:
+        # RecursionError and the others: not the JSON of a metric
+        with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
             if json.loads(line)["step"] <= step:
                 kept.append(line + b"\n")
-        except (ValueError, KeyError, TypeError, RecursionError):  # not the JSON of a metric
-            continue
     writing.write_bytes(path, b"".join(kept), sync=True)

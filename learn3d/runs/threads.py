@@ -52,25 +52,22 @@ class ThreadTuner:
 
     def after_step(self, seconds: float) -> str:
         """Record the duration of a step. Returns a line for the log when a number is chosen, else ""."""
-        if self.fixed:
-            return ""
         self._seconds.append(seconds)
         self._steps += 1
+        if self.fixed or len(self._seconds) < (TRIAL if self._trying else WINDOW):
+            return ""
         if self._trying:
             return self._try()
-        if len(self._seconds) == WINDOW:
-            median = statistics.median_low(self._seconds)
-            self._best = min(self._best, median)
-            is_due = self.threads == 1 and self._steps >= self._rest
-            if median > SLOWER * self._best or is_due:
-                self._rest = 2 * self._rest if is_due else REST
-                self._trying, self._medians = True, {}
-                self._use(self.all)
+        median = statistics.median_low(self._seconds)
+        self._best = min(self._best, median)
+        is_due = self.threads == 1 and self._steps >= self._rest
+        if median > SLOWER * self._best or is_due:
+            self._rest = 2 * self._rest if is_due else REST
+            self._trying, self._medians = True, {}
+            self._use(self.all)
         return ""
 
     def _try(self) -> str:
-        if len(self._seconds) < TRIAL:
-            return ""
         self._medians[self.threads] = statistics.median(list(self._seconds)[WARM_UP:])
         if self.threads == self.all:
             self._use(1)

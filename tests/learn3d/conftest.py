@@ -92,7 +92,7 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable
     folder = tmp_path_factory.mktemp("runs") / "finished"
     summary = train(tiny_config(folder))
     assert summary.finished
-    assert summary.step == 4
+    assert summary.progress.step == 4
     yield folder
     shutil.rmtree(folder)
 

@@ -131,7 +131,7 @@ def test_resume_finds_its_data_in_another_folder(tiny_config, tiny_folder, finis
     shutil.copytree(tiny_folder, tmp_path / "moved")
     before = {path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()}
     summary = train(tiny_config(finished_run, data=tmp_path / "moved"), resume=True)
-    assert (summary.step, summary.finished, summary.best_step) == (4, True, 4)
+    assert (summary.progress.step, summary.finished, summary.progress.best_step) == (4, True, 4)
     assert {path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()} == before
 
 
@@ -170,7 +170,7 @@ def test_the_best_of_other_validation_images_is_forgotten(tiny_config, finished_
     other = tiny_config(run, max_val_images=6)
     assert train(other, resume=True).best_step == 0, "nothing was left to do"
     summary = train(dataclasses.replace(other, iterations=5), resume=True)
-    assert (summary.step, summary.best_step) == (5, 5)
+    assert (summary.progress.step, summary.progress.best_step) == (5, 5)
 
 
 def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:

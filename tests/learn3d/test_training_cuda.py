@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 def test_train_resume_and_evaluate(precision: str, tiny_config, run_folder, read_metrics) -> None:
     train(tiny_config(run_folder, device="cuda", precision=precision, iterations=2))
     summary = train(tiny_config(run_folder, device="cuda", precision=precision), resume=True)
-    assert (summary.step, summary.finished) == (4, True)
+    assert (summary.progress.step, summary.finished) == (4, True)
     metrics = read_metrics(run_folder)
     assert [m["step"] for m in metrics if m["split"] == "train"] == [1, 2, 3, 4]
     assert [m["step"] for m in metrics if m["split"] == "val"] == [2, 4]

@@ -18,7 +18,8 @@ from learn3d.commands import train as train_command
 from learn3d.commands.train import Train
 from learn3d.config import load_config
 from learn3d.experiments.measurement import MEASURES
-from learn3d.runs.summary import Summary
+from learn3d.runs.checkpoint import Progress
+from learn3d.runs.run import Summary
 from learn3d.terminal import INTERRUPTED
 
 TOOLS = Path(__file__).parents[3] / "tools"
@@ -198,7 +199,8 @@ def test_errors_while_libraries_are_imported_are_one_line(error, said: str, stat
 
 @pytest.mark.parametrize(("best_step", "shown"), [(0, False), (500, True)])
 def test_best_iou_is_said_if_there_is_one(best_step: int, shown: bool, tmp_path, monkeypatch, command) -> None:
-    summary = Summary(tmp_path, 700, False, 0.25 if best_step else -1.0, best_step, 60.0, 600.0)
+    progress = Progress(700, 0.25 if best_step else -1.0, best_step, 600.0)
+    summary = Summary(tmp_path, progress, False, 60.0)
     monkeypatch.setattr(train_command, "train", lambda *_, **__: summary)
     status, out, _ = command("train", "--data", tmp_path, "--category", "chair", "--output", tmp_path)
     assert status == INTERRUPTED

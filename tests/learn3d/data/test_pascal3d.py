@@ -292,7 +292,7 @@ def test_a_trained_model_does_without_the_pretrained_weights(folder: Path, tmp_p
     config = TrainConfig(data=folder, category="aeroplane", output=tmp_path / "run", **options)
     assert train(config).finished
     weights.unlink()
-    assert train(dataclasses.replace(config, iterations=2), resume=True).step == 2
+    assert train(dataclasses.replace(config, iterations=2), resume=True).progress.step == 2
     method, saved, _ = load_method(tmp_path / "run" / "last.safetensors")
     assert saved.settings == settings and method.image_size == 224
     shutil.rmtree(tmp_path / "run")

@@ -42,11 +42,14 @@ def test_the_best_networks_are_those_with_the_best_silhouettes(made: Path, tmp_p
     summary = train(TrainConfig(**about, iterations=3, batch_size=4, precision="fp32", validate_every=1))
     lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     measured = {line["step"]: line["silhouette_iou"] for line in lines if line["split"] == "val"}
-    assert summary.best_step == max(measured, key=measured.get)
+    assert summary.progress.best_step == max(measured, key=measured.get)
     method, _, metadata = checkpoint.load_method(tmp_path / "run" / "best.safetensors")
-    assert metadata.progress.step == summary.best_step and measured[summary.best_step] == summary.best_iou
+    assert (
+        metadata.progress.step == summary.progress.best_step
+        and measured[summary.progress.best_step] == summary.progress.best_iou
+    )
     again = evaluate(method, load_dataset("photos", made, "chair", "val")).values["silhouette_iou"]
-    assert float(again.mean()) == pytest.approx(summary.best_iou, abs=1e-5)
+    assert float(again.mean()) == pytest.approx(summary.progress.best_iou, abs=1e-5)
 
 
 @pytest.fixture

@@ -26,7 +26,8 @@ from learn3d.experiments.tables import BINS, TABLES, VARIANTS
 from learn3d.files.writing import write_json
 from learn3d.poses.estimate import PoseOptions
 from learn3d.presets import PRESETS
-from learn3d.runs.summary import Summary
+from learn3d.runs.checkpoint import Progress
+from learn3d.runs.run import Summary
 
 
 def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
@@ -227,7 +228,7 @@ def test_a_run_goes_on_or_starts(finished_run, tiny_folder, request_for, tmp_pat
 
     def train(config, *, resume: bool, overwrite: bool) -> Summary:
         resumed.append(resume)
-        return Summary(config.output, 5, False, 0.0, 0, 0.0, 0.0)
+        return Summary(config.output, Progress(step=5), False, 0.0)
 
     monkeypatch.setattr(experiment, "train", train)
     monkeypatch.setattr(experiment, "evaluate_runs", lambda *_, **__: pytest.fail("a stopped run is not measured"))

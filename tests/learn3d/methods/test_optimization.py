@@ -158,7 +158,7 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
     train(tiny_config(tmp_path / "straight", **options))
     with monkeypatch.context() as patch:
         stop_after(patch, 2)
-        assert train(tiny_config(tmp_path / "stopped", **options)).step == 2
+        assert train(tiny_config(tmp_path / "stopped", **options)).progress.step == 2
     torch.manual_seed(99)
     assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
     for file in ("last", "best"):

@@ -17,6 +17,7 @@ from reader_checks import at_most
 from runs import check_same, metadata, same_bits
 from safetensors.torch import save_file
 
+from learn3d.files.reading import DamagedFile
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.runs import checkpoint
 from learn3d.training import train
@@ -50,11 +51,11 @@ def test_missing_and_foreign_files(tmp_path) -> None:
         checkpoint.load_method(tmp_path, "best")
     path = tmp_path / "last.safetensors"
     save_file({"x": torch.zeros(1)}, path)
-    with pytest.raises(checkpoint.DamagedError, match="not a checkpoint of learn3d"):
+    with pytest.raises(DamagedFile, match="not a checkpoint of learn3d"):
         checkpoint.load(path)
     header = b'{"x": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}'
     path.write_bytes(struct.pack("<Q", 2**60) + header)
-    with at_most(2**20), pytest.raises(checkpoint.DamagedError, match="is damaged or was cut short"):
+    with at_most(2**20), pytest.raises(DamagedFile, match="is damaged or was cut short"):
         checkpoint.load(path)
 
 
@@ -65,7 +66,7 @@ def test_a_flipped_bit_in_any_byte_is_found(tmp_path) -> None:
     for position in range(len(content)):
         bit = 1 << position % 8
         path.write_bytes(content[:position] + bytes([content[position] ^ bit]) + content[position + 1 :])
-        with pytest.raises(checkpoint.DamagedError):
+        with pytest.raises(DamagedFile):
             checkpoint.load(path)
 
 
@@ -81,7 +82,6 @@ def test_a_flipped_bit_in_any_byte_is_found(tmp_path) -> None:
         ({"info": {}}, "num_views is missing"),
         ("[1]", "must be a mapping"),
         ("[" * 100_000, "nested too deeply"),
-        ('{"step": NaN}', "NaN"),
     ],
 )
 def test_metadata_of_another_form(tmp_path, change, message: str) -> None:
@@ -225,7 +225,7 @@ def test_when_none_is_whole_the_run_says_so_and_leaves_all_as_it_is(tiny_run, st
     for path in shutil.copytree(stopped, run_folder).glob("*.safetensors"):
         cut(path)
     before = contents(run_folder)
-    with pytest.raises(ValueError, match=r"last.safetensors is damaged .*previous.safetensors is .*no checkpoint is"):
+    with pytest.raises(ValueError, match=r"last.safetensors: is damaged .*previous.safetensors: is .*no checkpoint is"):
         train(tiny_run(run_folder), resume=True)
     assert contents(run_folder) == before
 

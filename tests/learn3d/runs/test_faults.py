@@ -154,7 +154,7 @@ def test_a_closed_terminal_stops_the_run_in_good_order_but_under_nohup(
         with contextlib.suppress(BrokenPipeError):
             terminal.close()
     signal.signal(signal.SIGHUP, before)
-    assert (summary.step, summary.finished) == ((6, True) if nohup else (3, False))
+    assert (summary.progress.step, summary.finished) == ((6, True) if nohup else (3, False))
     assert train(tiny_run(run_folder), resume=True).finished
     check_same(run_folder, undisturbed)
 

@@ -1,9 +1,10 @@
-"""The state of a run: saved, and restored bit-identically."""
+"""A run: its state, saved and restored bit-identically, the first lines of its log and its summary."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -12,12 +13,35 @@ from learn3d.config import TrainConfig, check_resume, config_to_dict, load_confi
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import PoseCandidates
 from learn3d.files import writing
+from learn3d.files.reading import DamagedFile
 from learn3d.methods import DatasetInfo, Method
+from learn3d.methods.method import is_compact
+from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress, versions
 from learn3d.runs.folder import BEST, CONFIG, LAST, PREVIOUS
 from learn3d.runs.log import RunLog
+from learn3d.runs.threads import ThreadTuner
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The result of a call of `train`."""
+
+    folder: Path
+    progress: Progress
+    finished: bool  # False if a signal stopped it
+    seconds: float  # duration of this call
+
+    def __str__(self) -> str:
+        """One line for the terminal."""
+        done, minutes = self.progress, self.progress.seconds / 60
+        end = f"{'finished' if self.finished else 'stopped'} at step {done.step} after {self.seconds / 60:.1f} min"
+        if done.seconds > self.seconds + 1:
+            end += f" ({minutes:.1f} min of training in all)"
+        best = f"best validation IoU {done.best_iou:.4f} at step {done.best_step}; " if done.best_step else ""
+        return f"{end}; {best}everything is in {self.folder}"
 
 
 def describe_images(dataset: ViewDataset) -> str:
@@ -52,12 +76,29 @@ class Run:
             raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
         if resume:
             run_folder.remove_partials(folder)
-        if progress.step == config.iterations:
-            return progress, notes
-        if not resume:
-            run_folder.remove_old_run(folder, overwrite)
-        writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
+        if progress.step < config.iterations:
+            if not resume:
+                run_folder.remove_old_run(folder, overwrite)
+            writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
         return progress, notes
+
+    def describe(self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner) -> str:
+        """Method, data and device of a run that begins or continues; mirror plane and generator if masks decide."""
+        config, info = self.config, self.info
+        verb = f"resuming at step {progress.step}" if progress.step else "training"
+        name = f"{PRESETS[config.preset].label} ({config.preset})"
+        data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
+        where = f"{config.device}, {config.precision}, {threads}"
+        text = f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"
+        if config.settings.wants_mirror_plane and info.mirror_plane_deg is None:
+            text += "\nno mirror plane found in the masks (about 150 are needed); set it with --symmetry"
+        elif config.settings.wants_mirror_plane:
+            azimuth = f"{info.mirror_plane_deg:g}"
+            text += f"\nmirror plane: along the viewing direction of azimuth {azimuth}, found from the masks"
+        if config.settings.wants_solidity:
+            kind = "compact" if is_compact(info) else "not compact"
+            text += f"\nobjects: {kind}, as masks fill {info.solidity:.2f} of their convex hulls"
+        return text
 
     def _restore(self, tensors: dict[str, Tensor], metadata: Metadata) -> Progress:
         """Restore the state of a checkpoint. Raises a ValueError that names options or data that differ."""
@@ -93,36 +134,34 @@ class Run:
         The checkpoint before it becomes previous.safetensors. Neither file is ever incomplete.
         """
         log.sync()
-        folder = self.config.output
-        tensors = checkpoint.network_tensors(self.method)
-        if self.method.ema is not None:
-            tensors |= {f"ema.{name}": tensor for name, tensor in self.method.ema.tensors.items()}
+        method, last = self.method, self.config.output / LAST
+        tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
+        if method.ema is not None:
+            tensors |= {f"ema.{name}": tensor for name, tensor in method.ema.tensors.items()}
         if self.candidates is not None:
             tensors["poses.weights"] = torch.from_numpy(self.candidates.weights)
-        tensors["random.cpu"] = torch.get_rng_state()
         if self.config.device == "cuda":
             tensors["random.cuda"] = torch.cuda.get_rng_state()
-        for name, optimizer in self.method.optimizers.items():
+        for name, optimizer in method.optimizers.items():
             tensors |= checkpoint.optimizer_tensors(name, optimizer)
-        if (folder / LAST).is_file():
-            writing.give_second_name(folder / LAST, folder / PREVIOUS)
-        checkpoint.save(folder / LAST, tensors, self._metadata(progress))
+        if last.is_file():
+            writing.give_second_name(last, last.with_name(PREVIOUS))
+        self._write(last, tensors, progress)
 
     def save_best(self, progress: Progress) -> None:
         """Write best.safetensors: the networks, with EMA weights if the run has them."""
         with self.method.ema_weights():
-            networks = checkpoint.network_tensors(self.method)
-            checkpoint.save(self.config.output / BEST, networks, self._metadata(progress))
+            self._write(self.config.output / BEST, checkpoint.network_tensors(self.method), progress)
 
-    def _metadata(self, progress: Progress) -> Metadata:
-        return Metadata(self.config, self.info, progress, self.data, self.versions)
+    def _write(self, path: Path, tensors: dict[str, Tensor], progress: Progress) -> None:
+        checkpoint.save(path, tensors, Metadata(self.config, self.info, progress, self.data, self.versions))
 
 
 def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] | None, tuple[str, ...]]:
     """The newest undamaged checkpoint of a run, or None if it has none yet; and warnings.
 
     If last.safetensors is damaged or missing, previous.safetensors replaces it. Raises ValueError if the folder has no
-    run or one with other options; DamagedError if all checkpoints are damaged; OSError if one cannot be read.
+    run or one with other options; DamagedFile if all checkpoints are damaged; OSError if one cannot be read.
     """
     folder, notes = config.output, []
     paths = run_folder.checkpoints(folder)
@@ -133,7 +172,7 @@ def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] |
     for path in paths:
         try:
             saved = checkpoint.load(path)
-        except checkpoint.DamagedError as error:
+        except DamagedFile as error:
             notes.append(str(error))
             continue
         if path.name == PREVIOUS:
@@ -141,5 +180,5 @@ def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] |
             notes.append("going on from the checkpoint before it; the steps since then are repeated")
         return saved, tuple(notes)
     if notes:
-        raise checkpoint.DamagedError("; ".join(notes) + "; no checkpoint is whole: start a new run (--overwrite)")
+        raise DamagedFile(folder, "; ".join(notes) + "; no checkpoint is whole: start a new run (--overwrite)")
     return None, ()
