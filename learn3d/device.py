@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 CPUINFO = "/proc/cpuinfo"  # Linux lists the CPU's instruction sets here
 
@@ -34,11 +33,6 @@ def check_device(device: str) -> None:
     """Raise a ValueError if CUDA is asked for and missing."""
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'")
-
-
-def upload(tensor: Tensor, device: torch.device) -> Tensor:
-    """Copy a CPU tensor to `device` without waiting (the tensor itself if that is the CPU). Differentiable."""
-    return tensor.to(device, non_blocking=True)
 
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>

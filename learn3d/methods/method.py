@@ -15,7 +15,7 @@ import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch, DatasetInfo
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.view_bins import AngleBins
-from learn3d.device import autocast, upload
+from learn3d.device import autocast
 from learn3d.losses import pose_classification_loss
 from learn3d.methods.optimization import CONSTANT_LR, EMA, TrainingSchedule, adam, backpropagate
 from learn3d.methods.surfaces import Grids, Meshes
@@ -327,7 +327,9 @@ class MeshMethod(Method):
 
     def view_loss(self, images: Tensor, poses: LookAtPoses) -> Tensor:
         """The loss of the network "view_classifier" on stored images of these poses."""
-        return pose_classification_loss(self._view_logits(images), upload(AZIMUTHS.ids(poses), self.device))
+        return pose_classification_loss(
+            self._view_logits(images), AZIMUTHS.ids(poses).to(self.device, non_blocking=True)
+        )
 
     def _view_logits(self, images: Tensor) -> Tensor:
         with self.autocast():

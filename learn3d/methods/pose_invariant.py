@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.data.dataset import Batch, DatasetInfo
-from learn3d.device import upload
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.method import MeshMethod, MeshSettings, is_compact
 from learn3d.methods.optimization import frozen
@@ -121,7 +120,7 @@ class PoseInvariant(MeshMethod):
             losses["prior"] = gaussian_prior_loss(codes, settings.prior_form)
         discriminator_turn = step % 2 == 1
         if discriminator_turn and settings.lambda_classification > 0:
-            logits, views = self.discriminator(codes.detach()), upload(view_ids, self.device)
+            logits, views = self.discriminator(codes.detach()), view_ids.to(self.device, non_blocking=True)
             losses["classification"] = pose_classification_loss(logits, views)
         if not discriminator_turn and settings.lambda_adversarial > 0:
             logits = frozen(self.discriminator, codes)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
-from learn3d.device import autocast, upload
+from learn3d.device import autocast
 from learn3d.methods.method import Method, MethodSettings
 from learn3d.methods.optimization import adam, frozen
 from learn3d.methods.surfaces import Grids
@@ -138,7 +138,7 @@ class PrGAN(Method):
 
     def generate(self, z: Tensor) -> Tensor:
         """Silhouettes [B, 64, 64] of generated shapes, for z [B, 201] on the CPU. In float32: bf16 is slow here."""
-        codes = upload(z[:, :SHAPE_CODE], self.device)
+        codes = z[:, :SHAPE_CODE].to(self.device, non_blocking=True)
         with autocast(self.device, "fp32"):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
@@ -149,7 +149,7 @@ class PrGAN(Method):
         """A step of the GAN before `encoder_from_step`, afterwards one of the encoder."""
         if step >= self.settings.encoder_from_step:
             return self._encoder_step(len(batch), step)
-        return self._gan_step(upload(batch.masks, self.device), self.sample_z(len(batch)), step)
+        return self._gan_step(batch.masks.to(self.device, non_blocking=True), self.sample_z(len(batch)), step)
 
     def _gan_step(self, real: Tensor, z: Tensor, step: int) -> dict[str, float]:
         """Train the discriminator, if its accuracy is at most `accuracy_margin`; then the generator on the
@@ -187,7 +187,7 @@ class PrGAN(Method):
             images = self.generate(z)
         with self.autocast():
             estimate = self.encoder(images)
-        difference = estimate.float() - upload(z, self.device)
+        difference = estimate.float() - z.to(self.device, non_blocking=True)
         return self.backward_and_step({"encoder": difference.square().sum()}, step, "encoder")
 
     @torch.no_grad()

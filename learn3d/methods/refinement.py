@@ -9,7 +9,6 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.poses import Poses
-from learn3d.device import upload
 from learn3d.methods.method import MeshMethod
 from learn3d.methods.surfaces import Meshes
 
@@ -30,7 +29,7 @@ def refine(method: MeshMethod, images: Tensor, masks: Tensor, poses: Poses) -> M
 
     def decode(codes: Tensor) -> Tensor:
         with method.autocast():
-            return method.generator(upload(codes, method.device))
+            return method.generator(codes.to(method.device, non_blocking=True))
 
     def loss(vertices: Tensor) -> Tensor:
         vertices = vertices.float().cpu()

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.poses import Poses
-from learn3d.device import upload
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings
 from learn3d.methods.optimization import adam, frozen
@@ -202,14 +201,14 @@ class VPL(MeshMethod):
         self, network: Callable[..., Tensor], silhouettes: Tensor, seen_at: Tensor, batch: Batch
     ) -> Tensor:
         """Logits for silhouettes [B,S,S] of the batch's shapes, seen at the views `seen_at`."""
-        silhouettes = upload(silhouettes, self.device)
+        silhouettes = silhouettes.to(self.device, non_blocking=True)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
-                return network(silhouettes, upload(batch.view_ids[seen_at], self.device)).float()
+                return network(silhouettes, batch.view_ids[seen_at].to(self.device, non_blocking=True)).float()
         # autocast is off: with it, spectral normalisation mixes dtypes
-        conditions = [upload(batch.poses[seen_at].features(), self.device)]
+        conditions = [batch.poses[seen_at].features().to(self.device, non_blocking=True)]
         if self.settings.class_conditional:
-            conditions.append(upload(batch.class_ids, self.device))
+            conditions.append(batch.class_ids.to(self.device, non_blocking=True))
         return network(silhouettes, *conditions)
 
 

@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.device import upload
 from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
@@ -174,7 +173,7 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
         raise ValueError(
             f"images must be uint8 [B, 4, {size}, {size}] (RGB and mask), got {images.dtype} {list(images.shape)}"
         )
-    images = upload(images, torch.device(device))
+    images = images.to(device, non_blocking=True)
     pixels = torch.empty((len(images), size, size, 4), device=images.device)
     for channel in range(4):  # one pass converts and copies; torch's own change of layout is slower
         pixels[..., channel].copy_(images[:, channel])
