@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import io
-import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -43,18 +41,14 @@ def read_mesh(path: Path) -> RawMesh:
 def _read(path: Path) -> RawMesh:
     import trimesh
 
-    logging.getLogger("trimesh").addHandler(logging.NullHandler())
     content, kind = io.BytesIO(_content(path)), path.suffix.lower().lstrip(".")
     how = {"force": "scene", "process": False, "skip_materials": True}
     scene = trimesh.load(content, file_type=kind, resolver=_FilesBelow(path.parent), **how)
     parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not parts:
         raise DamagedFile(path, "no faces")
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    return RawMesh(
-        vertices=np.concatenate([np.asarray(part.vertices, np.float64) for part in parts]),
-        faces=np.concatenate([np.asarray(p.faces, np.int64) + o for p, o in zip(parts, offsets, strict=True)]),
-    )
+    vertices, faces = trimesh.util.append_faces([part.vertices for part in parts], [part.faces for part in parts])
+    return RawMesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
 
 
 class _FilesBelow:
@@ -92,15 +86,11 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
     return array != 0
 
 
-class Binvox(NamedTuple):
-    """A voxel grid."""
+def read_binvox(path: Path, size: int) -> tuple[np.ndarray, float]:
+    """Read a grid bool [size, size, size] with the mesh's axes x, y, z, and its side in the mesh's units.
 
-    voxels: np.ndarray  # bool [D, D, D], axes x, y, z of the mesh
-    scale: float  # side of the grid in the mesh's units
-
-
-def read_binvox(path: Path, size: int) -> Binvox:
-    """Read a grid of size^3 cells: a text header, then runs of (value, count) bytes; y runs fastest, then z, then x."""
+    The file has a text header, then runs of (value, count) bytes; y runs fastest, then z, then x.
+    """
     head, _, runs = read_bytes(path, limits.VOLUME_BYTES, "a binvox file").partition(b"\ndata\n")
     header = {words[0]: words[1:] for line in head.split(b"\n") if (words := line.split())}
     scale, (low, high) = float(header[b"scale"][0]), limits.DISTANCE
@@ -108,7 +98,7 @@ def read_binvox(path: Path, size: int) -> Binvox:
         raise ValueError(f"it has dim {header[b'dim']} and scale {scale}, wanted {size} and {low:g} .. {high:g}")
     pairs = np.frombuffer(runs, np.uint8)[: len(runs) // 2 * 2].reshape(-1, 2)
     grid = np.repeat(pairs[:, 0] != 0, pairs[:, 1]).reshape(size, size, size)  # axes x, z, y
-    return Binvox(np.ascontiguousarray(grid.transpose(0, 2, 1)), scale)
+    return np.ascontiguousarray(grid.transpose(0, 2, 1)), scale
 
 
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:

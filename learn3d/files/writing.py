@@ -18,12 +18,11 @@ from learn3d.terminal import stop_on_signal
 def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; at the end the file there is renamed to `path`.
 
-    After an exception the temporary file is removed; a killed process leaves it. sync: the file is
-    complete even after a power failure. Raises OSError if `path` is a folder, a pipe or a device.
+    After an exception the temporary file is removed; a killed process leaves it. sync: the file is complete even after
+    a power failure. Raises OSError if `path` is a folder, a pipe or a device.
     """
     path = Path(path)
-    if not _may_replace(path):
-        raise OSError(f"{path} is not a regular file and is not replaced; give another name")
+    _require_regular(path)
     temporary = path.with_name(f".{path.name}.partial")
     temporary.unlink(missing_ok=True)  # a killed process may have left a hard link, which must not be overwritten
     try:
@@ -41,10 +40,11 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _may_replace(path: Path) -> bool:
+def _require_regular(path: Path) -> None:
     # /dev/stdout is a link into /proc; it must stay one even if the output is redirected to a regular file.
     into_proc = path.is_symlink() and path.readlink().is_relative_to("/proc")
-    return not into_proc and (path.is_file() or not path.exists())
+    if into_proc or (path.exists() and not path.is_file()):
+        raise OSError(f"{path} is not a regular file and is not replaced")
 
 
 def _sync(path: Path) -> None:
@@ -63,8 +63,8 @@ def check_target(path: Path, option: str, *, folder: bool = False) -> None:
     path = Path(path)
     existing = next(p for p in (path, *path.parents) if p.exists()) if folder else path.parent
     try:
-        if not folder and not _may_replace(path):
-            raise OSError("it is not a regular file, and is not replaced")
+        if not folder:
+            _require_regular(path)
         with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from learn3d.fitting.familiarity import KNOWN_CODES, known_codes
@@ -16,7 +15,8 @@ from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
 from learn3d.terminal import note
 
-_TRAINING_ONLY = ("lambda_classification", "lambda_adversarial", "lambda_novel_view")  # they need more networks
+#: Settings that are not needed any more, or that ask for networks of the training only.
+_UNUSED = {"pretrained": None, "lambda_classification": 0.0, "lambda_adversarial": 0.0, "lambda_novel_view": 0.0}
 
 
 def export(source: Path, target: Path, *, which: str = "last", others: Tensor | None = None) -> int:
@@ -29,26 +29,26 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
     Raises ValueError for methods other than proposed, Vanilla-AE, Plus and Many views.
     """
     method, config, metadata = checkpoint.load_method(source, which)
-    config = trained_on = dataclasses.replace(config, poses=None)
+    config = dataclasses.replace(config, poses=None)
     if not isinstance(config.settings, (PoseInvariantSettings, ManyViewsSettings)):
         names = "proposed, vanilla, plus and many-views"
         raise ValueError(f"only runs of {names} can be exported, this one is of {config.preset}")
-    names = {field.name for field in dataclasses.fields(config.settings)}
-    unused = {"pretrained": None, **dict.fromkeys(_TRAINING_ONLY, 0.0)}
-    settings = dataclasses.replace(config.settings, **{name: unused[name] for name in names & unused.keys()})
-    config = dataclasses.replace(config, settings=settings, data=Path("data"), output=Path("run"))
     tensors = {
-        name: tensor.half() if tensor.dtype == torch.float32 else tensor
+        name: tensor
         for name, tensor in checkpoint.network_tensors(method).items()
         if name.startswith(("network.encoder.", "network.generator.", "network.view_classifier."))
     }
-    if not trained_on.data.is_dir():
-        note(f"note: {trained_on.data} is missing, so reconstruction with this file cannot warn of unknown objects")
+    if not config.data.is_dir():
+        note(f"note: {config.data} is missing, so reconstruction with this file cannot warn of unknown objects")
     elif isinstance(method, MeshMethod):
-        dataset = checkpoint.load_data(trained_on, "train")
-        known = dict(zip(KNOWN_CODES, known_codes(method, dataset, others), strict=True))
+        dataset = checkpoint.load_data(config, "train")
+        known = zip(KNOWN_CODES, known_codes(method, dataset, others), strict=True)
+        tensors |= {name: tensor for name, tensor in known if tensor is not None}
         if (templates := learn_templates(method, dataset)) is not None:
-            known |= dict(zip(TEMPLATES, templates, strict=True))
-        tensors |= {k: v.half() if v.is_floating_point() else v for k, v in known.items() if v is not None}
-    checkpoint.save(target, tensors, dataclasses.replace(metadata, config=config))
+            tensors |= dict(zip(TEMPLATES, templates, strict=True))
+    settings = {name: value for name, value in _UNUSED.items() if hasattr(config.settings, name)}
+    settings = dataclasses.replace(config.settings, **settings)
+    config = dataclasses.replace(config, settings=settings, data=Path("data"), output=Path("run"))
+    halves = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+    checkpoint.save(target, halves, dataclasses.replace(metadata, config=config))
     return target.stat().st_size

@@ -78,8 +78,8 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     return {path.name: SPLITS for path in sorted(Path(folder).glob("ShapeNetRendering/*/"))}
 
 
-def _build(path: Path, table: np.ndarray, _: Path, grid: formats.Binvox) -> tuple[np.ndarray, np.ndarray]:
-    azimuth, elevation, _, ratio, _ = table.T
+def _build(path: Path, table: np.ndarray, _: Path, grid: tuple[np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
+    (azimuth, elevation, _, ratio, _), (voxels, side) = table.T, grid
     poses = check_poses(path, np.stack([-azimuth, elevation, DISTANCE * ratio], axis=1), _TABLE)
-    poses[:, 2] /= grid.scale
-    return poses, grid.voxels
+    poses[:, 2] /= side
+    return poses, voxels

@@ -120,7 +120,7 @@ def test_only_regular_files_are_replaced(tmp_path) -> None:
         for path in (fifo, folder, link, output):
             with pytest.raises(OSError, match="is not a regular file and is not replaced"):
                 writing.write_json(path, {})
-            with pytest.raises(OSError, match="it is not a regular file"):
+            with pytest.raises(OSError, match="is not a regular file"):
                 writing.check_target(path, "--json")
     assert {path.name: path.lstat().st_ino for path in tmp_path.iterdir()} == before
 
