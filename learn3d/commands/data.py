@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from tqdm import tqdm
 
 from learn3d.commands.command import Command, DataFolder, Split
@@ -14,7 +12,6 @@ from learn3d.data import shards
 from learn3d.data.categories import synset_of
 from learn3d.data.conventions import IMAGE_SIZE
 from learn3d.data.layouts import Layout, check_folder, load_dataset
-from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
 from learn3d.make_data.debian.models import fetch_debian_models
@@ -169,20 +166,16 @@ class EstimatePoses(Command):
     """Arrangement of the files of the data set, see docs/data-sets.md."""
     options: PoseOptions
     cameras: CameraOptions
-    candidates: Annotated[int, tyro.conf.arg(metavar="INT")] = 4
-    """Number of poses of each image with a probability above 0; each training step draws one."""
     compare: bool = False
     """Compare with the known azimuths, and turn the table into their frame, so that voxel IoU can be measured."""
     views_per_object: Count | None = None
     """Number of training images of each object (default: the layout's protocol, one for kar, else all)."""
 
     def run(self) -> None:
-        if not 1 <= self.candidates <= MAX_CANDIDATES:
-            raise ValueError(f"candidates must lie in 1 .. {MAX_CANDIDATES}, got {self.candidates}")
         check_target(self.output, "--output")
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
         with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:
-            views = estimate_views(datasets, self.cameras, self.options, self.candidates, bar.update)
+            views = estimate_views(datasets, self.cameras, self.options, bar.update)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
         say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}")

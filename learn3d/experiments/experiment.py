@@ -28,7 +28,6 @@ from learn3d.terminal import INTERRUPTED, align, note, say
 from learn3d.training import train
 
 LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # files in a run's folder
-_CANDIDATES = 4  # estimated poses of each image
 
 
 def estimate_poses(config: TrainConfig) -> None:
@@ -42,7 +41,7 @@ def estimate_poses(config: TrainConfig) -> None:
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     datasets = load_views(config.layout, config.data, config.category, config.views_per_object)
-    views = estimate_views(datasets, CameraOptions(), PoseOptions(seed=config.seed), _CANDIDATES)
+    views = estimate_views(datasets, CameraOptions(), PoseOptions(seed=config.seed))
     comparison = compare(views)
     note(comparison.text())
     config.poses.parent.mkdir(parents=True, exist_ok=True)

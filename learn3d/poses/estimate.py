@@ -32,6 +32,7 @@ from scipy import ndimage
 from torch import Tensor
 
 import nmr
+from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.networks import CODE_SIZE, GENERATORS
 from learn3d.settings import Rare, checked
 
@@ -67,6 +68,8 @@ class PoseOptions:
     """Optimisation steps of each mean shape and of each of the three stages of the prototypes."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial shapes and of the order of the images."""
+    candidates: Annotated[int, Field(ge=1, le=MAX_CANDIDATES)] = 4
+    """Number of poses of each image with a probability above 0; each training step draws one."""
 
     @property
     def all_steps(self) -> int:

@@ -103,14 +103,13 @@ def estimate_views(
     datasets: Sequence[ViewDataset],
     cameras: CameraOptions,
     options: PoseOptions,
-    kept: int,
     tick: Callable[[], object] = lambda: None,
 ) -> EstimatedViews:
     """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
-    kept: number of candidates of each image with a probability above 0; the table holds up to MAX_CANDIDATES, which a
-    training can reweight. tick: called after each of `options.all_steps` steps. Raises ValueError if all training
-    masks are empty, or if the data set's poses are rotations.
+    The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight. tick: called after each of
+    `options.all_steps` steps. Raises ValueError if all training masks are empty, or if the data set's poses are
+    rotations.
     """
     elevation, distance, half_fov = _cameras(datasets, cameras)
     size = distance * torch.tan(half_fov.deg2rad())
@@ -135,7 +134,7 @@ def estimate_views(
     if own_elevation:
         posterior = posterior.sum(2, keepdim=True)
     weights, chosen = posterior.flatten(1).topk(min(MAX_CANDIDATES, posterior[0].numel()), 1)
-    weights[:, kept:] = 0
+    weights[:, options.candidates :] = 0
     azimuth, height = chosen // posterior.shape[2], chosen % posterior.shape[2]
     heights = elevation[:, None].expand_as(weights) if own_elevation else grid[height]
     confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)

@@ -56,7 +56,7 @@ def darts(objects: int) -> ViewDataset:
 
 
 def estimated(dataset: ViewDataset, **options: object) -> EstimatedViews:
-    return estimate_views([dataset], CameraOptions(), dataclasses.replace(QUICK, **options), 2)
+    return estimate_views([dataset], CameraOptions(), dataclasses.replace(QUICK, candidates=2, **options))
 
 
 @pytest.fixture(scope="module")
@@ -89,12 +89,12 @@ def test_a_seed_gives_the_same_bits() -> None:
 
 
 def test_ranges_of_elevations_and_unknown_cameras() -> None:
-    quick, dataset = dataclasses.replace(QUICK, steps=3), darts(5)
+    quick, dataset = dataclasses.replace(QUICK, steps=3, candidates=3), darts(5)
     known = dataclasses.replace(dataset.poses, elevation_deg=20.0 * (torch.arange(120) % 3))
-    table = estimate_views([dataclasses.replace(dataset, poses=known)], CameraOptions(), quick, 3).table
+    table = estimate_views([dataclasses.replace(dataset, poses=known)], CameraOptions(), quick).table
     assert all(len(set(azimuths)) == 24 for azimuths in table.azimuth_deg)  # each azimuth once, at the known elevation
     assert np.array_equal(table.elevation_deg[:, 0], known.elevation_deg)
-    views = estimate_views([dataclasses.replace(darts(5), poses=None)], CameraOptions("0:30", 2.5, 31.0), quick, 3)
+    views = estimate_views([dataclasses.replace(darts(5), poses=None)], CameraOptions("0:30", 2.5, 31.0), quick)
     assert set(np.unique(views.table.elevation_deg)) <= {0.0, 15.0, 30.0}
     assert (views.table.distance == 2.5).all() and (views.table.half_fov_deg == 15.5).all()
     with pytest.raises(ValueError, match=r"elevation must be degrees within -90 .. 90, or LOW:HIGH, got '30:x'"):
