@@ -10,12 +10,8 @@ from .draw import Draw, ellipse, points, rectangle
 from .parts import Part, bar, box, ellipsoid, join, loft, revolve, tube, wing
 
 # Shares of the half span at which a wing of each shape has a section, in addition to its middle and its tip.
-_STATIONS = {
-    "straight": [],
-    "elliptic": np.sin(np.linspace(0, np.pi / 2, 8)).round(4).tolist(),
-    "kinked": [0.55, 0.95],
-    "gull": [0.09, 0.18, 0.26, 0.35, 0.97],
-}
+_STATIONS = {"straight": [], "kinked": [0.55, 0.95], "gull": [0.09, 0.18, 0.26, 0.35, 0.97]}
+_STATIONS["elliptic"] = np.sin(np.linspace(0, np.pi / 2, 8)).round(4).tolist()
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,7 @@ class Planform:
 
     def wing(self) -> Part:
         """The whole wing, tip to tip, in one piece."""
-        shares = {0.0, 1.0, *([self.kink] if self.kink > 0.0 else _STATIONS[self.shape])}
+        shares = {0.0, self.kink, *_STATIONS[self.shape], 1.0}
         middle, *right = [(*self.at(share), self.thickness) for share in sorted(shares)]
         return wing([*((-x, *rest) for x, *rest in right[::-1]), middle, *right])
 
@@ -103,13 +99,14 @@ def fin(height: float, root: float, tip: float, sweep_deg: float, z: float, thic
 
 def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     """Fin and stabiliser of a kind: "conventional", "cross" (stabiliser half-way up the fin), "T", "V" or "twin"."""
-    height = draw(0.14, 0.21)
-    sweep = draw(28, 45) if swept else draw(5, 20)
-    root, tip = draw(0.13, 0.19), draw(0.06, 0.1)
-    half, chord = draw(0.15, 0.22), draw(0.09, 0.13)
-    lean = draw(25, 38) if swept else draw(0, 15)
-    tip_chord = draw(0.4, 0.8) * chord
-    base, z = 0.25 * radius, -0.5 + root + draw(-0.01, 0.03)
+    height, sweep, root, tip = (
+        draw(0.14, 0.21),
+        draw(*(28, 45) if swept else (5, 20)),
+        draw(0.13, 0.19),
+        draw(0.06, 0.1),
+    )
+    half, chord, lean = draw(0.15, 0.22), draw(0.09, 0.13), draw(*(25, 38) if swept else (0, 15))
+    tip_chord, base, z = draw(0.4, 0.8) * chord, 0.25 * radius, -0.5 + root + draw(-0.01, 0.03)
     if kind == "V":
         side = wing([(0, 0, z - 0.02, root, 0.1), (1.25 * half, 0, z - 0.02 - 0.5 * half * (1 + swept), tip, 0.1)])
         return side.rotated("z", draw(32, 45)).moved(y=base).both_sides()
@@ -123,13 +120,13 @@ def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     if swept and draw.maybe(0.4):  # a dorsal fillet
         part += fin(0.45 * height + base, 1.6 * root, 0.5 * root, 62, z + 0.75 * root, 0.04).moved(y=0.4 * base)
     share = {"T": 0.97, "cross": draw(0.35, 0.6), "conventional": 0.0}[kind]
-    level = 0.4 * base + share * (height + base)
-    front = z - share * (height + base) * np.tan(np.radians(sweep)) + 0.01
     if share == 0.0:
         front, level = -0.5 + chord + draw(0.0, 0.04), draw(0.1, 0.45) * radius
+    else:
+        rise, dihedral = share * (height + base), 0.0
+        front, level = z - rise * np.tan(np.radians(sweep)) + 0.01, 0.4 * base + rise
     if kind == "T":
         chord, tip_chord = min(chord, 1.3 * tip), min(tip_chord, 0.9 * tip)
-    dihedral = dihedral if share == 0 else 0.0
     return part + Planform(half, chord, tip_chord, lean, dihedral, front, level, thickness=0.1).wing()
 
 
@@ -214,18 +211,18 @@ def airliner(draw: Draw) -> Part:
         plane += ellipsoid((1.5 * radius, 0.7 * radius, 0.32), (0, 0.85 * radius, plan.z - 0.1))
     mount = "wing" if freighter else draw.pick({"wing": 4, "tail": 1, "tail3": 0.5, "wing3": 0.4})
     size = draw(0.35, 0.58) * radius
-    if mount.startswith("wing"):
+    if mount.startswith("tail"):
+        plane += tail_engines(draw, radius, 0.9 * size, z=draw(-0.32, -0.24))
+    else:
         two = draw.maybe(0.35 if freighter else 0.7)
         size *= 1.25 if two else 0.9
         for share in (draw(0.28, 0.4),) if two else (0.3, draw(0.55, 0.65)):
             x, y, z, chord = plan.at(share)
-            length, drop = draw(3.0, 4.6) * size, draw(1.1, 1.5) * size
-            forward = z + draw(0.0, 0.3) * length
-            lower = (y - drop + 0.6 * size, x, forward + 0.25 * length, 0.9 * length, 0.08)
+            length, low = draw(3.0, 4.6) * size, y - draw(1.1, 1.5) * size
+            front = z + draw(0.0, 0.3) * length
+            lower = (low + 0.6 * size, x, front + 0.25 * length, 0.9 * length, 0.08)
             pylon = wing([lower, (y, x, z - 0.05 * chord, 0.5 * chord, 0.1)], upright=True)
-            plane += (pylon + nacelle(size, length).moved(x, y - drop, forward)).both_sides()
-    else:
-        plane += tail_engines(draw, radius, 0.9 * size, z=draw(-0.32, -0.24))
+            plane += (pylon + nacelle(size, length).moved(x, low, front)).both_sides()
     if mount.endswith("3"):
         plane += nacelle(0.9 * size, 4.5 * size).moved(y=1.35 * radius, z=-0.36)
     plane += tail(draw, "T" if freighter or mount.startswith("tail") else "conventional", radius, swept=True)
@@ -283,8 +280,7 @@ def fighter(draw: Draw) -> Part:
         upright = fin(height, 0.19, 0.08, draw(30, 45), z=-0.27)
         plane += upright.rotated("z", -cant).moved(x, 0.3 * radius).both_sides()
     else:
-        height = draw(0.17, 0.25) + 0.6 * radius
-        plane += fin(height, draw(0.2, 0.3), 0.09, draw(35, 52), z=-0.2).moved(y=0.3 * radius)
+        plane += fin(draw(0.17, 0.25) + 0.6 * radius, draw(0.2, 0.3), 0.09, draw(35, 52), z=-0.2).moved(y=0.3 * radius)
     if shape != "delta":
         plane += Planform(draw(0.17, 0.23), 0.15, 0.06, draw(30, 45), -3, -0.34, 0.0, thickness=0.06).wing()
         if draw.maybe(0.4):  # strakes from the wing root towards the nose
@@ -345,24 +341,22 @@ def light_plane(draw: Draw) -> Part:
     shape = draw.pick(("straight", "straight", "elliptic", "kinked"))
     plan = Planform(**size, dihedral_deg=dihedral, z=z, y=y, shape=shape)
     plane = fuselage(radius, **form) + plan.wing()
-    if high:
-        plane += box((1.5 * radius, 1.1 * tall, 0.2), (0, 0.62 * tall, 0.14), 0.03)
-    else:
-        plane += canopy(1.5 * radius, 1.3 * tall, draw(0.24, 0.36), 0.72 * tall, 0.1)
+    cabin = box((1.5 * radius, 1.1 * tall, 0.2), (0, 0.62 * tall, 0.14), 0.03)
+    plane += cabin if high else canopy(1.5 * radius, 1.3 * tall, draw(0.24, 0.36), 0.72 * tall, 0.1)
     plane += propeller(draw, draw(0.11, 0.16), draw.count(2, 3), hub=0.025).moved(z=-0.515 if pusher else 0.497)
-    swept = draw.maybe(0.5)
-    plane += tail(draw, draw.pick({"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5}), radius, swept)
+    swept, kind = draw.maybe(0.5), draw.pick({"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5})
+    plane += tail(draw, kind, radius, swept)
     if high and draw.maybe(0.6):
         x, y, z, chord = plan.at(draw(0.4, 0.6))
         plane += bar((0.6 * radius, -0.6 * tall, z - 0.4 * chord), (x, y, z - 0.4 * chord), 0.018, 0.01).both_sides()
     if draw.maybe(0.12):  # floats
         x, y = 2.2 * radius, -tall - draw(0.08, 0.11)
         hull = fuselage(0.035, nose=0.25, nose_power=1.8, tail_start=0.5, upsweep=0.9, length=draw(0.65, 0.8))
-        floats = hull.moved(x, y, 0.12)
+        plane += hull.moved(x, y, 0.12).both_sides()
         for z in (0.24, 0.02):
-            floats += bar((0.5 * radius, -0.6 * tall, z), (x, y + 0.02, z), 0.016)
-            floats += bar((0.0, y + 0.02, z), (x, y + 0.02, z), 0.012)
-        return plane + floats.both_sides()
+            end = (x, y + 0.02, z)
+            plane += (bar((0.5 * radius, -0.6 * tall, z), end, 0.016) + bar((0.0, *end[1:]), end, 0.012)).both_sides()
+        return plane
     if draw.maybe(0.75):
         main_z, other_z = (0.03, 0.4) if draw.maybe(0.6) else (0.25, -0.46)
         plane += gear(tall, tall + draw(0.05, 0.09), 2.0 * radius, main_z, other_z)
@@ -412,12 +406,10 @@ def biplane(draw: Draw) -> Part:
     gap, stagger = draw(0.16, 0.22), draw(-0.03, 0.1)
     decks = 3 if draw.maybe(0.2) else 2
     chord, half = draw(0.13, 0.18) * (0.8 if decks == 3 else 1), draw(0.42, 0.58)
-    z, low = draw(0.24, 0.3), -0.9 * radius
-    shape = draw.pick(("straight", "elliptic"))
+    z, low, shape = draw(0.24, 0.3), -0.9 * radius, draw.pick(("straight", "elliptic"))
     plans = []
     for t in np.linspace(0, 1, decks):
-        reach = half * (1 if t == 1 else draw(0.85, 1.0))
-        y = low + t * (gap + radius)
+        reach, y = half * (1 if t == 1 else draw(0.85, 1.0)), low + t * (gap + radius)
         plans.append(Planform(reach, chord, 0.9 * chord, 0, 1.5, z + t * stagger, y, shape=shape))
         plane += plans[-1].wing()
     bottom, top = plans[0], plans[-1]
@@ -428,8 +420,7 @@ def biplane(draw: Draw) -> Part:
             plane += bar((x, y0, z0 - along * c0), (x, y1, z1 - along * c1), 0.013).both_sides()
     for z in (top.z - 0.2 * chord, top.z - 0.7 * chord):
         plane += bar((0.7 * radius, 0.5 * radius, z), (0.08, top.y, z), 0.012).both_sides()
-    plane += propeller(draw, draw(0.12, 0.15), 2, hub=0.025).moved(z=0.495)
-    plane += tail(draw, "conventional", radius)
+    plane += propeller(draw, draw(0.12, 0.15), 2, hub=0.025).moved(z=0.495) + tail(draw, "conventional", radius)
     return plane + gear(radius, 2.6 * radius, main_x=0.11, main_z=0.27, other_z=-0.46)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -12,65 +12,53 @@ from .parts import Part, bar, box, crossbar, join, loft, revolve, slab, wing
 
 TYRE = 0.22  # width of the wheels
 
-
-@dataclass(frozen=True)
-class Body:
-    """Measures of a car body, in metres or as shares of its length (0 = front bumper) or height."""
-
-    length: float
-    width: float
-    height: float
-    wheel: float  # radius of the wheels, metres
-    clearance: float  # height of the floor over the ground, metres
-    bonnet: float  # length of the bonnet, share of the length
-    screen: float  # length of the windscreen, share of the length
-    roof: float  # end of the roof, share of the length
-    window: float  # end of the rear window and start of the boot or bed, share of the length
-    belt: float  # height of the shoulder line under the windows, share of the height
-    lean: float  # inward lean of the side windows per height
-    has_bed: bool = False  # True for an open box behind the cabin
-
-    @property
-    def shoulder(self) -> float:
-        """Height of the shoulder line in metres; it stays above the wheel arches."""
-        return max(self.belt * self.height, 2 * self.wheel + 0.15)
-
-    @property
-    def axles(self) -> tuple[float, float]:
-        """Distance of the front and of the rear axle from the front bumper, in metres."""
-        return self.wheel + 0.48, self.length - self.wheel - 0.44
-
-
-# The smallest and the largest measures of each kind, in the order of the fields of Body.
-_MEASURES = {
-    #               length width height wheel clear. bonnet screen roof window belt  lean
-    "sedan":     (( 4.2,  1.70,  1.38,  0.30,  0.14,  0.25,  0.14, 0.66,  0.80, 0.56, 0.20),
-                  ( 5.2,  1.92,  1.52,  0.35,  0.20,  0.31,  0.19, 0.74,  0.90, 0.64, 0.40)),
-    "hatchback": (( 3.3,  1.58,  1.40,  0.28,  0.15,  0.16,  0.14, 0.84,  0.96, 0.56, 0.20),
-                  ( 4.3,  1.80,  1.60,  0.34,  0.20,  0.28,  0.20, 0.92,  1.00, 0.64, 0.40)),
-    "wagon":     (( 4.3,  1.70,  1.42,  0.30,  0.15,  0.24,  0.13, 0.91,  0.97, 0.56, 0.20),
-                  ( 5.0,  1.90,  1.58,  0.35,  0.22,  0.30,  0.18, 0.95,  1.00, 0.64, 0.40)),
-    "coupe":     (( 4.0,  1.78,  1.10,  0.31,  0.10,  0.26,  0.13, 0.56,  0.76, 0.58, 0.30),
-                  ( 4.7,  2.00,  1.34,  0.36,  0.15,  0.37,  0.17, 0.66,  0.96, 0.64, 0.50)),
-    "suv":       (( 4.1,  1.78,  1.62,  0.36,  0.22,  0.23,  0.12, 0.88,  0.96, 0.56, 0.12),
-                  ( 5.1,  2.02,  1.95,  0.43,  0.30,  0.30,  0.17, 0.94,  1.00, 0.64, 0.28)),
-    "van":       (( 4.4,  1.80,  1.90,  0.32,  0.18,  0.06,  0.06, 0.95,  0.98, 0.44, 0.04),
-                  ( 6.0,  2.05,  2.60,  0.37,  0.25,  0.20,  0.14, 0.97,  1.00, 0.52, 0.13)),
-    "pickup":    (( 4.8,  1.75,  1.60,  0.36,  0.24,  0.23,  0.09, 0.46,  0.57, 0.54, 0.20),
-                  ( 5.9,  2.05,  1.95,  0.44,  0.34,  0.29,  0.13, 0.55,  0.64, 0.62, 0.40)),
+# The weight of each kind, the smallest and largest measures. length, width, height, wheel (radius) and clearance (of
+# the floor over the ground) are in metres. bonnet and screen (lengths), roof (its end) and window (end of the rear
+# window, start of the boot or bed) are shares of the length. belt: height of the shoulder line under the windows, share
+# of the height. lean: inward lean of the side windows per height.
+_FIELDS = "length width height wheel clearance bonnet screen roof window belt lean".split()
+_KINDS = {
+    "sedan":     (2.5, ( 4.2,  1.70,  1.38,  0.30,  0.14,  0.25,  0.14, 0.66,  0.80, 0.56, 0.20),
+                       ( 5.2,  1.92,  1.52,  0.35,  0.20,  0.31,  0.19, 0.74,  0.90, 0.64, 0.40)),
+    "hatchback": (  2, ( 3.3,  1.58,  1.40,  0.28,  0.15,  0.16,  0.14, 0.84,  0.96, 0.56, 0.20),
+                       ( 4.3,  1.80,  1.60,  0.34,  0.20,  0.28,  0.20, 0.92,  1.00, 0.64, 0.40)),
+    "wagon":     (1.2, ( 4.3,  1.70,  1.42,  0.30,  0.15,  0.24,  0.13, 0.91,  0.97, 0.56, 0.20),
+                       ( 5.0,  1.90,  1.58,  0.35,  0.22,  0.30,  0.18, 0.95,  1.00, 0.64, 0.40)),
+    "coupe":     (1.8, ( 4.0,  1.78,  1.10,  0.31,  0.10,  0.26,  0.13, 0.56,  0.76, 0.58, 0.30),
+                       ( 4.7,  2.00,  1.34,  0.36,  0.15,  0.37,  0.17, 0.66,  0.96, 0.64, 0.50)),
+    "suv":       (1.8, ( 4.1,  1.78,  1.62,  0.36,  0.22,  0.23,  0.12, 0.88,  0.96, 0.56, 0.12),
+                       ( 5.1,  2.02,  1.95,  0.43,  0.30,  0.30,  0.17, 0.94,  1.00, 0.64, 0.28)),
+    "van":       (1.6, ( 4.4,  1.80,  1.90,  0.32,  0.18,  0.06,  0.06, 0.95,  0.98, 0.44, 0.04),
+                       ( 6.0,  2.05,  2.60,  0.37,  0.25,  0.20,  0.14, 0.97,  1.00, 0.52, 0.13)),
+    "pickup":    (1.6, ( 4.8,  1.75,  1.60,  0.36,  0.24,  0.23,  0.09, 0.46,  0.57, 0.54, 0.20),
+                       ( 5.9,  2.05,  1.95,  0.44,  0.34,  0.29,  0.13, 0.55,  0.64, 0.62, 0.40)),
 }  # fmt: skip
 
 
 def car(draw: Draw, kind: str) -> Part:
-    """A car of one of the kinds of `_MEASURES`."""
-    measures = [draw(*limits) for limits in zip(*_MEASURES[kind], strict=True)]
-    body = Body(*measures, has_bed=kind == "pickup")
-    part = _hull(body) + _wheels(draw, body)
+    """A car of one of the kinds of `_KINDS`."""
+    limits = zip(_FIELDS, *_KINDS[kind][1:], strict=True)
+    body = SimpleNamespace(**{name: draw(*both) for name, *both in limits}, has_bed=kind == "pickup")
+    body.shoulder = max(body.belt * body.height, 2 * body.wheel + 0.15)  # height of the shoulder line, above the wheels
+    body.axles = body.wheel + 0.48, body.length - body.wheel - 0.44  # their distances from the front bumper
+    part = _hull(body)
+
+    x, y, dish = (body.width - TYRE) / 2 - 0.02, body.wheel, draw(0.1, 0.6)
+    rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])  # of a wheel with a dished hub
+    profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
+    pair = revolve(profile).rotated("z", 90).moved(x, y).both_sides() + crossbar((-x, y, 0), 0.1)
+    part += join(pair.moved(z=body.length / 2 - s) for s in body.axles)
+
     half, y, z = body.width / 2, body.shoulder + 0.07, (0.5 - body.bonnet) * body.length - 0.2
     mirror = box((draw(0.14, 0.22), draw(0.09, 0.16), 0.08), (half + 0.07, y, z), 0.03)
     part += (mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)).both_sides()
-    if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):
-        part += _roof_box(draw, body)
+    if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):  # a roof box on two bars
+        start, end, half = body.bonnet + body.screen, body.roof, 0.35 * body.width
+        half -= 0.5 * body.lean * (body.height - body.shoulder)
+        z, long = (0.5 - (start + end) / 2) * body.length, 0.8 * (end - start) * body.length
+        part += join(box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1))
+        outline = rectangle(draw(1.0, 1.8) * half, long, 0.2, 3)
+        part += slab(outline, draw(0.18, 0.35), 0.1).moved(y=body.height + 0.05, z=z)
     if kind == "coupe" and draw.maybe(0.5):  # a spoiler on two stays
         half, z, high = 0.42 * body.width, draw(0.15, 0.4) - body.length / 2, draw(0.1, 0.3)
         y = body.shoulder + high
@@ -79,7 +67,7 @@ def car(draw: Draw, kind: str) -> Part:
     return part
 
 
-def _hull(body: Body) -> Part:
+def _hull(body: SimpleNamespace) -> Part:
     """The body: cross-sections from front to rear, with the wheel arches cut into their lower corners."""
     length, belt, boot = body.length, body.shoulder, min(body.window * body.length, body.length - 0.12)
     bed = (boot + 0.06, length - 0.08) if body.has_bed else (length, length)  # start and end of the open box
@@ -133,24 +121,4 @@ def _hull(body: Body) -> Part:
     return loft(np.stack([x, y, np.broadcast_to((length / 2 - s)[:, None], x.shape)], 2))
 
 
-def _wheels(draw: Draw, body: Body) -> Part:
-    """Four wheels on two axles, their hubs dished on both sides."""
-    x, y, dish = (body.width - TYRE) / 2 - 0.02, body.wheel, draw(0.1, 0.6)
-    rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])
-    profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
-    wheel = revolve(profile, 16).rotated("z", 90).moved(x, y)
-    pair = wheel.both_sides() + crossbar((-x, y, 0), 0.1)
-    return join(pair.moved(z=body.length / 2 - s) for s in body.axles)
-
-
-def _roof_box(draw: Draw, body: Body) -> Part:
-    start, end = body.bonnet + body.screen, body.roof
-    z, long = (0.5 - (start + end) / 2) * body.length, 0.8 * (end - start) * body.length
-    half = 0.35 * body.width - 0.5 * body.lean * (body.height - body.shoulder)
-    bars = join(box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1))
-    outline = rectangle(draw(1.0, 1.8) * half, long, 0.2, 3)
-    return bars + slab(outline, draw(0.18, 0.35), 0.1).moved(y=body.height + 0.05, z=z)
-
-
-_WEIGHTS = {"sedan": 2.5, "hatchback": 2, "wagon": 1.2, "coupe": 1.8, "suv": 1.8, "van": 1.6, "pickup": 1.6}
-KINDS = {partial(car, kind=kind): weight for kind, weight in _WEIGHTS.items()}
+KINDS = {partial(car, kind=kind): weight for kind, (weight, *_) in _KINDS.items()}

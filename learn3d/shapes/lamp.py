@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from .draw import Draw, ellipse, rectangle, rounded_path
+from .draw import Draw, ellipse, points, rectangle, rounded_path
 from .parts import Part, bar, crossbar, ellipsoid, join, revolve, slab, tube
 
 
 def _shell(radius: np.ndarray, y: np.ndarray, sides: int = 20) -> Part:
     """A thin wall around the y axis, open below and above: its outer radius [N] at the heights y [N]."""
-    outer = np.stack([radius, y], 1)
-    inner = np.stack([radius - 0.03 * radius.max(), y], 1)
-    return revolve(np.concatenate([outer, inner[::-1]]), sides, hollow=True)
+    inner = radius - 0.03 * radius.max()
+    return revolve(np.r_[np.c_[radius, y], np.c_[inner, y][::-1]], sides, hollow=True)
 
 
 def _shade(draw: Draw, radius: float, height: float) -> Part:
@@ -38,21 +37,15 @@ def _foot(draw: Draw, size: float) -> Part:
 
 def table_lamp(draw: Draw) -> Part:
     """A turned base under a shade."""
-    height, width = draw(0.2, 0.38), draw(0.06, 0.13)
-    t = np.linspace(0, 1, 17)
-    profiles = {
-        "vase": 0.22 + 0.8 * np.exp(-(((t - draw(0.3, 0.7)) / 0.22) ** 2)),
-        "balls": 0.2 + 0.6 * np.abs(np.sin(draw.count(2, 4) * np.pi * t)),
-        "hourglass": 0.25 + 0.7 * np.abs(2 * t - 1) ** 1.6,
-        "cone": 0.9 - 0.75 * t,
-        "stick": np.full(17, 0.15),
-    }
-    profile = profiles[draw.pick(tuple(profiles))]
-    points = [(1.0, 0.0), (1.0, 0.04), *zip(profile, 0.06 + 0.94 * t, strict=True)]
-    base = revolve(np.array(points) * [width, height], draw.pick({20: 3, 8: 1, 4: 1}))
-    neck = height + draw(0.02, 0.06)
-    shade = _shade(draw, draw(1.15, 2.2) * max(width, 0.09), draw(0.15, 0.3))
-    return base + bar((0, 0.7 * height, 0), (0, neck + 0.03, 0), 0.025) + shade.moved(y=neck - 0.02)
+    height, width, t = draw(0.2, 0.38), draw(0.06, 0.13), np.linspace(0, 1, 17)
+    vase = 0.22 + 0.8 * np.exp(-(((t - draw(0.3, 0.7)) / 0.22) ** 2))
+    balls = 0.2 + 0.6 * np.abs(np.sin(draw.count(2, 4) * np.pi * t))
+    hourglass, cone, stick = 0.25 + 0.7 * np.abs(2 * t - 1) ** 1.6, 0.9 - 0.75 * t, np.full(17, 0.15)
+    profile = np.c_[draw.pick((vase, balls, hourglass, cone, stick)), 0.06 + 0.94 * t]
+    sides, neck = draw.pick({20: 3, 8: 1, 4: 1}), height + draw(0.02, 0.06)
+    base = revolve(np.r_[[(1.0, 0.0), (1.0, 0.04)], profile] * [width, height], sides)
+    shade = _shade(draw, draw(1.15, 2.2) * max(width, 0.09), draw(0.15, 0.3)).moved(y=neck - 0.02)
+    return base + bar((0, 0.7 * height, 0), (0, neck + 0.03, 0), 0.025) + shade
 
 
 def floor_lamp(draw: Draw) -> Part:
@@ -71,20 +64,17 @@ def floor_lamp(draw: Draw) -> Part:
 def arc_lamp(draw: Draw) -> Part:
     """A floor lamp with a pole that bends over to the front, and a shade that hangs from it."""
     height, reach = draw(1.4, 1.9), draw(0.5, 1.2)
-    rise = draw(0.3, 0.7) * height
-    angle = np.linspace(0, np.pi * draw(0.7, 0.95), 14)
-    arc = np.stack([0 * angle, height - rise + rise * np.sin(angle), reach / 2 * (1 - np.cos(angle))], 1)
+    rise, angle = draw(0.3, 0.7) * height, np.linspace(0, np.pi * draw(0.7, 0.95), 14)
+    arc = points(0.0, height - rise + rise * np.sin(angle), reach / 2 * (1 - np.cos(angle)))
     tall = draw(0.14, 0.26)
     hang = arc[-1] - [0, draw(0.0, 0.2) + tall, 0]
-    shade = _shade(draw, draw(0.12, 0.24), tall).moved(*hang)
-    cord = bar(arc[-1], hang + [0, 0.5 * tall, 0], 0.014)
-    return _foot(draw, 0.36) + tube([(0, 0.01, 0), *arc], 0.014) + cord + shade
+    shade = bar(arc[-1], hang + [0, 0.5 * tall, 0], 0.014) + _shade(draw, draw(0.12, 0.24), tall).moved(*hang)
+    return _foot(draw, 0.36) + tube([(0, 0.01, 0), *arc], 0.014) + shade
 
 
 def desk_lamp(draw: Draw) -> Part:
     """Two arms with joints, or one bent tube, that hold a head towards +z."""
-    lower, upper = np.radians(draw(-35, 25)), np.radians(draw(20, 80))
-    foot = np.array([0, 0.02, 0])
+    lower, upper, foot = np.radians(draw(-35, 25)), np.radians(draw(20, 80)), np.array([0, 0.02, 0])
     elbow = foot + draw(0.2, 0.42) * np.array([0, np.cos(lower), np.sin(lower)])
     head = elbow + draw(0.2, 0.42) * np.array([0, np.cos(upper), np.sin(upper)])
     thick = draw(0.014, 0.022)
@@ -124,10 +114,9 @@ def chandelier(draw: Draw) -> Part:
         arm += revolve([(0.012, 0), (0.045, 0.01), (0.045, 0.02), (0.012, 0.022)], 10).moved(reach, rise - 0.01)
         arm += bar((reach, rise, 0), (reach, rise + 0.1, 0), 0.026)
     t = np.linspace(0, 1, 9)
-    radius = 0.02 + 0.04 * np.abs(np.sin(draw(1, 3) * np.pi * t))
-    column = revolve(np.stack([radius, -0.12 + 0.3 * t], 1), 12) + bar((0, 0.1, 0), (0, drop, 0), 0.016)
-    rose = slab(ellipse(0.13, 0.13), 0.03).moved(y=drop - 0.01)
-    return column + rose + arm.around(90 + 360 / count * np.arange(count))
+    column = revolve(np.c_[0.02 + 0.04 * np.abs(np.sin(draw(1, 3) * np.pi * t)), -0.12 + 0.3 * t], 12)
+    column += bar((0, 0.1, 0), (0, drop, 0), 0.016) + slab(ellipse(0.13, 0.13), 0.03).moved(y=drop - 0.01)
+    return column + arm.around(90 + 360 / count * np.arange(count))
 
 
 KINDS = {table_lamp: 3.5, floor_lamp: 2.5, arc_lamp: 1, desk_lamp: 1.5, pendant: 1.8, chandelier: 1.2}

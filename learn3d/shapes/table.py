@@ -13,16 +13,15 @@ from .supports import apron, cross, disc, legs, loops, panels, star
 
 def _size(draw: Draw) -> tuple[float, float, float]:
     """Length, width and height of a dining, coffee, side, bar or console table."""
-    use = draw.pick({"dining": 4, "coffee": 3, "side": 1.5, "bar": 1, "console": 1})
-    length, ratio, height = {
-        "dining": ((0.9, 2.4), (0.42, 0.85), (0.7, 0.78)),
-        "coffee": ((0.7, 1.4), (0.45, 1.0), (0.32, 0.48)),
-        "side": ((0.4, 0.6), (0.7, 1.0), (0.45, 0.7)),
-        "bar": ((0.6, 1.3), (0.5, 1.0), (0.9, 1.1)),
-        "console": ((0.9, 1.5), (0.25, 0.36), (0.72, 0.9)),
-    }[use]
-    length = draw(*length)
-    return length, length * draw(*ratio), draw(*height)
+    limits = {
+        ((0.9, 2.4), (0.42, 0.85), (0.7, 0.78)): 4,  # dining
+        ((0.7, 1.4), (0.45, 1.0), (0.32, 0.48)): 3,  # coffee
+        ((0.4, 0.6), (0.7, 1.0), (0.45, 0.7)): 1.5,  # side
+        ((0.6, 1.3), (0.5, 1.0), (0.9, 1.1)): 1,  # bar
+        ((0.9, 1.5), (0.25, 0.36), (0.72, 0.9)): 1,  # console
+    }
+    length, ratio, height = (draw(*both) for both in draw.pick(limits))
+    return length, length * ratio, height
 
 
 def _top(draw: Draw, outline: np.ndarray, height: float) -> tuple[Part, float]:
@@ -61,8 +60,8 @@ def pedestal_table(draw: Draw) -> Part:
         outline = draw.pick((rectangle(length, width, 0.02), ellipse(length, width, 32, 3.0)))
     else:
         length = width = min(length, 1.5)
-        square = rectangle(length, length, 0.02)
-        outline = square if kind == "square" else ellipse(length, length, 8 if kind == "octagon" else 32)
+        sides = {"circle": 32, "octagon": 8}
+        outline = ellipse(length, length, sides[kind]) if kind in sides else rectangle(length, length, 0.02)
     top, under = _top(draw, outline, height)
     reach = draw(0.5, 0.85) * width / 2
     if length < 1.35 * width:
@@ -76,18 +75,18 @@ def _pedestal(draw: Draw, reach: float, under: float) -> Part:
     kind = draw.pick({disc: 1, star: 1, "hourglass": 1, "block": 1, "claw": 2})
     if kind in (disc, star):
         return kind(draw, reach, reach, under)
-    t = np.linspace(0, 1, 13)
+    t, top = np.linspace(0, 1, 13), under + 0.005
     if kind == "hourglass":
         waist = draw(0.2, 0.6)
         radius = reach * (waist + (1 - waist) * (2 * t - 1) ** 2)
-        return revolve(np.stack([radius, t * (under + 0.005)], 1), draw.pick((6, 24)))
+        return revolve(np.c_[radius, t * top], draw.pick((6, 24)))
     if kind == "block":
         wide = draw(0.2, 0.5) * reach
         foot = slab(rectangle(1.8 * reach, 1.8 * reach), draw(0.03, 0.08))
-        return foot + between((-wide, 0.02, -wide), (wide, under + 0.005, wide))
+        return foot + between((-wide, 0.02, -wide), (wide, top, wide))
     thick, low = draw(0.035, 0.06) * (0.6 + reach), draw(0.12, 0.3) * under
     radius = thick * (1 + 0.4 * np.sin(draw(2, 4) * np.pi * t))
-    column = revolve(np.stack([radius, 0.5 * low + t * (under + 0.005 - 0.5 * low)], 1), 14)
+    column = revolve(np.c_[radius, 0.5 * low + t * (top - 0.5 * low)], 14)
     plate = slab(ellipse(reach, reach, 16), 0.03).moved(y=under - 0.025)
     path = [(0, 1.2 * low, 0), (0.45 * reach, 1.1 * low, 0), (0.75 * reach, 0.1 * low, 0), (reach, 0.025, 0)]
     path = rounded_path(path, 0.2, 4)
@@ -122,16 +121,21 @@ def desk(draw: Draw) -> Part:
     """A writing desk: drawers on one or both sides, a board at the rear, perhaps a shelf on top."""
     half_x, half_z, height = draw(0.5, 0.95), draw(0.25, 0.42), draw(0.7, 0.78)
     top, under = _top(draw, rectangle(2 * half_x, 2 * half_z, 0.01, 1), height)
-    unit, low = draw(0.3, 0.42), draw(0.0, 0.6) * height
-    drawers = _drawers(draw, half_x - 0.02 - unit, half_x - 0.02, low, under + 0.004, half_z - 0.03)
+    left, low, right = half_x - 0.02 - draw(0.3, 0.42), draw(0.0, 0.6) * height, half_x - 0.02
+    high, front = under + 0.004, half_z - 0.03
+    drawers, middle = between((left, low, -front), (right, high, front)), (left + right) / 2
+    for lower, upper in pairwise(np.linspace(low + 0.01, high - 0.01, draw.count(2, 5) if high - low > 0.4 else 2)):
+        drawers += between((left + 0.015, lower + 0.008, front - 0.01), (right - 0.015, upper - 0.008, front + 0.015))
+        y, z = 0.4 * lower + 0.6 * upper, front + 0.022  # of the handle
+        drawers += bar((middle - 0.05, y, z), (middle + 0.05, y, z), 0.02)
     if low > 0.03:
         x = half_x - 0.05
         drawers += join(bar((x, 0, z), (x, low + 0.01, z), 0.04, 0.04) for z in (-half_z + 0.07, half_z - 0.08))
-    panel = between((half_x - 0.05, 0, -half_z + 0.02), (half_x - 0.02, under + 0.004, half_z - 0.03))
+    panel = between((half_x - 0.05, 0, -half_z + 0.02), (right, high, front))
     other, side = draw.pick((drawers, panel)), draw.pick((-1.0, 1.0))
     rear = draw(0.1, 0.6) * height
-    part = top + drawers + other.scaled(x=-1.0)
-    part += between((-half_x + 0.03, rear, -half_z + 0.03), (half_x - 0.03, under + 0.004, -half_z + 0.05))
+    board = between((-half_x + 0.03, rear, -half_z + 0.03), (half_x - 0.03, high, -half_z + 0.05))
+    part = top + drawers + other.scaled(x=-1.0) + board
     if draw.maybe(0.4):
         tall, deep = height + draw(0.15, 0.5), draw(0.16, 0.26) - half_z
         part += between((-half_x, tall - 0.025, -half_z), (half_x, tall, deep))
@@ -140,26 +144,15 @@ def desk(draw: Draw) -> Part:
     return part.scaled(x=side)
 
 
-def _drawers(draw: Draw, x0: float, x1: float, low: float, high: float, half_z: float) -> Part:
-    """A block from x0 to x1 with one to four drawers, each with a handle."""
-    part = between((x0, low, -half_z), (x1, high, half_z))
-    edges = np.linspace(low + 0.01, high - 0.01, draw.count(2, 5) if high - low > 0.4 else 2)
-    middle = (x0 + x1) / 2
-    for bottom, top in pairwise(edges):
-        part += between((x0 + 0.015, bottom + 0.008, half_z - 0.01), (x1 - 0.015, top - 0.008, half_z + 0.015))
-        y, z = 0.4 * bottom + 0.6 * top, half_z + 0.022
-        part += bar((middle - 0.05, y, z), (middle + 0.05, y, z), 0.02)
-    return part
-
-
 def drum_table(draw: Draw) -> Part:
     """A low round table: a solid drum, or a cage of rods between two plates."""
     width, height = draw(0.5, 1.0), draw(0.3, 0.5)
     plate = ellipse(width, width, 32)
     top = slab(plate, 0.04).moved(y=height - 0.04)
     if draw.maybe(0.5):
-        waist = draw(0.3, 0.55) * width
-        return top + revolve([(0.45 * width, 0), (waist, height / 2), (0.45 * width, height - 0.02)], 32)
+        return top + revolve(
+            [(0.45 * width, 0), (draw(0.3, 0.55) * width, height / 2), (0.45 * width, height - 0.02)], 32
+        )
     rod = bar((width / 2 - 0.07, 0.005, 0), (width / 2 - 0.07, height - 0.02, 0), 0.016)
     return top + slab(inset(plate, 0.04), 0.02) + rod.around(np.arange(0, 360, 360 / draw.count(10, 21)))
 
