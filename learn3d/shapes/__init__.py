@@ -4,8 +4,6 @@ Frame of all categories: y up, the front (nose of an airplane or car, open side 
 are symmetric about x = 0, except L-shaped sofas, desks with one drawer unit, and the like.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 
@@ -15,7 +13,6 @@ from .parts import assemble
 
 # The recipes of each category, with the weights of a random choice.
 _RECIPES = {module.__name__.rpartition(".")[2]: module.KINDS for module in (airplane, car, chair, lamp, sofa, table)}
-
 CATEGORIES: tuple[str, ...] = tuple(_RECIPES)
 
 
@@ -23,8 +20,8 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
     """A random shape of the category (one of `CATEGORIES`). It depends on the state of `rng` alone, which advances.
 
     The components are watertight, oriented outwards, and overlap at the joints of the object. It has 150 to 8000 faces,
-    mostly 1000 to 5000. The bounding box is centred at the origin, its longest side is 1; y is up, the front towards
-    +z. Raises ValueError for an unknown category.
+    mostly 1000 to 5000. The bounding box is centred at the origin, its longest side is 1. Raises ValueError for an
+    unknown category.
 
     >>> make_shape("chair", np.random.default_rng(7)).is_watertight
     True

@@ -1,7 +1,5 @@
 """Procedural airplanes, in lengths of the fuselage, nose towards +z: fuselages, wings, tails, engines, landing gear."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,13 +97,9 @@ def fin(height: float, root: float, tip: float, sweep_deg: float, z: float, thic
 
 def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     """Fin and stabiliser of a kind: "conventional", "cross" (stabiliser half-way up the fin), "T", "V" or "twin"."""
-    height, sweep, root, tip = (
-        draw(0.14, 0.21),
-        draw(*(28, 45) if swept else (5, 20)),
-        draw(0.13, 0.19),
-        draw(0.06, 0.1),
-    )
-    half, chord, lean = draw(0.15, 0.22), draw(0.09, 0.13), draw(*(25, 38) if swept else (0, 15))
+    height, sweep = draw(0.14, 0.21), draw(28, 45) if swept else draw(5, 20)
+    root, tip = draw(0.13, 0.19), draw(0.06, 0.1)
+    half, chord, lean = draw(0.15, 0.22), draw(0.09, 0.13), draw(25, 38) if swept else draw(0, 15)
     tip_chord, base, z = draw(0.4, 0.8) * chord, 0.25 * radius, -0.5 + root + draw(-0.01, 0.03)
     if kind == "V":
         side = wing([(0, 0, z - 0.02, root, 0.1), (1.25 * half, 0, z - 0.02 - 0.5 * half * (1 + swept), tip, 0.1)])
@@ -270,7 +264,11 @@ def fighter(draw: Draw) -> Part:
     plane = fuselage(radius, tail_start=0.75, **form) + plan.wing()
     plane += canopy(0.9 * radius, 1.1 * radius, draw(0.18, 0.28), 0.8 * radius, draw(0.15, 0.22))
     if twin:
-        plane += _tunnels(draw(0.8, 1.25) * radius)
+        wide, rings = draw(0.8, 1.25) * radius, []  # tunnels beside the fuselage, each with a slanted intake
+        for z0, w, h, y in (0.14, 0.9, 1.3, -0.3), (0.0, 1.0, 1.4, -0.2), (-0.3, 1.0, 1.3, 0), (-0.48, 0.8, 0.9, 0.1):
+            across, up = rectangle(w * wide, h * wide, 0.3 * wide).T
+            rings.append(points(wide + across, y * wide + up, z0 + 0.05 * (z0 > 0.1) * (up / wide)))
+        plane += (loft(rings) + nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)).both_sides()
     else:
         side = box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02).both_sides()
         chin = box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02)
@@ -295,15 +293,6 @@ def fighter(draw: Draw) -> Part:
             store += box((0.01, 0.03, 0.06), (x, y - 0.012, z - 0.45 * chord))
         plane += store.both_sides()
     return plane
-
-
-def _tunnels(wide: float) -> Part:
-    """Two tunnels beside the fuselage, each with a slanted intake and a nozzle."""
-    rings = []
-    for z, w, h, y in ((0.14, 0.9, 1.3, -0.3), (0.0, 1.0, 1.4, -0.2), (-0.3, 1.0, 1.3, 0), (-0.48, 0.8, 0.9, 0.1)):
-        across, up = rectangle(w * wide, h * wide, 0.3 * wide).T
-        rings.append(points(wide + across, y * wide + up, z + 0.05 * (z > 0.1) * (up / wide)))
-    return (loft(rings) + nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)).both_sides()
 
 
 def turboprop(draw: Draw) -> Part:

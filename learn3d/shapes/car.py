@@ -1,13 +1,11 @@
 """Procedural cars, in metres: a body lofted from front to rear, wheels, mirrors, perhaps a roof box or a spoiler."""
 
-from __future__ import annotations
-
 from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 
-from .draw import Draw, rectangle, rounded_path
+from .draw import Draw, points, rectangle, rounded_path
 from .parts import Part, bar, box, crossbar, join, loft, revolve, slab, wing
 
 TYRE = 0.22  # width of the wheels
@@ -117,8 +115,8 @@ def _hull(body: SimpleNamespace) -> Part:
     bed_y = [rim, rim - 0.01, hump, hump - 0.001, bottom, bottom]
     upper = np.where((bed[0] < s) & (s < bed[1]), [bed_x, bed_y], [cabin_x, cabin_y])
     x, y = np.concatenate([[lower_x, lower_y], upper], 1).transpose(0, 2, 1)  # [S, 12]
-    x, y = np.concatenate([x, -x[:, -2:0:-1]], 1), np.concatenate([y, y[:, -2:0:-1]], 1)
-    return loft(np.stack([x, y, np.broadcast_to((length / 2 - s)[:, None], x.shape)], 2))
+    x, y = np.c_[x, -x[:, -2:0:-1]], np.c_[y, y[:, -2:0:-1]]
+    return loft(points(x, y, (length / 2 - s)[:, None]))
 
 
 KINDS = {partial(car, kind=kind): weight for kind, (weight, *_) in _KINDS.items()}

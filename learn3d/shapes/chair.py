@@ -1,13 +1,11 @@
 """Procedural chairs, in metres: a seat on a support with a back and arms, moulded shells, armchairs, barrel chairs."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
 
 from .draw import Draw, Point, ellipse, points, rectangle, rounded_path
-from .parts import Part, bar, between, crossbar, post, sheet, slab, tube
+from .parts import Part, bar, between, crossbar, join, post, sheet, slab, tube
 from .sofa import upholstered
 from .supports import cantilever, cross, disc, legs, loops, panels, rocker, star
 
@@ -59,8 +57,7 @@ def jointed_chair(draw: Draw, family: str) -> Part:
         rise = draw(0.17, 0.26)
         rear = -depth / 2 + 0.03 + (curve + bulge) - np.tan(np.radians(recline)) * rise
         edge = 0.5 * width - 0.02 if angular else max(stile_x, half_x)
-        arm = _arm(draw, (stile_x, height + rise, rear), rise, edge, height - 0.6 * thickness, depth)
-        part += arm.both_sides()
+        part += _arm(draw, (stile_x, height + rise, rear), rise, edge, height - 0.6 * thickness, depth).both_sides()
     return part
 
 
@@ -69,8 +66,7 @@ def _arm(draw: Draw, back: Point, rise: float, edge: float, base: float, depth: 
     x, y, rear = back
     front = depth * draw(0.15, 0.45)
     foot_z = min(front, depth * 0.3)
-    kind = draw.pick({"post": 3, "panel": 0.8, "loop": 1.5, "swoop": 1.5, "cantilever": 0.7})
-    size = draw(0.025, 0.05)
+    kind, size = draw.pick({"post": 3, "panel": 0.8, "loop": 1.5, "swoop": 1.5, "cantilever": 0.7}), draw(0.025, 0.05)
     rest, start = rectangle(size * draw(1.0, 2.0), 0.7 * size, segments=1), (x, y, rear - 0.01)
     if kind == "panel":
         return between((edge - 0.02, base - 0.02, rear), (edge + 0.03, y, front + 0.02), 0.012)
@@ -125,12 +121,9 @@ def _frame(draw: Draw, half: float, height: float, curve: float, kind: str) -> P
         count = draw.count(1, 4) if high else 1
         pitch = (top - rail - low) / (count + 0.5)
         each = min(draw(0.25, 0.6) * pitch, 0.08)
-        for k in range(count):
-            part += _rail(half, low + (k + 0.5) * pitch, each, board, curve, 0.6 * arch)
-        return part
+        return part + join(_rail(half, low + (k + 0.5) * pitch, each, board, curve, 0.6 * arch) for k in range(count))
     if kind in ("panel", "band"):
-        bottom = low if kind == "panel" else 0.55 * height
-        x, y = np.meshgrid(np.linspace(-half, half, 9), [bottom, top - 0.5 * rail])
+        x, y = np.linspace(-half, half, 9), np.array([[low if kind == "panel" else 0.55 * height], [top - 0.5 * rail]])
         return part + sheet(points(x, y, _bow(x, half, curve)), board)
     bottom, upper = -0.01, top - 0.6 * rail
     if draw.maybe(0.5) or kind == "lattice":
@@ -139,13 +132,13 @@ def _frame(draw: Draw, half: float, height: float, curve: float, kind: str) -> P
     if kind == "splat":  # a vase-shaped board in the middle
         tall, wide, t = upper + arch * 0.8 - bottom, half * draw(0.25, 0.5), np.linspace(0, 1, 9)[:, None]
         width = wide * (1 + draw(0.1, 0.5) * np.sin(2 * np.pi * (draw(0.6, 1.4) * t + draw(0, 1))))
-        x = np.array([[-1.0, -0.5, 0.0, 0.5, 1.0]]) * np.minimum(width, 1.8 * wide)
+        x = np.linspace(-1, 1, 5) * np.minimum(width, 1.8 * wide)
         return part + sheet(points(x, bottom + t * tall, 0.0), board)
     if kind == "cross":
-        for side in (-1, 1):
-            x = side * np.linspace(-half, half, 7)
-            path = points(x, np.linspace(bottom + 0.01, upper, 7), _bow(x, half, curve))
-            part += tube(path, 1.0, rectangle(board, draw(0.02, 0.04), segments=1))
+        x = np.linspace(-half, half, 7)
+        path = points(x, np.linspace(bottom + 0.01, upper, 7), _bow(x, half, curve))
+        for mirror in (-1, 1):
+            part += tube(path * [mirror, 1, 1], 1.0, rectangle(board, draw(0.02, 0.04), segments=1))
         return part
     count = {"slats": draw.count(2, 7), "spindles": draw.count(4, 8), "lattice": draw.count(2, 4)}[kind]
     wide = draw(0.25, 0.6) * 2 * half / (count + 1)
@@ -184,10 +177,9 @@ def _plate(draw: Draw, half: float, top: float, curve: float, thickness: float) 
 
 def _hoop(draw: Draw, half: float, top: float, curve: float) -> Part:
     """A bent hoop, empty or filled with spindles (Windsor)."""
-    angle = np.linspace(0, np.pi, 17)
-    straight = draw(0.2, 0.6) * top
-    x = np.concatenate([[half], half * np.cos(angle), [-half]])
-    y = np.concatenate([[-0.02], straight + (top - straight) * np.sin(angle) ** 0.9, [-0.02]])
+    angle, straight = np.linspace(0, np.pi, 17), draw(0.2, 0.6) * top
+    x = np.r_[half, half * np.cos(angle), -half]
+    y = np.r_[-0.02, straight + (top - straight) * np.sin(angle) ** 0.9, -0.02]
     part = tube(points(x, y, _bow(x, half, curve)), draw(0.018, 0.035) / 2)
     count = draw.count(3, 8) if draw.maybe(0.85) else 0
     for x in np.linspace(-half, half, count + 2)[1:-1]:
@@ -203,9 +195,8 @@ def shell_chair(draw: Draw) -> Part:
     front, rear = depth / 2, -depth / 2
     path = [(0, -0.03, front), (0, 0, front - 0.08), (0, -0.02, rear + 0.05), (0, back, rear - lean)]
     path = rounded_path(path, draw(0.1, 0.2), 5)
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    t = np.linspace(0, 1, 18)[:, None]  # along the middle line, from the front edge to the top of the back
-    v = np.linspace(-1, 1, 15)[None]  # across
+    length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
+    t, v = np.linspace(0, 1, 18)[:, None], np.linspace(-1, 1, 15)  # from the front edge to the top of the back; across
     y, z = (np.interp(t * length[-1], length, path[:, k]) for k in (1, 2))
     ease = np.clip((t - 0.3) / 0.4, 0, 1)
     ease = ease**2 * (3 - 2 * ease)
@@ -227,8 +218,7 @@ def barrel_chair(draw: Draw) -> Part:
     """A round seat with a back that wraps around it and falls towards the arms."""
     radius, height, rise, fall = draw(0.26, 0.38), draw(0.36, 0.47), draw(0.22, 0.5), draw(0.0, 0.8)
     reach = np.radians(draw(80, 150))
-    angle = np.linspace(-reach, reach, 25)
-    thickness = draw.pick((0.025, 0.04, 0.09)) * draw(0.9, 1.2)
+    angle, thickness = np.linspace(-reach, reach, 25), draw.pick((0.025, 0.04, 0.09)) * draw(0.9, 1.2)
     top = rise * (1 - fall * (1 - np.cos(angle)) / (1 - np.cos(reach)))
     gap = np.minimum(draw(0.1, 0.22), 0.5 * top) if draw.maybe(0.4) else None  # between seat and back, at each angle
     bottom = -0.06 if gap is None else gap
@@ -275,14 +265,6 @@ def bench(draw: Draw) -> Part:
     return part
 
 
-KINDS = {
-    partial(jointed_chair, family="dining"): 5,
-    partial(jointed_chair, family="office"): 1.5,
-    shell_chair: 2,
-    partial(upholstered, seats=1): 1.5,
-    partial(jointed_chair, family="lounge"): 1.5,
-    partial(jointed_chair, family="bar"): 1,
-    barrel_chair: 1,
-    stool: 1.2,
-    bench: 0.7,
-}
+KINDS = {partial(jointed_chair, family="dining"): 5, partial(jointed_chair, family="office"): 1.5, shell_chair: 2}
+KINDS |= {partial(upholstered, seats=1): 1.5, partial(jointed_chair, family="lounge"): 1.5}
+KINDS |= {partial(jointed_chair, family="bar"): 1, barrel_chair: 1, stool: 1.2, bench: 0.7}

@@ -3,8 +3,6 @@
 Outlines are closed curves [N, 2], counter-clockwise, star-shaped about their mean.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -49,7 +47,7 @@ def ellipse(width: float, depth: float, count: int = 20, exponent: float = 2.0) 
     cosine, sine = np.cos(angle), np.sin(angle)
     power = 2.0 / exponent
     x, y = np.sign(cosine) * np.abs(cosine) ** power, np.sign(sine) * np.abs(sine) ** power
-    return np.stack([0.5 * width * x, 0.5 * depth * y], 1)
+    return np.c_[0.5 * width * x, 0.5 * depth * y]
 
 
 def rectangle(width: float, depth: float, radius: float | None = None, segments: int = 2) -> np.ndarray:
@@ -64,13 +62,13 @@ def rectangle(width: float, depth: float, radius: float | None = None, segments:
     radius = 0.12 * short if radius is None else min(max(radius, 0.01 * short), 0.49 * short)
     angle = np.concatenate([np.linspace(k, k + 1, segments + 1) for k in range(4)]) * (np.pi / 2)
     corner = np.repeat(corner, segments + 1, 0)
-    return corner * (np.array([width, depth]) / 2 - radius) + radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return corner * (np.array([width, depth]) / 2 - radius) + radius * np.c_[np.cos(angle), np.sin(angle)]
 
 
 def inset(outline: np.ndarray, distance: float) -> np.ndarray:
     """The outline moved inwards by `distance` along its mitred vertex normals."""
     edge = np.roll(outline, -1, 0) - outline
-    normal = np.stack([edge[:, 1], -edge[:, 0]], 1) / np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
+    normal = np.c_[edge[:, 1], -edge[:, 0]] / np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
     mitre = normal + np.roll(normal, 1, 0)
     return outline - mitre * (2.0 * distance / np.maximum((mitre**2).sum(1, keepdims=True), 0.5))
 

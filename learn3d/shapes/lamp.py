@@ -1,7 +1,5 @@
 """Procedural lamps, in metres: table, floor, arc and desk lamps, pendants, chandeliers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from .draw import Draw, ellipse, points, rectangle, rounded_path

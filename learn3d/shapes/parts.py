@@ -1,7 +1,7 @@
 """Closed parts of procedural shapes: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
 
-All parts are lofts. A loft is watertight for any rings, so a shape made of lofts is a union of closed components. Axes:
-x right, y up, z forward.
+All parts are lofts, which are watertight for any rings: a shape is a union of closed components. Axes: x right, y up, z
+forward.
 """
 
 from __future__ import annotations
@@ -11,8 +11,12 @@ from functools import lru_cache
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from .draw import Point, ellipse, inset, points, rectangle
+
+CIRCLE = ellipse(2.0, 2.0, 8)
+Z = (0.0, 0.0, 1.0)
 
 # Thin bars get extra rings: a voxelizer that casts rays on a 32^3 grid misses bars between two grid lines, but it also
 # marks the cell of every vertex. Both lengths are in units of the longest side of the shape.
@@ -118,26 +122,23 @@ def revolve(profile: Sequence[Point], sides: int = 16, hollow: bool = False) -> 
 def ellipsoid(size: Point, center: Point = (0.0, 0.0, 0.0), sides: int = 14, stacks: int = 8) -> Part:
     """An ellipsoid of the given size [3] about `center`."""
     angle = np.linspace(-0.5, 0.5, stacks + 1) * np.pi
-    profile = np.stack([np.maximum(np.cos(angle), 0.02), np.sin(angle)], 1) * 0.5
+    profile = np.c_[np.maximum(np.cos(angle), 0.02), np.sin(angle)] * 0.5
     return revolve(profile, sides).scaled(*size).moved(*center)
 
 
 def tube(
-    path: Sequence[Point],
-    radius: float | np.ndarray = 1.0,
-    section: np.ndarray | None = None,
-    closed: bool = False,
-    side: Point = (0.0, 0.0, 1.0),
+    path: ArrayLike, radius: ArrayLike = 1.0, section: np.ndarray = CIRCLE, closed: bool = False, side: Point = Z
 ) -> Part:
-    """A tube along a path [P, 3], with mitred bends. section: outline [N, 2] (default: a circle); radius scales it.
+    """A tube along a path [P, 3], with mitred bends. section: outline [N, 2]; radius scales it, a number or [P].
 
-    The first axis of the section points towards `side` as far as the path allows. radius is a number or [P].
+    The first axis of the section points towards `side` as far as the path allows.
     """
     path = np.asarray(path, dtype=float)
-    section = ellipse(2.0, 2.0, 8) if section is None else section
     step = np.diff([path[-1], *path, path[0]] if closed else path, axis=0)
     step /= np.linalg.norm(step, axis=1, keepdims=True)
-    behind, ahead = (step[:-1], step[1:]) if closed else (step[[0, *range(len(step))]], step[[*range(len(step)), -1]])
+    if not closed:
+        step = step[[0, *range(len(step)), -1]]
+    behind, ahead = step[:-1], step[1:]
     tangent = ahead + behind
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     normal = np.asarray(side, dtype=float)
@@ -155,10 +156,10 @@ def tube(
             bend = bend / size
             ring = ring + (ring @ bend)[:, None] * bend * (1.0 / max(ahead[k] @ tangent[k], 0.4) - 1.0)
         rings.append(path[k] + ring)
-    return loft(np.stack(rings), "ring" if closed else "fan")
+    return loft(rings, "ring" if closed else "fan")
 
 
-def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = (0.0, 0.0, 1.0)) -> Part:
+def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = Z) -> Part:
     """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
     if height is None:
         return tube([start, end], 1.0, ellipse(width, width, 6), side=side)
@@ -201,10 +202,10 @@ def _loft_faces(rings: int, size: int, ends: str) -> np.ndarray:
     faces = [np.moveaxis(sides, 1, -1).reshape(-1, 3)]
     if ends == "fan":
         center = np.full(size, rings * size)
-        faces += [np.stack([center, b[0], a[0]], 1), np.stack([center + 1, a[-1], b[-1]], 1)]
+        faces += [np.c_[center, b[0], a[0]], np.c_[center + 1, a[-1], b[-1]]]
     elif ends == "strip":
-        i = np.arange(size // 2 - 1)
-        cap = np.concatenate([np.stack([i + 1, i, size - 1 - i], 1), np.stack([i + 1, size - 1 - i, size - 2 - i], 1)])
+        i, j = np.arange(size // 2 - 1), size - 1 - np.arange(size // 2 - 1)
+        cap = np.r_[np.c_[i + 1, i, j], np.c_[i + 1, j, j - 1]]
         faces += [cap, a[-1, 0] + cap[:, ::-1]]
     return np.concatenate(faces)
 

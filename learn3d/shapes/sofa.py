@@ -1,7 +1,5 @@
 """Procedural sofas, in metres: upholstered blocks, corner sofas, framed settees, curved sofas."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -17,8 +15,12 @@ def _cushions(lower: tuple[float, float, float], upper: tuple[float, float, floa
     return join(between((left + 0.008, *lower[1:]), (right - 0.008, *upper[1:]), 0.05) for left, right in edges)
 
 
-def upholstered(draw: Draw, seats: int) -> Part:
-    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaning back, perhaps arms."""
+def upholstered(draw: Draw, seats: int = 0) -> Part:
+    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaning back, perhaps arms.
+
+    seats 0: a random number from two to four.
+    """
+    seats = seats or draw.pick({2: 3, 3: 4, 4: 1})
     half, depth = seats * draw(0.27, 0.36), draw(0.75, 1.0)
     foot, seat, high = draw(0.05, 0.16), draw(0.36, 0.46), draw(0.66, 0.95 if seats > 1 else 1.1)
     back, lean, soft = draw(0.14, 0.24), draw(0, 12), draw(0.02, 0.06)
@@ -47,11 +49,6 @@ def upholstered(draw: Draw, seats: int) -> Part:
         x, y = half + 0.5 * wide, level - 0.05
         arm += bar((x, y, rear + 0.02), (x, y, front), 1.3 * wide, 1.3 * wide)
     return part + arm.both_sides()
-
-
-def block_sofa(draw: Draw) -> Part:
-    """Two to four seats between upholstered arms."""
-    return upholstered(draw, seats=draw.pick({2: 3, 3: 4, 4: 1}))
 
 
 def corner_sofa(draw: Draw) -> Part:
@@ -117,10 +114,10 @@ def curved_sofa(draw: Draw) -> Part:
     y = foot + np.linspace(0, 1, 4)[:, None] * (high - draw(0, 0.25) * forward - foot)
     wrap = sheet(points(x, y, z), thick)
     edge = np.linspace(x[0], x[-1], 9)[1:-1]
-    front = np.stack([edge, z[0] + draw(-0.1, 0.1) * (1 - (edge / x[0]) ** 2)], 1)
-    outline = np.concatenate([front, np.stack([x, z], 1)[::-1]])[::-1]
+    front = np.c_[edge, z[0] + draw(-0.1, 0.1) * (1 - (edge / x[0]) ** 2)]
+    outline = np.r_[front, np.c_[x, z][::-1]][::-1]
     cushion = slab(outline, seat - foot, 0.04).moved(y=foot)
     return wrap + cushion + feet(draw, 0.6 * half, 0.22 * depth, foot + 0.02)
 
 
-KINDS = {block_sofa: 4.0, corner_sofa: 1.5, settee: 1.6, curved_sofa: 1.2}
+KINDS = {upholstered: 4.0, corner_sofa: 1.5, settee: 1.6, curved_sofa: 1.2}

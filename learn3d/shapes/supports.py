@@ -3,8 +3,6 @@
 A support reaches from the floor (y = 0) to `height`, and to about x = +-half_x and z = +-half_z.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from .draw import Draw, ellipse, points, rectangle, rounded_path
@@ -58,11 +56,11 @@ def _leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
         waist = draw(0.5, 0.75)
         return [(0, 1), (0.1, 1), (0.13, waist), (0.68, waist), (0.72, 1), (1, 1)], False
     if kind == "baluster":
-        swell = [(draw(0.25, 0.5), 1.25), (0.75, 0.7), (0.82, 1.1), (0.88, 0.8)]
-        return [(0, 0.55), (0.06, 0.75), (0.1, 0.5), *swell, (1, 1)], True
+        swell = (draw(0.25, 0.5), 1.25)
+        return [(0, 0.55), (0.06, 0.75), (0.1, 0.5), swell, (0.75, 0.7), (0.82, 1.1), (0.88, 0.8), (1, 1)], True
     a, b = draw(0.2, 0.35), draw(0.55, 0.75)
-    turned = [(a - 0.08, 0.7), (a, 1.05), (a + 0.08, 0.65), (b, 1.2), (b + 0.08, 0.7)]
-    return [(0, 0.5), *turned, (0.92, 1.1), (1, 1)], True
+    lower, upper = [(0, 0.5), (a - 0.08, 0.7), (a, 1.05), (a + 0.08, 0.65)], [(b, 1.2), (b + 0.08, 0.7)]
+    return [*lower, *upper, (0.92, 1.1), (1, 1)], True
 
 
 def apron(half_x: float, half_z: float, top: float, depth: float, thickness: float) -> Part:
@@ -79,8 +77,8 @@ def feet(draw: Draw, half_x: float, half_z: float, height: float) -> Part:
         return ellipsoid((1.4 * size, height, 1.4 * size), (half_x, height / 2, half_z)).four_corners()
     outline = rectangle(size, size, segments=1) if kind == "block" else ellipse(size, size, 10)
     lean = 0.03 if draw.maybe(0.4) else 0.0
-    foot, head = (half_x + lean, 0, half_z + lean), (half_x, height, half_z)
-    return post(foot, head, outline, [(0, 0.6), (1, 1)]).four_corners()
+    foot = (half_x + lean, 0, half_z + lean)
+    return post(foot, (half_x, height, half_z), outline, [(0, 0.6), (1, 1)]).four_corners()
 
 
 def star(draw: Draw, half_x: float, half_z: float, height: float) -> Part:

@@ -1,7 +1,5 @@
 """Procedural tables, in metres: a top on legs, pedestals, trestles or a frame; desks; drums."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -150,9 +148,8 @@ def drum_table(draw: Draw) -> Part:
     plate = ellipse(width, width, 32)
     top = slab(plate, 0.04).moved(y=height - 0.04)
     if draw.maybe(0.5):
-        return top + revolve(
-            [(0.45 * width, 0), (draw(0.3, 0.55) * width, height / 2), (0.45 * width, height - 0.02)], 32
-        )
+        waist = (draw(0.3, 0.55) * width, height / 2)
+        return top + revolve([(0.45 * width, 0), waist, (0.45 * width, height - 0.02)], 32)
     rod = bar((width / 2 - 0.07, 0.005, 0), (width / 2 - 0.07, height - 0.02, 0), 0.016)
     return top + slab(inset(plate, 0.04), 0.02) + rod.around(np.arange(0, 360, 360 / draw.count(10, 21)))
 
