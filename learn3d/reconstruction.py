@@ -29,11 +29,10 @@ from learn3d.data.framing import (
 )
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.files import limits, writing
-from learn3d.fitting.camera import belief
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.fitting.fit import Progress, fit, predict
+from learn3d.fitting.fit import Progress, belief, fit, predict
 from learn3d.fitting.smoothing import divide, outer_surface
 from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.methods import MeshMethod, Method
@@ -308,7 +307,7 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor 
     """Azimuth from which the shape's silhouette fits the mask uint8 [S,S] of its image best; a multiple of 15.
 
     A guess for pictures: elevation and distance are unknown, so four elevations are tried, and all outlines are scaled
-    to one size. probabilities: see `fitting.camera.find_view`.
+    to one size. probabilities: see `fitting.fit.find_view`.
     """
     target, azimuths, losses = centre(_reduce(mask))[0], [15.0 * k for k in range(24)], []
     for elevation in (0.0, 10.0, 20.0, 30.0):

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 import nmr
-from learn3d.fitting.camera import View
+from learn3d.fitting.fit import View
 from learn3d.fitting.smoothing import joined, sharpen
 from learn3d.pictures.surfaces import Surface, Texture
 
@@ -43,7 +43,7 @@ def color_mesh(
     hidden, too, blurred colours of their neighbours.
 
     mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the picture's camera. picture: R,
-    G, B and mask, uint8 [4, S, S], framed as in `fitting.camera`. mirror: float32 [3, 3], the reflection that maps the
+    G, B and mask, uint8 [4, S, S], framed as in `fitting.fit`. mirror: float32 [3, 3], the reflection that maps the
     shape to itself, None without symmetry. textured: double the vertices along sharp edges, and add a texture image.
     """
     look_up_seen = _seen(*mesh, view, picture)

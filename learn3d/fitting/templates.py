@@ -19,8 +19,7 @@ from torch import Tensor
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import ViewDataset
-from learn3d.fitting.camera import View, belief, minimize
-from learn3d.fitting.fit import Fit, Prediction, Progress
+from learn3d.fitting.fit import Fit, Prediction, Progress, View, belief, minimize
 from learn3d.methods import MeshMethod
 from learn3d.shapes import CATEGORIES, numbered_shape
 

@@ -126,10 +126,12 @@ def estimate(
         torch.manual_seed(options.seed)
         create = functools.partial(Shapes, subset, candidates, options, rng, tick)
         parts = [_estimate_once(options, create, data, *neighbours) for _ in range(options.repeats)]
-    shifts = _common_frame([part.posterior.sum(2) for part in parts], rng)
-    posteriors = [part.posterior.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True)]
-    posterior = sum(posteriors) / len(parts)
-    agreement = sum(part.agreement.roll(shift, 1) for part, shift in zip(parts, shifts, strict=True))
+    posteriors, agreements, shapes, weights, front_votes = zip(*parts, strict=True)
+    shifts = _common_frame([posterior.sum(2) for posterior in posteriors], rng)
+    posteriors, agreements = (
+        [values.roll(shift, 1) for values, shift in zip(each, shifts, strict=True)] for each in (posteriors, agreements)
+    )
+    posterior, agreement = sum(posteriors) / len(parts), sum(agreements)
     best = posterior.sum(2).argmax(1)
     confidence = MAX_CONFIDENCE * (_near(agreement, best) / agreement.sum(1).clamp_min(1e-9))
     _, which = data.objects.unique(return_inverse=True)
@@ -139,11 +141,10 @@ def estimate(
     alike = pairs > 0 and int(_near(views, best).sum()) - len(views) > 0.5 * pairs  # from all sides
     if len(fitted) < MIN_IMAGES or alike:
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
-    front_votes = sum(part.front_votes for part in parts) / len(parts)
-    typical = max(range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum()))
-    shapes, weights = parts[typical].shapes, parts[typical].weights
-    shapes.turns = (shapes.turns + shifts[typical] * TURNS // options.azimuths) % TURNS
-    return Estimate(posterior, confidence, shapes.align(), shapes.network.faces, weights, front_votes)
+    k = max(range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum()))  # the most typical one
+    shapes[k].turns = (shapes[k].turns + shifts[k] * TURNS // options.azimuths) % TURNS
+    faces, votes = shapes[k].network.faces, sum(front_votes) / len(parts)
+    return Estimate(posterior, confidence, shapes[k].align(), faces, weights[k], votes)
 
 
 def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
@@ -160,22 +161,14 @@ def _near(mass: Tensor, azimuth: Tensor) -> Tensor:
     return mass.gather(1, (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]).sum(1)
 
 
-class _Part(NamedTuple):
-    """One of several estimates, in a frame of its own."""
-
-    posterior: Tensor  # float32 [N, A, E]
-    agreement: Tensor  # float32 [N, A]: the nearest masks' probabilities, added up
-    shapes: Shapes
-    weights: Tensor  # float32 [M]: mean posterior of each prototype
-    front_votes: float
-
-
 def _estimate_once(
     options: PoseOptions, create: Callable[[], Shapes], data: Masks, of_fitted: Neighbours, of_all: Neighbours
-) -> _Part:
+) -> tuple[Tensor, Tensor, Shapes, Tensor, float]:
     """Steps 1 to 4 on the masks of the shapes that `create` makes, then the posteriors of all masks `data`.
 
-    of_fitted, of_all: the neighbours of the shapes' masks and of `data` among the shapes' masks.
+    of_fitted, of_all: the neighbours of the shapes' masks and of `data` among the shapes' masks. Returns, in a frame of
+    its own, the posteriors [N, A, E] of `data` and the added probabilities [N, A] of their nearest masks; the shapes
+    and their mean posteriors [M]; and `Estimate.front_votes`.
     """
     starts = []
     for _ in range(options.restarts):
@@ -197,7 +190,7 @@ def _estimate_once(
     alone = torch.cat([_posteriors(-values / TEMPERATURE, "free").sum(1) for values in chunks])
     posterior = _normalize(alone**0.3 * (of_all.message(smoothed) + 1e-3))
     agreement = of_all.message(own.sum(1)).sum(2)
-    return _Part(posterior, agreement, shapes, own.sum((2, 3)).mean(0), front_votes)
+    return posterior, agreement, shapes, own.sum((2, 3)).mean(0), front_votes
 
 
 class Shapes:

@@ -13,10 +13,9 @@ from PIL import Image
 import nmr
 from learn3d.data.dataset import DatasetInfo
 from learn3d.data.layouts import load_dataset
-from learn3d.fitting.camera import AZIMUTHS, CENTRED_SIZE, View, find_view, frame_view
 from learn3d.fitting.coloring import _nearest_clear, color_mesh
 from learn3d.fitting.familiarity import KnownCodes, known_codes, learn_others
-from learn3d.fitting.fit import fit, predict
+from learn3d.fitting.fit import AZIMUTHS, CENTRED_SIZE, View, find_view, fit, frame_view, predict
 from learn3d.fitting.smoothing import joined
 from learn3d.methods import create_method
 from learn3d.methods.method import MeshMethod
