@@ -32,7 +32,7 @@ from learn3d.terminal import is_watched, note, say
 
 
 class MakeDataset(Command):
-    """Render a data set from a folder of meshes or procedural shapes, in the layout of a published one.
+    """Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of a published one.
 
     Examples:
       learn3d make-dataset --output data --category chair --source my_chairs --augment 5

@@ -24,6 +24,11 @@ from learn3d.files.reading import open_file
 _BYTES_PER_SECOND = 3e7  # a tenth of the speed of decompression
 
 
+def names(path: Path) -> list[str]:
+    """Names of the arrays of an npz file."""
+    return [name.removesuffix(".npy") for name in _archive(path).namelist()]
+
+
 def read(path: Path, key: str, max_bytes: int | None = None) -> np.ndarray:
     """The array `key`, of numbers or bools. Raises ValueError for other arrays and larger ones.
 

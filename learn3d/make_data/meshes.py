@@ -1,4 +1,4 @@
-"""Settings of `learn3d make-dataset`, and the meshes of each split: files of a folder, or generated shapes."""
+"""Settings of `learn3d make-dataset`, and the meshes of each split: of a folder, of a mesh pack, or generated."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from trimesh import Trimesh
 
 from learn3d.data import conventions
 from learn3d.data.categories import SPLITS, synset_of
+from learn3d.files import npz, sandbox
 from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
 from learn3d.make_data.writers import WRITERS, WrittenLayout
 from learn3d.settings import Count, FilePath, Rare, Weight, checked
 from learn3d.shapes import CATEGORIES, numbered_shape
 
 MAX_FACES = 1_000_000
+_PACK = "an npz file with v0, f0, v1, f1, ... and no pickled objects"
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Amount = Annotated[int, Field(ge=0)]
 WITHOUT_EFFECT = {"output", "overwrite", "shards", "jobs"}  # options that do not change the content of the files
@@ -40,7 +42,7 @@ class DatasetConfig:
     """Views of each object (default: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos and around; kato and dvr
     always have 24)."""
     source: FilePath | None = None
-    """Folder of meshes, searched recursively (default: shapes from --procedural)."""
+    """Folder of meshes, searched recursively, or a mesh pack .npz (default: shapes from --procedural)."""
     procedural: Amount = 0
     """Number of shapes from the procedural generator, instead of meshes from files or together with them."""
     test: Weight | None = None
@@ -68,7 +70,7 @@ class DatasetConfig:
 
     def __post_init__(self) -> None:
         if self.source is None and self.procedural == 0:
-            raise ValueError("give --source (a folder of meshes), --procedural (a number), or both")
+            raise ValueError("give --source (a folder of meshes or a mesh pack .npz), --procedural (a number), or both")
         if self.source and self.procedural and (self.up, self.front_axis) != ("y", "z"):
             raise ValueError("with --procedural, meshes of --source must have its axes: --up y --front z")
         writer = WRITERS[self.layout]
@@ -122,11 +124,10 @@ def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
     """The meshes of each of the splits train, val and test. Raises ValueError if there are none to train on."""
     if config.procedural and config.category not in CATEGORIES:
         raise ValueError(f"the procedural generator makes {', '.join(CATEGORIES)}; got category {config.category!r}")
-    found = mesh_files(config.source) if config.source else {}
-    sources = {name: partial(read_mesh, found[name]) for name in sorted(found)}
+    sources = mesh_sources(config.source) if config.source else {}
+    augmented = len(sources) or config.procedural
     for i in range(config.procedural):
         sources[f"{config.category}_{i:05d}"] = partial(numbered_shape, config.category, config.seed, i)
-    augmented = len(found) or config.procedural
     names, files = object_names(sources), list(sources)
     numbers = split_objects(len(files), config.test, config.val, config.seed)
 
@@ -137,11 +138,29 @@ def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
     return {split: [item(number, split) for number in numbers[split].tolist()] for split in SPLITS}
 
 
-def mesh_files(folder: Path) -> dict[str, Path]:
-    """The mesh files in a folder and below by their relative paths. Raises ValueError if there are none."""
-    if found := {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.suffix.lower() in EXTENSIONS}:
-        return found
-    raise ValueError(f"there is no mesh in {folder}; give a folder of meshes ({', '.join(EXTENSIONS)})")
+def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
+    """A function that reads it for each mesh of a folder (by relative path, sorted) or of a mesh pack (by number).
+
+    A pack is an npz file with v0 float [V, 3], f0 int [F, 3], v1, f1, ... Raises ValueError if there is no mesh.
+    """
+    if source.suffix == ".npz" and source.is_file():
+        count = sum(name[:1] == "v" and name[1:].isdigit() for name in sandbox.read(npz.names, source, wanted=_PACK))
+        found = {f"{i:0{len(str(count - 1))}d}": partial(_packed, source, i) for i in range(count)}
+    else:
+        paths = {p.relative_to(source).as_posix(): p for p in source.rglob("*") if p.suffix.lower() in EXTENSIONS}
+        found = {name: partial(read_mesh, paths[name]) for name in sorted(paths)}
+    if not found:
+        raise ValueError(f"there is no mesh in {source}; give {_PACK}, or a folder of {', '.join(EXTENSIONS)}")
+    return found
+
+
+def _packed(path: Path, number: int) -> RawMesh:
+    """Mesh `number` of a pack. Raises ValueError if it is damaged."""
+    vertices, faces = (sandbox.read(npz.read, path, f"{kind}{number}", wanted=_PACK) for kind in "vf")
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
+        found = f"{vertices.dtype} {list(vertices.shape)}, {faces.dtype} {list(faces.shape)}"
+        raise ValueError(f"not a triangle mesh: wanted vertices float [V, 3] and faces int [F, 3], got {found}")
+    return RawMesh(vertices, faces)
 
 
 def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:

@@ -25,7 +25,6 @@ from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
 from learn3d.experiments.experiment import read_result
 from learn3d.files import formats, sandbox
-from learn3d.files.formats import read_mesh
 from learn3d.make_data import meshes
 from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.pages.report import read_metrics
@@ -229,12 +228,24 @@ def mesh_target(tmp: Path) -> Target:
     damaged |= dict.fromkeys(plain, m.damage) | dict.fromkeys(["a.off", "b.ply"], m.damage_text)
 
     def read(folder: Path) -> None:
-        for path in meshes.mesh_files(folder).values():
+        for read_one in meshes.mesh_sources(folder).values():
             with contextlib.suppress(ValueError):
-                checked = meshes.check(read_mesh(path))
+                checked = meshes.check(read_one())
                 assert np.isfinite(checked.vertices).all() and checked.faces.max() < len(checked.vertices)
 
     return Target(folder, damaged | {"model.gltf": m.damage_json}, read)
+
+
+def pack_target(tmp: Path) -> Target:
+    box = trimesh.creation.box()
+    np.savez(tmp / "pack.npz", v0=box.vertices, f0=box.faces, v1=box.vertices, f1=box.faces)
+
+    def read(folder: Path) -> None:
+        for read_one in meshes.mesh_sources(folder / "pack.npz").values():
+            with contextlib.suppress(ValueError):
+                meshes.check(read_one())
+
+    return Target(tmp, {"pack.npz": NPZ}, read)
 
 
 def drop_in_target(tmp: Path) -> Target:
@@ -252,6 +263,7 @@ def drop_in_target(tmp: Path) -> Target:
 TARGETS: dict[str, Callable[[Path], Target]] = {
     **{layout: partial(layout_target, layout=layout) for layout in SETTINGS},
     "meshes": mesh_target,
+    "mesh pack": pack_target,
     "checkpoint": checkpoint_target,
     "weights": weights_target,
     "config": config_target,

@@ -126,7 +126,7 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"source": "nowhere"}, "give a folder of meshes"),
+        ({"source": "nowhere"}, "there is no mesh in .* or a folder"),
         ({"source": "nothing"}, "there is no mesh"),
         ({"source": "bad"}, r"no mesh is left for training; .* a.obj: no faces"),
         ({"procedural": 3, "front": "x"}, "must have its axes: --up y --front z"),
@@ -216,6 +216,33 @@ def test_names_of_objects_are_fit_for_files_and_differ_by_more_than_case() -> No
     paths = ("a.obj", "a_2.obj", "A!.obj", "-a.obj", "b/c d.ply", "..ply.ply", "!.stl", "x" * 300 + ".off")
     names = meshes.object_names(paths)
     assert names == ["a", "a_2", "A_3", "a_4", "b_c_d", "ply", "mesh", "x" * 80]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (None, "an npz file with v0"),
+        ({"n": 3}, "there is no mesh"),
+        ({"v0": np.array([{}], dtype=object)}, "pickled objects"),
+        ({"v0": np.eye(3)}, "f0"),
+        ({"v0": np.eye(3), "f0": np.eye(3)}, "not a triangle mesh"),
+    ],
+)
+def test_packs_that_are_refused(tmp_path: Path, arrays: dict | None, message: str) -> None:
+    path = tmp_path / "a.npz"
+    path.write_text("<html>")
+    if arrays is not None:
+        np.savez(path, **arrays)
+    with pytest.raises(ValueError, match=message):
+        make(tmp_path / "data", path)
+
+
+def test_a_pack_becomes_a_data_set(tmp_path: Path) -> None:
+    boxes = [trimesh.creation.box((1.0, 0.2 + 0.1 * i, 0.5)) for i in range(3)]
+    arrays = {f"v{i}": b.vertices.astype(np.float32) for i, b in enumerate(boxes)}
+    arrays |= {f"f{i}": b.faces.astype(np.int32) for i, b in enumerate(boxes)}
+    np.savez(tmp_path / "pack.npz", n=3, **arrays)
+    assert make(tmp_path / "data", tmp_path / "pack.npz").counts == {"train": 3}
 
 
 def test_meshes_without_faces_and_broken_files_are_skipped_and_listed(tmp_path: Path) -> None:
