@@ -29,12 +29,6 @@ def autocast(device: torch.device | str, precision: Literal["bf16", "fp32"]) -> 
     return torch.autocast(torch.device(device).type, dtype=torch.bfloat16, enabled=precision == "bf16")
 
 
-def check_device(device: str) -> None:
-    """Raise a ValueError if CUDA is asked for and missing."""
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'")
-
-
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>
 
 

@@ -6,7 +6,6 @@ from typing import Literal
 
 import torch
 
-from learn3d.device import check_device
 from learn3d.methods.many_views import ManyViews, ManyViewsSettings
 from learn3d.methods.method import DatasetInfo, MeshMethod, Method, MethodSettings
 from learn3d.methods.multi_view import MultiView, MultiViewSettings
@@ -52,7 +51,8 @@ def create_method(
 
     Raises ValueError if the device is missing, or if the method needs poses and the data set has none.
     """
-    check_device(device)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'")
     if type(settings) not in _METHODS:
         raise ValueError(f"no method learns with {type(settings).__name__}; add the pair to learn3d.methods._METHODS")
     kind = _METHODS[type(settings)]
