@@ -30,10 +30,11 @@ class Draw(np.random.Generator):
         """True with the given probability."""
         return self.random() < probability
 
-    def pick(self, options: dict[Any, float] | tuple) -> Any:
-        """One of the options, with equal probability or, for a dict, in proportion to its values."""
-        weights = np.cumsum(list(options.values()) if isinstance(options, dict) else np.ones(len(options)))
-        return tuple(options)[np.searchsorted(weights, self.random() * weights[-1], side="right")]
+    def pick(self, options: dict[Any, float] | Sequence, weights: Sequence[float] = ()) -> Any:
+        """One of the options, in proportion to the weights or to a dict's values, else with equal probability."""
+        weights = weights or (list(options.values()) if isinstance(options, dict) else np.ones(len(options)))
+        ends = np.cumsum(weights)
+        return tuple(options)[np.searchsorted(ends, self.random() * ends[-1], side="right")]
 
 
 def points(x: float | np.ndarray, y: float | np.ndarray, z: float | np.ndarray) -> np.ndarray:

@@ -15,13 +15,8 @@ def _shell(radius: np.ndarray, y: np.ndarray, sides: int = 20) -> Part:
 def _shade(draw: Draw, radius: float, height: float) -> Part:
     """A lamp shade from y = 0 to `height`, with a bulb, and two wires across that hold it."""
     t, top = np.linspace(0, 1, 7), draw(0.3, 0.75)
-    outline = {
-        "cone": 1 - (1 - top) * t,
-        "drum": 1 - 0.1 * t,
-        "bell": top + (1 - top) * (1 - t) ** 2,
-        "dome": np.sqrt(1 - (0.98 * t) ** 2),
-    }
-    scale = outline[draw.pick({"cone": 4, "drum": 2, "bell": 1.5, "dome": 1.5})]
+    cone, drum, bell = 1 - (1 - top) * t, 1 - 0.1 * t, top + (1 - top) * (1 - t) ** 2
+    scale = draw.pick((cone, drum, bell, np.sqrt(1 - (0.98 * t) ** 2)), (4, 2, 1.5, 1.5))  # the last one is a dome
     shade = _shell(radius * scale, height * t, sides=draw.pick({20: 5, 4: 1}))
     level, reach = 0.85 * height, 0.985 * radius * float(np.interp(0.85, t, scale))  # the wires end inside the wall
     shade += crossbar((-reach, level, 0), 0.012) + bar((0, level, -reach), (0, level, reach), 0.012)

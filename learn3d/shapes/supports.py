@@ -28,18 +28,18 @@ def legs(draw: Draw, half_x: float, half_z: float, height: float, size: float = 
     head = np.array([[half_x, height, half_z], [half_x, height, -half_z]])
     part = join(post(f, h + [0, 0.01, 0], outline, profile).both_sides() for f, h in zip(foot, head, strict=True))
 
-    stretchers = draw.pick({"none": 3, "H": 1, "box": 1, "sides": 0.7, "X": 0.4})
+    kind = draw.pick({"none": 3, "H": 1, "box": 1, "sides": 0.7, "X": 0.4})  # of the stretchers
     t, thick = draw(0.15, 0.5), 0.55 * size
     front, rear = foot + t * (head - foot)
-    if stretchers in ("H", "box", "sides"):
+    if kind == "X":
+        part += bar(front, rear * [-1, 1, 1], thick, thick, side=(0, 1, 0)).both_sides()
+    elif kind != "none":
         part += bar(front, rear, thick).both_sides()
-    if stretchers == "H":
+    if kind == "H":
         part += crossbar(0.5 * (front + rear), thick)
-    if stretchers == "box":
+    if kind == "box":
         t = t if draw.maybe(0.5) else min(t + 0.12, 0.6)
         part += join(crossbar(end, thick) for end in foot + t * (head - foot))
-    if stretchers == "X":
-        part += bar(front, rear * [-1, 1, 1], thick, thick, side=(0, 1, 0)).both_sides()
     if draw.maybe(0.45) and splay < 0.1 * height and not plain:
         part += apron(half_x, half_z, height, draw(0.04, 0.09), 0.5 * size)
     return part

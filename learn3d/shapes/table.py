@@ -32,12 +32,9 @@ def _top(draw: Draw, outline: np.ndarray, height: float) -> tuple[Part, float]:
 def table_with_legs(draw: Draw) -> Part:
     """Four legs, loops of metal, panels or crossed legs under an angular, rounded or oval top."""
     length, width, height = _size(draw)
-    outline, reach = {
-        "rectangle": (rectangle(length, width, 0.01, 1), 0.93),
-        "rounded": (rectangle(length, width, draw(0.1, 0.45) * width, 4), 0.85),
-        "oval": (ellipse(length, width, 32), 0.64),
-        "superellipse": (ellipse(length, width, 32, 3.5), 0.74),
-    }[draw.pick({"rectangle": 4, "rounded": 2, "oval": 1.5, "superellipse": 1})]
+    tops = [(rectangle(length, width, 0.01, 1), 0.93), (rectangle(length, width, draw(0.1, 0.45) * width, 4), 0.85)]
+    tops += [(ellipse(length, width, 32), 0.64), (ellipse(length, width, 32, 3.5), 0.74)]
+    outline, reach = draw.pick(tops, (4, 2, 1.5, 1))
     top, under = _top(draw, outline, height)
     support = draw.pick({legs: 4, loops: 1, panels: 1, cross: 0.7})
     if support is not legs:
