@@ -16,7 +16,7 @@ from learn3d.data.conventions import Definition
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
-from learn3d.methods.surfaces import grid_surface
+from learn3d.methods.method import grid_surface
 from learn3d.pictures.surfaces import Surface
 
 #: A function that aligns the predicted shapes of a batch with the true ones; see `evaluate`.

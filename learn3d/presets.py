@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Augmentation, Sampling
 from learn3d.methods import LRSchedule, MethodSettings
-from learn3d.methods.many_views import ManyViewsSettings
-from learn3d.methods.multi_view import MultiViewSettings
+from learn3d.methods.multi_view import ManyViewsSettings, MultiViewSettings
 from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.methods.prgan import PrGANSettings

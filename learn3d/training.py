@@ -13,7 +13,7 @@ from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.methods import create_method
-from learn3d.methods.method import MeshMethod
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.poses.updates import update_poses, update_steps
 from learn3d.runs import folder as run_folder
 from learn3d.runs.log import RunLog, check_log

@@ -15,7 +15,7 @@ from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.evaluation import spread_samples
 from learn3d.figures.runs import Run
 from learn3d.methods import Method
-from learn3d.methods.surfaces import grid_surface
+from learn3d.methods.method import grid_surface
 from learn3d.pictures.sheets import TILE, magnify, natural_colors, save_png, tile
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
 

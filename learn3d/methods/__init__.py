@@ -6,14 +6,13 @@ from typing import Literal
 
 import torch
 
-from learn3d.methods.many_views import ManyViews, ManyViewsSettings
-from learn3d.methods.method import DatasetInfo, MeshMethod, Method, MethodSettings
-from learn3d.methods.multi_view import MultiView, MultiViewSettings
-from learn3d.methods.optimization import CONSTANT_LR, LRSchedule, TrainingSchedule
+from learn3d.methods.mesh_method import MeshMethod
+from learn3d.methods.method import DatasetInfo, Grids, Meshes, Method, MethodSettings
+from learn3d.methods.multi_view import ManyViews, ManyViewsSettings, MultiView, MultiViewSettings
+from learn3d.methods.optimization import LRSchedule, TrainingSchedule
 from learn3d.methods.plus import Plus, PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.prgan import PrGAN, PrGANSettings
-from learn3d.methods.surfaces import Grids, Meshes
 from learn3d.methods.vpl import VPL, VPLSettings
 
 __all__ = [
@@ -45,7 +44,7 @@ def create_method(
     device: str,
     precision: Literal["bf16", "fp32"],
     seed: int,
-    schedule: TrainingSchedule = CONSTANT_LR,
+    schedule: TrainingSchedule = TrainingSchedule(),  # noqa: B008 (it is frozen)
 ) -> Method:
     """The method of `settings`, with networks initialised from `seed`.
 

@@ -1,15 +1,24 @@
-"""Vanilla-AE as Kato et al. 2018 published it: the shape of each of two views must explain both."""
+"""Methods that know which views show the same object, from batches [a_1 .. a_n, b_1 .. b_n, ...].
+
+Multi-view is Vanilla-AE as Kato et al. 2018 published it: the shape of each of two views must explain both. Many views:
+the shape of one image must explain other views of its object, whose depth is used if it is known.
+"""
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
+from torch import Tensor, nn
 
 import nmr
-from learn3d.data.dataset import Batch
-from learn3d.methods.method import MeshMethod, MeshSettings, check_groups
+from learn3d.data.dataset import MASK_SIZE, Batch
+from learn3d.data.sampling import GROUP_SIZE
+from learn3d.losses import depth_loss, gaussian_prior_loss
+from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.optimization import SparseGradientAdam
-from learn3d.networks import EncoderName, GeneratorName
-from learn3d.settings import Weight, checked
+from learn3d.networks import EncoderName, GeneratorName, SymmetryOption
+from learn3d.settings import Positive, Weight, checked
 
 CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative to the other layers
 
@@ -25,22 +34,17 @@ class MultiViewSettings(MeshSettings):
 
 
 class MultiView(MeshMethod):
-    """Encoder and mesh generator, trained on pairs of views: batches [a_1 .. a_n, b_1 .. b_n], sampling "pairs"."""
+    """Encoder and mesh generator, trained on pairs of views."""
 
     settings: MultiViewSettings
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         rate = self.settings.learning_rate
-        of_generator = dict(self.generator.named_parameters())
-        slow = [parameter for name, parameter in of_generator.items() if name.startswith("centroid.")]
-        others = [parameter for name, parameter in of_generator.items() if not name.startswith("centroid.")]
-        optimizers = {
-            "encoder": SparseGradientAdam(self.encoder.parameters(), lr=rate),
-            "generator": SparseGradientAdam(others, lr=rate),
-        }
-        if slow:  # only the generator "bounded" has this layer
-            optimizers["centroid"] = SparseGradientAdam(slow, lr=CENTROID_LEARNING_RATE * rate)
-        return optimizers
+        layers = {"encoder": list(self.encoder.parameters()), "generator": [], "centroid": []}
+        for name, parameter in self.generator.named_parameters():
+            layers["centroid" if name.startswith("centroid.") else "generator"].append(parameter)
+        rates = {name: CENTROID_LEARNING_RATE * rate if name == "centroid" else rate for name in layers}
+        return {name: SparseGradientAdam(found, lr=rates[name]) for name, found in layers.items() if found}
 
     def check_batch(self, batch: Batch) -> None:
         check_groups(batch, 2, "pairs")
@@ -59,4 +63,85 @@ class MultiView(MeshMethod):
         seen = torch.arange(2 * pairs).reshape(2, pairs)[[0, 0, 1, 1]].flatten()
         silhouettes = self.render(torch.cat([vertices, vertices]), batch.poses[seen])
         losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks[seen])}
-        return self.backward_and_step(losses | self.surface_losses(vertices), step, *self.optimizers)
+        return self.backward_and_step(losses | self.surface_losses(vertices), step)
+
+
+@checked
+class ManyViewsSettings(MeshSettings):
+    """Networks and weights of the losses; a loss with weight 0 is not computed."""
+
+    encoder: EncoderName = "conv-light"
+    symmetry: SymmetryOption = "auto"
+    clamp_to_cube: bool = True
+    learning_rate: Positive = 4e-4
+    lambda_smooth: Weight = 3e-4
+    """Weight of the smoothness loss."""
+    lambda_prior: Weight = 1e-4
+    """Weight of the mean squared length of the codes."""
+    lambda_depth: Weight = 3.0
+    """Weight of the depth loss, in views whose depth is known."""
+    lambda_view: Weight = 0.0
+    """Weight of the loss of a small network that classifies the azimuth of an image; reconstruction places the camera
+    of a picture by it. 0: no such network."""
+
+
+class ManyViews(MeshMethod):
+    """Encoder and mesh generator, trained on groups of `GROUP_SIZE` views."""
+
+    averages_mirror_images = True
+    settings: ManyViewsSettings
+
+    def create_networks(self) -> dict[str, nn.Module]:
+        return super().create_networks() | self.create_view_classifier()
+
+    @property
+    def weights(self) -> dict[str, float]:
+        settings = self.settings
+        return {
+            "projection": 1.0,
+            "depth": settings.lambda_depth,
+            "smoothness": settings.lambda_smooth,
+            "prior": settings.lambda_prior,
+            "view": settings.lambda_view,
+        }
+
+    def check_batch(self, batch: Batch) -> None:
+        super().check_batch(batch)
+        check_groups(batch, GROUP_SIZE, "groups")
+
+    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
+        """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
+        depth + lambda_smooth smoothness + lambda_prior prior + lambda_view view. Every second image of symmetric
+        objects is flipped first, but not for the loss view.
+        """
+        settings, count = self.settings, len(batch) // GROUP_SIZE
+        images = batch.images[:count]
+        codes, vertices = self.predict(self.flip_every_second(images)[0])
+        losses: dict[str, Tensor] = {}
+        if settings.lambda_prior > 0:
+            losses["prior"] = gaussian_prior_loss(codes, "squared")
+        if settings.lambda_view > 0:
+            losses["view"] = self.view_loss(images, batch.poses[:count])
+        vertices = vertices.cpu()
+        uses_depth = batch.depth is not None and settings.lambda_depth > 0
+        rendered = nmr.render(
+            vertices.repeat(GROUP_SIZE, 1, 1),
+            self.faces,
+            batch.cameras,
+            outputs=("alpha", "depth") if uses_depth else ("alpha",),
+            image_size=MASK_SIZE,
+        )
+        losses["projection"] = nmr.losses.soft_iou_loss(rendered.alpha, batch.masks)
+        if uses_depth:
+            losses["depth"] = depth_loss(rendered.depth, batch.depth)
+        return self.backward_and_step(losses | self.surface_losses(vertices), step)
+
+
+def check_groups(batch: Batch, size: int, sampling: Literal["pairs", "groups"]) -> None:
+    """Raise ValueError unless a batch is [a_1 .. a_n, b_1 .. b_n, ...], `size` views of each of n objects."""
+    count, rest = divmod(len(batch), size)
+    if rest or not torch.equal(batch.object_ids, batch.object_ids[:count].repeat(size)):
+        raise ValueError(
+            f"the method learns from batches of {size} views of each object, [a_1 .. a_n, b_1 .. b_n, ...], but this "
+            f"batch of {len(batch)} views has another form; choose sampling {sampling!r}"
+        )

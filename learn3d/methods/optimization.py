@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -48,19 +48,16 @@ class TrainingSchedule:
         raise ValueError(f"the schedule {self.lr_schedule!r} has no line in TrainingSchedule.lr_factor")
 
 
-CONSTANT_LR = TrainingSchedule()  # constant learning rates, no EMA
-
-
 class EMA:
-    """Exponential moving average of all parameters and floating-point buffers of some networks.
+    """Exponential moving average of all parameters and floating-point buffers of networks.
 
     After step t: average = d * average + (1 - d) * weights with d = min(decay, (1 + t) / (10 + t)), so that the initial
     weights are soon forgotten.
     """
 
-    def __init__(self, networks: Mapping[str, nn.Module], decay: float) -> None:
+    def __init__(self, networks: nn.Module, decay: float) -> None:
         self.decay = decay
-        self._own = {f"{n}.{k}": v for n, net in networks.items() for k, v in net.state_dict(keep_vars=True).items()}
+        self._own = networks.state_dict(keep_vars=True)
         self.tensors = {name: value.detach().clone() for name, value in self._own.items()}
 
     @torch.no_grad()
@@ -119,9 +116,6 @@ class SparseGradientAdam(torch.optim.Adam):
     lr' = lr sqrt(1 - beta_2^t) / (1 - beta_1^t), and all weights share the count t. The state is that of torch's Adam.
     """
 
-    def __init__(self, params: Iterable[Tensor], lr: float) -> None:
-        super().__init__(params, lr=lr)
-
     @torch.no_grad()
     def step(self) -> None:
         for group in self.param_groups:
@@ -167,24 +161,13 @@ def backpropagate(losses: Mapping[str, Tensor], weights: Mapping[str, float], st
     """
     if missing := [name for name in losses if name not in weights]:
         raise ValueError(f"the method's weights lack {', '.join(missing)}; they have {', '.join(weights) or 'none'}")
-    totals: dict[torch.device, Tensor] = {}
-    for name, loss in losses.items():
-        weight = weights[name]
-        term = loss if weight == 1.0 else weight * loss
-        totals[loss.device] = totals[loss.device] + term if loss.device in totals else term
-    values = read_back(losses)
+    values = dict.fromkeys(losses, 0.0)
+    for device in {loss.device for loss in losses.values()}:  # one copy from each
+        names = [name for name, loss in losses.items() if loss.device == device]
+        values |= zip(names, torch.stack([losses[name].detach().float() for name in names]).tolist(), strict=True)
     values["total"] = sum(weights[name] * value for name, value in values.items())
     if not all(math.isfinite(value) for value in values.values()):
         listed = ", ".join(f"{name} {value:g}" for name, value in values.items())
         raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")
-    torch.autograd.backward(list(totals.values()))
-    return values
-
-
-def read_back(losses: Mapping[str, Tensor]) -> dict[str, float]:
-    """The values of scalar losses, with one copy from each device."""
-    values: dict[str, float] = dict.fromkeys(losses, 0.0)
-    for device in {loss.device for loss in losses.values()}:
-        names = [name for name, loss in losses.items() if loss.device == device]
-        values |= zip(names, torch.stack([losses[name].detach().float() for name in names]).tolist(), strict=True)
+    torch.autograd.backward(list(losses.values()), [torch.full_like(losses[name], weights[name]) for name in losses])
     return values

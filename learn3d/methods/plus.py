@@ -11,11 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.losses import silhouette_energy_distance
-from learn3d.methods.optimization import adam
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
-from learn3d.networks import EncoderName, GeneratorName, PoseDiscriminator, SymmetryOption
+from learn3d.networks import EncoderName, GeneratorName, SymmetryOption
+from learn3d.networks.discriminators import pose_discriminator
 from learn3d.settings import Count, Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks in the mask bank
@@ -87,49 +88,39 @@ class MaskBank(nn.Module):
 class Plus(PoseInvariant):
     """Encoder, mesh generator, pose discriminator and a mask bank."""
 
+    averages_mirror_images = True
     settings: PlusSettings
     mask_bank: MaskBank
 
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
         if self.settings.uses_discriminator and networks["generator"].mirror is not None:
-            networks["discriminator"] = PoseDiscriminator(2 * self.info.num_views)  # flipped views are other views
+            networks["discriminator"] = pose_discriminator(2 * self.info.num_views)  # flipped views are other views
         if self.settings.lambda_novel_view > 0:
             networks["mask_bank"] = MaskBank(self.settings.bank_size)
-        return networks | self.create_view_classifier() if self.settings.lambda_view > 0 else networks
-
-    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        trained = {name: network for name, network in self.networks.items() if name != "mask_bank"}
-        return {name: adam(network, self.settings.learning_rate) for name, network in trained.items()}
+        return networks | self.create_view_classifier()
 
     @property
     def weights(self) -> dict[str, float]:
         return super().weights | {"novel_view": self.settings.lambda_novel_view, "view": self.settings.lambda_view}
 
-    def encode(self, images: Tensor) -> Tensor:
-        return self.encode_symmetric(images)
-
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """A step of `PoseInvariant`, plus lambda_novel_view times the loss at a novel view once the mask bank is full.
-
-        If shapes are symmetric, every second image is flipped. A flipped image of a symmetric object shows the same
-        shape, so mask and pose stay the same. For the discriminator it has another view class: K + k instead of k.
+        """The losses of `PoseInvariant`, lambda_view times that of the azimuths, and lambda_novel_view times that at a
+        novel view once the mask bank is full. Every second image of symmetric objects is flipped. For the discriminator
+        it has another view class then: K + k instead of k.
         """
-        flipped = self._flipped(batch)
-        images = torch.where(flipped[:, None, None, None], batch.images.flip(3), batch.images)
-        return self._train(images, batch.view_ids + self.info.num_views * flipped, batch, step)
-
-    def _flipped(self, batch: Batch) -> Tensor:
-        # every second one: batches are in random order
-        return (torch.arange(len(batch)) % 2 == 1) & (self.generator.mirror is not None)
-
-    def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
-        losses = super()._silhouette_losses(vertices, batch)
+        images, flipped = self.flip_every_second(batch.images)
+        codes, vertices = self.predict(images)
+        on_codes = self.losses_on_codes(codes, batch.view_ids + self.info.num_views * flipped, step)
+        vertices = vertices.cpu()
+        losses = {"projection": nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)}
         if self.settings.lambda_view > 0:
             losses["view"] = self.view_loss(batch.images, batch.poses)
-        return losses | self._novel_view_loss(vertices, batch) if self.settings.lambda_novel_view > 0 else losses
+        if self.settings.lambda_novel_view > 0:
+            losses |= self.novel_view_loss(vertices, batch)
+        return self.backward_and_step(losses | self.surface_losses(vertices) | on_codes, step)
 
-    def _novel_view_loss(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
+    def novel_view_loss(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
         """Render all shapes of the batch at one of its cameras. The loss is the energy distance between these
         silhouettes and the masks of this view class in the mask bank, mostly of other objects.
         """

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 import nmr
 from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
-from learn3d.methods.method import MeshMethod, MeshSettings, is_compact
+from learn3d.methods.mesh_method import MeshMethod, MeshSettings, is_compact
 from learn3d.methods.optimization import frozen
-from learn3d.networks import PoseDiscriminator
+from learn3d.networks.discriminators import pose_discriminator
 from learn3d.settings import Positive, Weight, checked
 
 COMPACT_AREA_WEIGHT = 0.03
@@ -71,7 +71,7 @@ class PoseInvariant(MeshMethod):
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
         if self.settings.uses_discriminator:
-            networks["discriminator"] = PoseDiscriminator(self.info.num_views)
+            networks["discriminator"] = pose_discriminator(self.info.num_views)
         return networks
 
     @property
@@ -87,34 +87,26 @@ class PoseInvariant(MeshMethod):
         }
 
     def weights_at(self, step: int) -> dict[str, float]:
-        first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
-        if last is None or first == 0:
+        if self.settings.varies_over_run is None:
             return self.weights
+        first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
         done = min(1.0, (step - 1) / max(1, self.schedule.iterations - 1))
         return self.weights | {"smoothness": first ** (1 - done) * last**done}
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Train encoder and generator in every step on projection + lambda_1 smoothness + lambda_area area + lambda_4
-        prior.
-
-        Odd steps add lambda_2 classification on detached codes, which trains the discriminator alone. Even steps add
-        lambda_3 confusion, which trains the encoder through the discriminator; the discriminator itself does not learn.
+        prior, and encoder and discriminator by turns (see `losses_on_codes`).
         """
-        return self._train(batch.images, batch.view_ids, batch, step)
-
-    def _train(self, images: Tensor, view_ids: Tensor, batch: Batch, step: int) -> dict[str, float]:
-        codes, vertices = self.predict(images)
-        on_codes = self._losses_on_codes(codes, view_ids, step)
+        codes, vertices = self.predict(batch.images)
+        on_codes = self.losses_on_codes(codes, batch.view_ids, step)
         vertices = vertices.cpu()
-        losses = self._silhouette_losses(vertices, batch) | self.surface_losses(vertices) | on_codes
-        trained = ["encoder", "generator"] + ["discriminator"] * ("classification" in losses)
-        trained += ["view_classifier"] * ("view" in losses)
-        return self.backward_and_step(losses, step, *trained)
+        losses = {"projection": nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)}
+        return self.backward_and_step(losses | self.surface_losses(vertices) | on_codes, step)
 
-    def _silhouette_losses(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
-        return {"projection": nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)}
-
-    def _losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> dict[str, Tensor]:
+    def losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> dict[str, Tensor]:
+        """The prior; in odd steps classification on detached codes, which trains the discriminator alone; in even steps
+        confusion, which trains the encoder through the discriminator, which itself does not learn.
+        """
         settings, losses = self.settings, {}
         if settings.lambda_prior > 0:
             losses["prior"] = gaussian_prior_loss(codes, settings.prior_form)

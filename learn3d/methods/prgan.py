@@ -14,9 +14,8 @@ from torch import Tensor, nn
 from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.device import autocast
-from learn3d.methods.method import Method, MethodSettings
+from learn3d.methods.method import Grids, Method, MethodSettings
 from learn3d.methods.optimization import adam, frozen
-from learn3d.methods.surfaces import Grids
 from learn3d.networks import network_input
 from learn3d.networks.voxel_gan import (
     DISCRIMINATOR_CHANNELS,
@@ -39,6 +38,9 @@ FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerC
 @checked
 class PrGANSettings(MethodSettings):
     """Learning rates, widths, phases and cameras; the defaults are the published code's for airplanes."""
+
+    image_size = IMAGE_SIZE
+    reads_view_ids = True
 
     encoder_from_step: Step = 53_051
     """First step that trains the encoder instead of the GAN (published: after 50 epochs)."""
@@ -63,14 +65,6 @@ class PrGANSettings(MethodSettings):
     """Distance of the data set's cameras; with the field of view it gives the size of objects in the images."""
     half_fov_deg: Annotated[float, Field(gt=0, lt=90)] = 15.0
     """Half of the field of view of the data set's cameras."""
-
-    @property
-    def reads_view_ids(self) -> bool:
-        return True
-
-    @property
-    def image_size(self) -> int:
-        return IMAGE_SIZE
 
     def check_run(self, *, iterations: int, batch_size: int) -> None:
         if self.encoder_from_step > iterations:
@@ -119,6 +113,9 @@ class PrGAN(Method):
         settings = self.settings
         return ViewCircle(self.info.num_views, settings.elevation_deg, settings.distance, settings.half_fov_deg)
 
+    def check_batch(self, batch: Batch) -> None:
+        check_views(batch.poses, batch.view_ids, self.views)
+
     def encode(self, images: Tensor) -> Tensor:
         """Shape codes [B, 200] from the mask channel alone."""
         masks = network_input(images, self.device, self.image_size)[:, 3]
@@ -142,14 +139,12 @@ class PrGAN(Method):
         with autocast(self.device, "fp32"):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
-    def check_batch(self, batch: Batch) -> None:
-        check_views(batch.poses, batch.view_ids, self.views)
-
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """A step of the GAN before `encoder_from_step`, afterwards one of the encoder."""
+        z = self.sample_z(len(batch))
         if step >= self.settings.encoder_from_step:
-            return self._encoder_step(len(batch), step)
-        return self._gan_step(batch.masks.to(self.device, non_blocking=True), self.sample_z(len(batch)), step)
+            return self._encoder_step(z, step)
+        return self._gan_step(batch.masks.to(self.device, non_blocking=True), z, step)
 
     def _gan_step(self, real: Tensor, z: Tensor, step: int) -> dict[str, float]:
         """Train the discriminator, if its accuracy is at most `accuracy_margin`; then the generator on the
@@ -157,32 +152,31 @@ class PrGAN(Method):
         published code.
         """
         values = {"accuracy": self.accuracy(real, z)}
-        self.set_training(True)
 
-        def backward_and_step(name: str, loss: Tensor) -> None:
+        def minimize(name: str, loss: Tensor) -> None:
             values[name] = self.backward_and_step({name: loss}, step, name)[name]
 
+        self.networks.train()
         fake = self.generate(z)
         if values["accuracy"] <= self.settings.accuracy_margin:
             with self.autocast():
                 of_real, of_fake = self.discriminator(real).float(), self.discriminator(fake.detach()).float()
-            backward_and_step("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0))
+            minimize("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0))
 
         with self.autocast():
             logits = frozen(self.discriminator, fake).float()
-        backward_and_step("generator", _bce(logits, 1.0))
+        minimize("generator", _bce(logits, 1.0))
 
         with self.autocast():
             first = self.discriminator.first
             of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
-        backward_and_step("generator_statistics", statistics_loss(of_real, of_fake))
+        minimize("generator_statistics", statistics_loss(of_real, of_fake))
         values["total"] = sum(values.get(name, 0.0) for name in self.optimizers)
         return values
 
-    def _encoder_step(self, count: int, step: int) -> dict[str, float]:
-        """Train the encoder to predict z from `count` new samples of the generator, which is in evaluation mode."""
-        self.set_training(False)
-        z = self.sample_z(count)
+    def _encoder_step(self, z: Tensor, step: int) -> dict[str, float]:
+        """Train the encoder to predict z from new samples of the generator, which is in evaluation mode."""
+        self.networks.eval()
         with torch.no_grad():
             images = self.generate(z)
         with self.autocast():
@@ -193,7 +187,7 @@ class PrGAN(Method):
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> float:
         """Mean probability, in evaluation mode, that the discriminator assigns to the right answers."""
-        self.set_training(False)
+        self.networks.eval()
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
         return float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)

@@ -19,13 +19,13 @@ import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.poses import Poses
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods.method import DatasetInfo, MeshMethod, MeshSettings
+from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.optimization import adam, frozen
 from learn3d.networks import ENCODERS, GENERATORS
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.encoders import PreactResNet18
 from learn3d.networks.layers import reverse_gradient
-from learn3d.networks.resnet import FlatResNet18
+from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.settings import Channels, Pixels, Positive, Weight, checked
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object if alpha is at least this
@@ -114,17 +114,28 @@ class VPL(MeshMethod):
         if settings.encoder == "preact-resnet18":
             encoder = PreactResNet18(settings.image_size)
         elif settings.encoder == "resnet18":
-            encoder = FlatResNet18(settings.image_size, settings.pretrained is not None, info.inverted)
+            frozen_norms = settings.pretrained is not None
+            encoder = ResNet18Encoder(info.inverted, flat_size=settings.image_size, frozen_norms=frozen_norms)
         else:
-            encoder = ENCODERS[settings.encoder]()
+            encoder = ENCODERS[settings.encoder](info.inverted)
         scales = {}
         if settings.generator.startswith("cube"):
             scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
         generator = GENERATORS[settings.generator](symmetry=settings.symmetry, **scales)
         networks = {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
-        if settings.lambda_discriminator > 0:
-            networks["discriminator"] = _create_discriminator(settings, info)
-        return networks
+        if settings.lambda_discriminator == 0:
+            return networks
+        channels = settings.discriminator_channels
+        if settings.discriminator == "patch":
+            discriminator = PatchDiscriminator(info.pose_features, channels)
+        elif settings.discriminator == "spectral-patch":
+            num_classes = info.num_classes if settings.class_conditional else None
+            discriminator = SpectralPatchDiscriminator(info.pose_features, channels, num_classes)
+        elif info.num_views < 2:
+            raise ValueError(f"discriminator 'dcgan' tells views by their class and needs two, got {info.num_views}")
+        else:
+            discriminator = OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
+        return networks | {"discriminator": discriminator}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
@@ -157,19 +168,19 @@ class VPL(MeshMethod):
         silhouettes, elsewhere = self.render(both, batch.poses[torch.cat([own, others])]).tensor_split([len(batch)])
         losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
         if is_baseline:
-            return self.backward_and_step(losses, step, "encoder", "generator")
+            return self.backward_and_step(losses, step)
         if settings.adversary == "reversal":
-            reverse = settings.lambda_discriminator
-            real, fake = reverse_gradient(silhouettes, reverse), reverse_gradient(elsewhere, reverse)
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
+            real, fake = (reverse_gradient(s, settings.lambda_discriminator) for s in (silhouettes, elsewhere))
         elif step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
-            losses["discrimination"] = self._discrimination_loss(real, fake, others, batch)
         else:
             logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, batch)
             losses["adversarial"] = F.softplus(-logits).mean()
-        trained = ["encoder", "generator"] + ["discriminator"] * ("discrimination" in losses)
-        return self.backward_and_step(losses, step, *trained)
+            return self.backward_and_step(losses, step)
+        of_real = self._discriminate(self.discriminator, real, own, batch)
+        of_fake = self._discriminate(self.discriminator, fake, others, batch)
+        losses["discrimination"] = F.softplus(-of_real).mean() + F.softplus(of_fake).mean()
+        return self.backward_and_step(losses, step)
 
     def render(self, vertices: Tensor, poses: Poses) -> Tensor:
         """Silhouettes float32 [B,s,s] with the settings' size, anti-aliasing and gradient."""
@@ -187,15 +198,8 @@ class VPL(MeshMethod):
         masks = batch.masks
         if self.settings.silhouette_size != MASK_SIZE:
             masks = (batch.images[:, 3] >= MASK_THRESHOLD * 255).to(silhouettes)
-        if self.settings.silhouette_loss == "pyramid":
-            return silhouette_pyramid_loss(silhouettes, masks)
-        return nmr.losses.soft_iou_loss(silhouettes, masks)
-
-    def _discrimination_loss(self, real: Tensor, fake: Tensor, others: Tensor, batch: Batch) -> Tensor:
-        """Binary cross-entropy of logits x: softplus(-x) for the target 1, softplus(x) for 0; scalar."""
-        real_logits = self._discriminate(self.discriminator, real, torch.arange(len(batch)), batch)
-        fake_logits = self._discriminate(self.discriminator, fake, others, batch)
-        return F.softplus(-real_logits).mean() + F.softplus(fake_logits).mean()
+        pyramid = self.settings.silhouette_loss == "pyramid"
+        return (silhouette_pyramid_loss if pyramid else nmr.losses.soft_iou_loss)(silhouettes, masks)
 
     def _discriminate(
         self, network: Callable[..., Tensor], silhouettes: Tensor, seen_at: Tensor, batch: Batch
@@ -231,18 +235,3 @@ def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> 
     different = (batch.view_ids[:, None] != batch.view_ids).float()
     weights = torch.where(different.any(1, keepdim=True), different, 1.0)
     return torch.multinomial(weights, 1).squeeze(1)
-
-
-def _create_discriminator(settings: VPLSettings, info: DatasetInfo) -> nn.Module:
-    channels = settings.discriminator_channels
-    if settings.discriminator == "dcgan":
-        if info.num_views < 2:
-            raise ValueError(
-                f"discriminator 'dcgan' tells views by their class and needs at least 2, got {info.num_views}"
-            )
-        return OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
-    if settings.discriminator == "patch":
-        return PatchDiscriminator(info.pose_features, channels)
-    return SpectralPatchDiscriminator(
-        info.pose_features, channels, info.num_classes if settings.class_conditional else None
-    )

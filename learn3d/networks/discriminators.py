@@ -19,15 +19,9 @@ from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
 SLOPE = 0.2  # slope of the leaky ReLUs
 
 
-class PoseDiscriminator(nn.Module):
+def pose_discriminator(num_views: int) -> nn.Sequential:
     """Shape code [B,512] -> logits [B,K] over K view classes."""
-
-    def __init__(self, num_views: int) -> None:
-        super().__init__()
-        self.layers = linear_layers(CODE_SIZE, 256, 128, num_views)
-
-    def forward(self, codes: Tensor) -> Tensor:
-        return self.layers(codes)
+    return linear_layers(CODE_SIZE, 256, 128, num_views)
 
 
 class OneHotViewDiscriminator(nn.Module):
@@ -40,16 +34,15 @@ class OneHotViewDiscriminator(nn.Module):
     def __init__(self, num_views: int, channels: int = 128, silhouette_size: int = 64) -> None:
         super().__init__()
         self.num_views = num_views
-        widths = [channels, 2 * channels, 4 * channels, 8 * channels]
         layers: list[nn.Module] = [nn.Conv2d(1 + num_views, channels, 4, stride=2, padding=1), nn.LeakyReLU(SLOPE)]
-        for before, after in itertools.pairwise(widths):
-            layers += [nn.Conv2d(before, after, 4, stride=2, padding=1), nn.BatchNorm2d(after), nn.LeakyReLU(SLOPE)]
-        self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(widths[-1] * (silhouette_size // 16) ** 2, 1))
+        for before in (channels, 2 * channels, 4 * channels):
+            convolution = nn.Conv2d(before, 2 * before, 4, stride=2, padding=1)
+            layers += [convolution, nn.BatchNorm2d(2 * before), nn.LeakyReLU(SLOPE)]
+        self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(8 * channels * (silhouette_size // 16) ** 2, 1))
 
     def forward(self, silhouettes: Tensor, view_ids: Tensor) -> Tensor:
-        planes = F.one_hot(view_ids, self.num_views).to(silhouettes)[:, :, None, None]
-        planes = planes.expand(-1, -1, *silhouettes.shape[1:])
-        return self.layers(torch.cat([silhouettes.unsqueeze(1), planes], dim=1)).squeeze(1)
+        planes = F.one_hot(view_ids, self.num_views).to(silhouettes)
+        return self.layers(_append(silhouettes.unsqueeze(1), planes)).squeeze(1)
 
 
 class SpectralPatchDiscriminator(nn.Module):
@@ -63,19 +56,18 @@ class SpectralPatchDiscriminator(nn.Module):
 
     def __init__(self, view_features: int, channels: int = 32, num_classes: int | None = None) -> None:
         super().__init__()
-        widths = [2 * channels, 2 * channels, 4 * channels, 8 * channels, 8 * channels]
         self.first = nn.Sequential(_spectral_conv(1, channels), *_norm_without_gain(nn.BatchNorm2d(channels)))
         self.view = nn.Sequential(
             spectral_norm(nn.Linear(view_features, channels, bias=False)), *_norm_without_gain(nn.BatchNorm1d(channels))
         )
         layers: list[nn.Module] = []
-        for before, after in itertools.pairwise(widths):
+        for before, after in itertools.pairwise((2 * channels, 2 * channels, 4 * channels, 8 * channels, 8 * channels)):
             layers += [_spectral_conv(before, after), *_norm_without_gain(nn.BatchNorm2d(after))]
         self.layers = nn.Sequential(*layers)
-        self.last = _spectral_conv(widths[-1], 1, bias=True)
+        self.last = _spectral_conv(8 * channels, 1, bias=True)
         self.num_classes = num_classes
         if num_classes is not None:
-            self.classes = spectral_norm(nn.Linear(num_classes, widths[-1], bias=False))
+            self.classes = spectral_norm(nn.Linear(num_classes, 8 * channels, bias=False))
 
     def forward(self, silhouettes: Tensor, views: Tensor, class_ids: Tensor | None = None) -> Tensor:
         """`views` float [B,C]; `class_ids` int64 [B], only with `num_classes`."""
@@ -101,8 +93,8 @@ class PatchDiscriminator(nn.Module):
         self.first = nn.Sequential(nn.Conv2d(1, channels, 4, stride=2, padding=2), nn.LeakyReLU(SLOPE))
         self.view = nn.Sequential(nn.Linear(view_features, channels), nn.LeakyReLU(SLOPE))
         layers: list[nn.Module] = []
-        for width, stride in ((2, 2), (4, 2), (8, 1)):
-            layers += [nn.Conv2d(max(2, width // 2) * channels, width * channels, 4, stride=stride, padding=2)]
+        for before, after, stride in ((2, 2, 2), (2, 4, 2), (4, 8, 1)):
+            layers += [nn.Conv2d(before * channels, after * channels, 4, stride=stride, padding=2)]
             layers += [nn.LeakyReLU(SLOPE)]
         self.layers = nn.Sequential(*layers, nn.Conv2d(8 * channels, 1, 4, padding=2))
         initialize_he(self)

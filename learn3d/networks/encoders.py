@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
+from learn3d.networks.layers import initialize_he, linear_layers, norm_relu
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
@@ -17,14 +17,20 @@ CENTRED_SIZE = 0.8  # object size (`ViewDataset.object_sizes`) after `centre`
 
 
 class ConvEncoder(nn.Module):
-    """Image [B,4,64,64] (RGB and mask, float in [0,1]) -> shape code [B,512], unbounded (no ReLU at the end)."""
+    """Image [B,4,64,64] (RGB and mask, float in [0,1]) -> shape code [B,512], unbounded (no ReLU at the end).
+
+    inverted: whether the data set stores colours as 1 - colour. Encoders take colours as they are stored, but for those
+    that say otherwise.
+    """
 
     image_size = 64
+    channels: tuple[int, ...] = (64, 128, 256)
+    hidden_sizes: tuple[int, ...] = (1024, 1024)
 
-    def __init__(self) -> None:
+    def __init__(self, inverted: bool = True) -> None:
         super().__init__()
-        self.convolutions = _convolutions(64, 128, 256)
-        self.layers = linear_layers(256 * (self.image_size // 8) ** 2, 1024, 1024, CODE_SIZE)
+        self.convolutions = _convolutions(*self.channels)
+        self.layers = linear_layers(self.channels[-1] * (self.image_size // 8) ** 2, *self.hidden_sizes, CODE_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
         # The last ReLU follows the change of memory layout; before it, its gradient would take 9 ms of a 270 ms step.
@@ -39,6 +45,12 @@ class ReluConvEncoder(ConvEncoder):
         return torch.relu(super().forward(images))
 
 
+class SmallConvEncoder(ConvEncoder):
+    """1.3 million weights instead of 19, for small data sets and quick experiments. Unpublished."""
+
+    channels, hidden_sizes = (16, 32, 64), (256,)
+
+
 class LightConvEncoder(ConvEncoder):
     """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers. Unpublished.
 
@@ -47,30 +59,15 @@ class LightConvEncoder(ConvEncoder):
     that are not `inverted` (stored as 1 - colour over black) are inverted first.
     """
 
-    hidden_sizes: tuple[int, ...] = (1024, 1024)
-
     def __init__(self, inverted: bool = True) -> None:
         nn.Module.__init__(self)
-        self.inverted = inverted
-        narrow = 32
+        self.inverted, narrow = inverted, 32
         self.convolutions = _convolutions(32, 64, 128).extend([nn.Conv2d(128, narrow, 1), nn.ReLU()])
         self.layers = linear_layers(narrow * (self.image_size // 8) ** 2, *self.hidden_sizes, CODE_SIZE)
         initialize_he(self.convolutions)
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images if self.inverted else _on_black(images))
-
-
-class SmallConvEncoder(ConvEncoder):
-    """ConvEncoder with a quarter of the channels and one hidden layer: 1.3 million weights, not 19. Unpublished.
-
-    For small data sets and quick experiments.
-    """
-
-    def __init__(self) -> None:
-        nn.Module.__init__(self)
-        self.convolutions = _convolutions(16, 32, 64)
-        self.layers = linear_layers(64 * (self.image_size // 8) ** 2, 256, CODE_SIZE)
 
 
 class CentredConvEncoder(LightConvEncoder):
@@ -99,7 +96,7 @@ class ViewClassifier(nn.Module):
     0.2 million weights. Unpublished.
     """
 
-    def __init__(self, num_views: int, *, inverted: bool) -> None:
+    def __init__(self, num_views: int, inverted: bool) -> None:
         super().__init__()
         self.inverted = inverted
         self.convolutions = _convolutions(16, 32, 64).extend([nn.Conv2d(64, 64, 3, stride=2, padding=1), nn.ReLU()])
@@ -147,7 +144,7 @@ def _convolutions(*channels: int) -> nn.Sequential:
 
 
 EncoderName = Literal["conv", "conv-light", "conv-small", "conv-centred", "conv-relu", "resnet18"]
-ENCODERS: dict[str, type[nn.Module]] = {
+ENCODERS: dict[str, type[ConvEncoder] | type[ResNet18Encoder]] = {
     "conv": ConvEncoder,
     "conv-light": LightConvEncoder,
     "conv-small": SmallConvEncoder,
@@ -155,16 +152,6 @@ ENCODERS: dict[str, type[nn.Module]] = {
     "conv-relu": ReluConvEncoder,
     "resnet18": ResNet18Encoder,
 }
-
-
-def create_encoder(name: EncoderName, *, inverted: bool) -> nn.Module:
-    """The encoder `name`. inverted: whether the data set stores colours as 255 - colour.
-
-    resnet18 restores natural colours, which its normalisation and pretrained weights need. conv-light and conv-centred
-    invert natural colours, so that a white background is 0. The others take colours as they are stored.
-    """
-    encoder = ENCODERS[name]
-    return encoder(inverted) if issubclass(encoder, (ResNet18Encoder, LightConvEncoder)) else encoder()
 
 
 def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:
@@ -190,23 +177,14 @@ class PreactResNet18(nn.Module):
 
     def __init__(self, image_size: int = 224, channels: int = 64) -> None:
         super().__init__()
-        self.image_size = image_size
-        widths = [channels, 2 * channels, 4 * channels, 8 * channels]
-        blocks: list[nn.Module] = []
-        for before, width in zip([channels, *widths[:-1]], widths, strict=True):
-            blocks += [_Block(before, width, first=not blocks), _Block(width, width)]
-        self.layers = nn.Sequential(
-            nn.Conv2d(3, channels, 7, stride=2, padding=3, bias=False),
-            nn.BatchNorm2d(channels, eps=BATCH_NORM_EPS),
-            nn.ReLU(),
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            *blocks,
-            nn.BatchNorm2d(widths[-1], eps=BATCH_NORM_EPS),
-            nn.ReLU(),
-            nn.Flatten(),
-        )
+        layers = [nn.Conv2d(3, channels, 7, stride=2, padding=3, bias=False), *norm_relu(channels)]
+        layers += [nn.MaxPool2d(3, stride=2, ceil_mode=True), _Block(channels, channels, first=True)]
+        layers.append(_Block(channels, channels))
+        for width in (2 * channels, 4 * channels, 8 * channels):
+            layers += [_Block(width // 2, width), _Block(width, width)]
+        self.layers = nn.Sequential(*layers, *norm_relu(8 * channels), nn.Flatten())
         initialize_he(self)
-        self.code = nn.Linear(widths[-1] * (image_size // 32) ** 2, CODE_SIZE)
+        self.code = nn.Linear(8 * channels * (image_size // 32) ** 2, CODE_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
         return self.code(self.layers(grey_background(images)))
@@ -220,12 +198,10 @@ class _Block(nn.Module):
     def __init__(self, before: int, after: int, first: bool = False) -> None:
         super().__init__()
         stride = 1 if before == after else 2
-        activation = [] if first else [nn.BatchNorm2d(before, eps=BATCH_NORM_EPS), nn.ReLU()]
         self.residual = nn.Sequential(
-            *activation,
+            *([] if first else norm_relu(before)),
             nn.Conv2d(before, after, 3, stride=stride, padding=1, bias=False),
-            nn.BatchNorm2d(after, eps=BATCH_NORM_EPS),
-            nn.ReLU(),
+            *norm_relu(after),
             nn.Conv2d(after, after, 3, padding=1, bias=False),
         )
         self.shortcut = nn.Identity() if stride == 1 else nn.Conv2d(before, after, 1, stride=2, bias=False)

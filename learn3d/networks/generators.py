@@ -1,17 +1,72 @@
-"""Mesh generators, shape codes -> vertices: deformed spheres and cubes."""
+"""Mesh generators, shape codes -> vertices: deformed spheres and cubes, with mirror symmetry about a vertical plane."""
 
 from __future__ import annotations
 
+import math
+from typing import Annotated, Literal
+
 import torch
+import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.layers import BATCH_NORM_EPS, initialize_he, linear_layers
-from learn3d.networks.mesh_generator import MeshGenerator, Symmetry
+from learn3d.networks.layers import initialize_he, linear_layers, norm_relu
 
-OBJECT_SCALE = 0.5
-STIFFNESS, FREE_SHARE = 3.0, 0.2  # b and a of SmoothSphereGenerator
+#: The mirror plane x = 0 or z = 0, or the vertical plane along which a camera of this azimuth in degrees looks
+#: (x = 0 is 0, z = 0 is 90).
+Symmetry = Literal["x", "z"] | Annotated[float, Field(ge=-360, le=360)]
+#: The setting; auto: the plane that the training masks show (`data.mirror_plane`). None: no symmetry.
+SymmetryOption = Symmetry | Literal["auto"] | None
+
+
+class MeshGenerator(nn.Module):
+    """Shape code [B,512] -> vertices float32 [B,V,3] in the object frame (y up), on faces of a fixed topology.
+
+    If `symmetry` is not None, a subclass computes vertices that are symmetric about z = 0, and `place` turns them about
+    the vertical axis to the plane `symmetry`.
+    """
+
+    faces: Tensor  # int64 [F,3]
+    edges: Tensor  # int64 [E,4]: the table of `nmr.edge_table`
+    mirror: Tensor | None  # int64 [V]: index of each vertex's mirror image; None: no symmetry
+    rotation: Tensor | None  # float32 [3,3]: turns the plane z = 0 to the plane `symmetry`; None: they are the same
+
+    def __init__(self, points: Tensor, faces: Tensor, symmetry: Symmetry | None) -> None:
+        super().__init__()
+        tables = {"faces": faces, "edges": nmr.edge_table(faces), "mirror": None, "rotation": None}
+        if symmetry is not None:
+            mirrored = points * torch.tensor([1, 1, -1])
+            tables["mirror"] = torch.cdist(mirrored.double(), points.double()).argmin(dim=1)
+        if symmetry not in (None, "z"):
+            angle = math.radians(0.0 if symmetry == "x" else symmetry)
+            sine, cosine = round(math.sin(angle), 12), round(math.cos(angle), 12)  # exact for quarter turns
+            # The x axis is turned towards the eye, in direction (sin a, -cos a) of (x, z).
+            tables["rotation"] = torch.tensor([[sine, 0.0, -cosine], [0.0, 1.0, 0.0], [cosine, 0.0, sine]])
+        for name, table in tables.items():
+            self.register_buffer(name, table, persistent=False)
+
+    def place(self, vertices: Tensor) -> Tensor:
+        """Turn vertices that are symmetric about z = 0 to the plane `symmetry`."""
+        if self.rotation is None:
+            return vertices
+        return (vertices[..., None] * self.rotation).sum(-2)  # autocast would round a matrix product to bf16
+
+    def symmetrized(self, vertices: Tensor) -> Tensor:
+        """The mean of placed vertices [B,V,3] and their mirror images; `vertices` without symmetry."""
+        if self.mirror is None:
+            return vertices
+        mirrored = vertices[:, self.mirror.to(vertices.device), :, None] * self.reflection.to(vertices)
+        return (vertices + mirrored.sum(-2)) / 2
+
+    @property
+    def reflection(self) -> Tensor | None:
+        """The reflection float32 [3,3] that maps placed shapes to themselves; None without symmetry."""
+        if self.mirror is None:
+            return None
+        turn = torch.eye(3) if self.rotation is None else self.rotation.cpu()
+        return turn.T @ torch.diag(torch.tensor([1.0, 1.0, -1.0])) @ turn
 
 
 def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
@@ -20,7 +75,7 @@ def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
     The paper's text adds the displacement to the unit sphere itself. At the data set's camera a unit sphere covers the
     whole image, so no silhouette edge would be seen and nothing would be learnt; the published code has the factor 0.5.
     """
-    return OBJECT_SCALE * (sphere + displacement)
+    return 0.5 * (sphere + displacement)
 
 
 class SphereGenerator(MeshGenerator):
@@ -41,26 +96,23 @@ class SphereGenerator(MeshGenerator):
         self.register_buffer("sphere", sphere.float(), persistent=False)
         self.outputs = sphere.numel()
         if symmetry is not None:
-            self._share_outputs()
+            middle, right = (torch.nonzero(side)[:, 0] for side in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0))
+            self.outputs = 2 * len(middle) + 3 * len(right)
+            source, sign = torch.full(self.sphere.shape, self.outputs), torch.ones_like(self.sphere)
+            source[middle, :2] = torch.arange(2 * len(middle)).reshape(-1, 2)
+            source[right] = torch.arange(2 * len(middle), self.outputs).reshape(-1, 3)
+            source[self.mirror[right]] = source[right]
+            sign[self.mirror[right], 2] = -1
+            self.register_buffer("source", source, persistent=False)
+            self.register_buffer("sign", sign, persistent=False)
         self.layers = linear_layers(CODE_SIZE, 1024, 2048, self.outputs)
-
-    def _share_outputs(self) -> None:
-        middle, right = (torch.nonzero(chosen)[:, 0] for chosen in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0))
-        self.outputs = 2 * len(middle) + 3 * len(right)
-        source, sign = torch.full(self.sphere.shape, self.outputs), torch.ones_like(self.sphere)
-        source[middle, :2] = torch.arange(2 * len(middle)).reshape(-1, 2)
-        source[right] = torch.arange(2 * len(middle), self.outputs).reshape(-1, 3)
-        source[self.mirror[right]] = source[right]
-        sign[self.mirror[right], 2] = -1
-        self.register_buffer("source", source, persistent=False)
-        self.register_buffer("sign", sign, persistent=False)
 
     def displacements(self, codes: Tensor) -> Tensor:
         """Displacement float32 [B,642,3] of every vertex of the sphere."""
         outputs = self.layers(codes).float()
         if self.mirror is None:
             return outputs.reshape(len(codes), -1, 3)
-        return nn.functional.pad(outputs, (0, 1))[:, self.source] * self.sign
+        return F.pad(outputs, (0, 1))[:, self.source] * self.sign
 
     def forward(self, codes: Tensor) -> Tensor:
         return self.place(deform_sphere(self.sphere, self.displacements(codes)))
@@ -78,7 +130,14 @@ class SmoothSphereGenerator(SphereGenerator):
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:
         super().__init__(symmetry)
-        self.register_buffer("mixing", mixing_matrix(self.faces, STIFFNESS, FREE_SHARE), persistent=False)
+        identity = torch.eye(len(self.sphere), dtype=torch.float64)
+        first, second = self.edges[:, :2].T
+        neighbours = torch.zeros_like(identity)
+        neighbours[first, second] = neighbours[second, first] = 1
+        laplacian = torch.diag(neighbours.sum(1)) - neighbours
+        free_share, stiffness = 0.2, 3.0
+        mixing = free_share * identity + (1 - free_share) * torch.linalg.inv(identity + stiffness * laplacian)
+        self.register_buffer("mixing", mixing.float(), persistent=False)
 
     def displacements(self, codes: Tensor) -> Tensor:
         free = super().displacements(codes)
@@ -90,16 +149,6 @@ class SmoothSphereGenerator(SphereGenerator):
         mirrored = mixed[:, self.mirror] * mixed.new_tensor([1.0, 1.0, -1.0])
         flat = mixed * mixed.new_tensor([1.0, 1.0, 0.0])
         return torch.where(side > 0, mixed, torch.where(side < 0, mirrored, flat))
-
-
-def mixing_matrix(faces: Tensor, stiffness: float, free_share: float) -> Tensor:
-    """a I + (1 - a) (I + b L)^-1 for a = free_share, b = stiffness and a mesh's graph Laplacian L: float32 [V,V]."""
-    neighbours = torch.zeros(int(faces.max()) + 1, int(faces.max()) + 1, dtype=torch.float64)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        neighbours[faces[:, i], faces[:, j]] = neighbours[faces[:, j], faces[:, i]] = 1
-    identity = torch.eye(len(neighbours), dtype=torch.float64)
-    laplacian = torch.diag(neighbours.sum(1)) - neighbours
-    return (free_share * identity + (1 - free_share) * torch.linalg.inv(identity + stiffness * laplacian)).float()
 
 
 class SmallSphereGenerator(SphereGenerator):
@@ -117,7 +166,7 @@ def deform_bounded_sphere(sphere: Tensor, bias: Tensor, centroid: Tensor) -> Ten
     0.5 (c + s (1 - sign(s) c)), which stays in its octant about c / 2. A vertex on a coordinate plane of the sphere
     (b = 0) stays on it: logit(0) = -inf, and its gradient is 0.
     """
-    base, center = OBJECT_SCALE * sphere, torch.tanh(centroid)[:, None]
+    base, center = 0.5 * sphere, torch.tanh(centroid)[:, None]
     stretch = base.sign() * torch.sigmoid(torch.logit(base.abs()) + bias)
     return 0.5 * (center + stretch * (1 - base.sign() * center))
 
@@ -146,8 +195,7 @@ class BoundedGenerator(MeshGenerator):
         centroid = 0.1 * self.centroid(features).float()
         if self.mirror is None:
             return deform_bounded_sphere(self.sphere, bias, centroid)
-        x, y, _ = centroid.unbind(1)
-        vertices = deform_bounded_sphere(self.sphere, bias, torch.stack([x, y, torch.zeros_like(x)], dim=1))
+        vertices = deform_bounded_sphere(self.sphere, bias, F.pad(centroid[:, :2], (0, 1)))
         mirrored = torch.cat([vertices[..., :2], -vertices[..., 2:]], dim=2)[:, self.mirror]
         return self.place(torch.where(self.sphere[:, 2:] < 0, mirrored, vertices))
 
@@ -183,28 +231,24 @@ def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
 class CubeGenerator(MeshGenerator):
     """Base class: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
 
-    `base` is a parameter that starts as the sphere of radius 0.5 (times object_scale); a subclass computes `bias` from
-    the codes. With `symmetry`, as published: z becomes |z|, each vertex becomes the mean of itself and its mirror
-    image, and z gets the sign that the vertex has on the cube. The vertices are then exactly symmetric, but the faces'
-    diagonals are not.
+    `base` is a parameter that starts as the sphere of radius 0.5 (times object_scale); a subclass computes `bias`, the
+    offsets [B,1352,3], from the codes. With `symmetry`, as published: z becomes |z|, each vertex becomes the mean of
+    itself and its mirror image, and z gets the sign that the vertex has on the cube. The vertices are then exactly
+    symmetric, but the faces' diagonals are not.
     """
 
     signs: Tensor  # float32 [V,3]: (1, 1, -1) if z < 0 on the cube, else 1
 
     def __init__(self, scale: float, object_scale: float, symmetry: Symmetry | None) -> None:
         points, patches, faces = cube_surface()
-        super().__init__(2 * points - (GRID_SIZE - 1), faces, symmetry)
-        self.patches, self.scale, self.object_scale = patches, scale, object_scale
         centred = 2 * points.double() / (GRID_SIZE - 1) - 1
+        super().__init__(centred, faces, symmetry)
+        self.patches, self.scale, self.object_scale = patches, scale, object_scale
         sphere = centred / centred.norm(dim=1, keepdim=True)
         self.base = nn.Parameter(torch.atanh(INITIAL_RADIUS * sphere / BOUND).float())
         signs = torch.ones(len(points), 3)
-        signs[points[:, 2] < GRID_SIZE / 2, 2] = -1
+        signs[centred[:, 2] < 0, 2] = -1
         self.register_buffer("signs", signs, persistent=False)
-
-    def bias(self, codes: Tensor) -> Tensor:
-        """Offsets [B,V,3] from `base` for codes [B,512]."""
-        raise NotImplementedError
 
     def forward(self, codes: Tensor) -> Tensor:
         points = self.base + self.scale * self.bias(codes).float()
@@ -233,10 +277,10 @@ class ConvCubeGenerator(CubeGenerator):
         places: list[list[int]] = [[] for _ in self.base]
         for place, vertex in enumerate(self.patches.flatten().tolist()):
             places[vertex].append(place)
-        filled = [[*p, *[p[0]] * (3 - len(p))] for p in places]
-        shares = [[1 / len(p)] * len(p) + [0.0] * (3 - len(p)) for p in places]
-        self.register_buffer("positions", torch.tensor(filled), persistent=False)
-        self.register_buffer("shares", torch.tensor(shares)[:, :, None], persistent=False)
+        positions = torch.tensor([[*p, *[p[0]] * (3 - len(p))] for p in places])
+        shares = torch.tensor([[1 / len(p)] * len(p) + [0.0] * (3 - len(p)) for p in places])
+        self.register_buffer("positions", positions, persistent=False)
+        self.register_buffer("shares", shares[:, :, None], persistent=False)
 
     def bias(self, codes: Tensor) -> Tensor:
         sides = torch.stack([side(codes) for side in self.sides], dim=1)  # [B,6,3,16,16]
@@ -246,20 +290,12 @@ class ConvCubeGenerator(CubeGenerator):
 
 
 def _side_decoder(channels: int) -> nn.Sequential:
-    layers: list[nn.Module] = [
-        nn.Linear(CODE_SIZE, 4 * channels, bias=False),
-        nn.Unflatten(1, (channels, 2, 2)),
-        nn.BatchNorm2d(channels, eps=BATCH_NORM_EPS),
-        nn.ReLU(),
-    ]
-    for _ in range(3):
-        layers += [
-            nn.ConvTranspose2d(channels, channels // 2, 3, stride=2, padding=1, output_padding=1, bias=False),
-            nn.BatchNorm2d(channels // 2, eps=BATCH_NORM_EPS),
-            nn.ReLU(),
-        ]
-        channels //= 2
-    decoder = nn.Sequential(*layers, nn.Conv2d(channels, 3, 3, padding=1))
+    layers: list[nn.Module] = [nn.Linear(CODE_SIZE, 4 * channels, bias=False), nn.Unflatten(1, (channels, 2, 2))]
+    layers += norm_relu(channels)
+    for width in (channels // 2, channels // 4, channels // 8):
+        layers.append(nn.ConvTranspose2d(2 * width, width, 3, stride=2, padding=1, output_padding=1, bias=False))
+        layers += norm_relu(width)
+    decoder = nn.Sequential(*layers, nn.Conv2d(width, 3, 3, padding=1))
     initialize_he(decoder)
     return decoder
 
@@ -276,3 +312,14 @@ class LinearCubeGenerator(CubeGenerator):
 
     def bias(self, codes: Tensor) -> Tensor:
         return self.layers(codes).unflatten(1, (-1, 3))
+
+
+GeneratorName = Literal["auto", "sphere", "sphere-smooth", "sphere-small", "bounded", "cube-conv", "cube-fc"]
+GENERATORS: dict[str, type[MeshGenerator]] = {
+    "sphere": SphereGenerator,
+    "sphere-smooth": SmoothSphereGenerator,
+    "sphere-small": SmallSphereGenerator,
+    "bounded": BoundedGenerator,
+    "cube-conv": ConvCubeGenerator,
+    "cube-fc": LinearCubeGenerator,
+}

@@ -1,11 +1,9 @@
-"""Parts that several networks share: linear layers with ReLU, initial weights, gradient reversal."""
+"""Parts that several networks share: layers, initial weights, gradient reversal."""
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 BATCH_NORM_EPS = 2e-5  # batch norms have it in the published code of Kato and Harada 2019
@@ -19,6 +17,11 @@ def linear_layers(*sizes: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+def norm_relu(channels: int) -> list[nn.Module]:
+    """Batch norm of Kato and Harada 2019, and ReLU."""
+    return [nn.BatchNorm2d(channels, eps=BATCH_NORM_EPS), nn.ReLU()]
+
+
 def initialize_he(network: nn.Module) -> None:
     """He's normal distribution for the weights of all convolutions and linear layers, 0 for their biases."""
     for module in network.modules():
@@ -28,20 +31,11 @@ def initialize_he(network: nn.Module) -> None:
                 nn.init.zeros_(module.bias)
 
 
-class _ReverseGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, factor: float) -> Tensor:
-        ctx.factor = factor
-        return values.view_as(values)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return -ctx.factor * grad, None
-
-
 def reverse_gradient(values: Tensor, factor: float) -> Tensor:
     """The identity, with the gradient times -factor (Ganin and Lempitsky 2015).
 
     Networks after it minimise a loss; networks before it maximise the same loss, `factor` times as fast.
     """
-    return _ReverseGradient.apply(values, factor)
+    same = values.view_as(values)
+    same.register_hook(lambda grad: -factor * grad)
+    return same

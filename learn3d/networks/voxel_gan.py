@@ -30,22 +30,19 @@ DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
 
 
 class DoublingConvolution(nn.ConvTranspose3d):
-    """[B, C, n, n, n] -> [B, C', 2n, 2n, 2n]: a transposed 4^3 convolution of stride 2.
-
-    With one output channel on a CPU, torch's own forward pass takes four times as long as that of `_Double`.
-    """
+    """[B, C, n, n, n] -> [B, C', 2n, 2n, 2n]: a transposed 4^3 convolution of stride 2."""
 
     def __init__(self, before: int, after: int) -> None:
         super().__init__(before, after, 4, stride=2, padding=1)
 
     def forward(self, features: Tensor) -> Tensor:
-        if self.out_channels == 1 and features.device.type == "cpu":
+        if self.out_channels == 1 and features.device.type == "cpu":  # torch takes four times as long
             return _Double.apply(features, self.weight, self.bias)
         return super().forward(features)
 
 
 class _Double(torch.autograd.Function):
-    """Each cell becomes eight, each a sum over 2^3 neighbours: a convolution with eight output channels.
+    """DoublingConvolution to one channel. Each cell becomes eight, so it is a convolution with eight output channels.
 
     Along an axis, cell 2i is w[3] x[i-1] + w[1] x[i], and cell 2i + 1 is w[2] x[i] + w[0] x[i+1].
     """
@@ -65,28 +62,26 @@ class _Double(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
-        wanted = list(ctx.needs_input_grad)
-        stride, padding, dilation, output_padding = [2, 2, 2], [1, 1, 1], [1, 1, 1], [0, 0, 0]
+        stride, padding, dilation, output_padding = [2] * 3, [1] * 3, [1] * 3, [0] * 3
         return torch.ops.aten.convolution_backward(
-            grad, *ctx.saved_tensors, [1], stride, padding, dilation, True, output_padding, 1, wanted
+            grad, *ctx.saved_tensors, [1], stride, padding, dilation, True, output_padding, 1, ctx.needs_input_grad
         )
 
 
 class VoxelGenerator(nn.Module):
     """Shape code [B, 200] -> density float32 [B, 64, 64, 64] in [0, 1 / TAU], axes (x, y, z) of the object frame.
 
-    A linear layer to `channels[0]` features on 4^3 cells, then transposed convolutions (4^3, stride 2) to the other
-    channels at 8^3, 16^3 and 32^3 and to one at 64^3; batch norm and ReLU after all but the last, which has a sigmoid.
-    The published code has one channel already at 32^3, perhaps by mistake: its batch norm there is declared for 16.
+    A linear layer to `channels[0]` features on 4^3 cells, then doubling convolutions to the other channels and to one
+    at 64^3; batch norm and ReLU after all but the last, which has a sigmoid. The published code has one channel already
+    at 32^3, perhaps by mistake: its batch norm there is declared for 16.
     """
 
     def __init__(self, channels: Sequence[int] = GENERATOR_CHANNELS) -> None:
         super().__init__()
         self.first = nn.Linear(SHAPE_CODE, channels[0] * 4**3)
-        layers: list[nn.Module] = [nn.BatchNorm3d(channels[0]), nn.ReLU()]
-        for before, after in itertools.pairwise(channels):
-            layers += [DoublingConvolution(before, after), nn.BatchNorm3d(after), nn.ReLU()]
-        layers.append(DoublingConvolution(channels[-1], 1))
+        layers: list[nn.Module] = []
+        for before, after in itertools.pairwise((*channels, 1)):
+            layers += [nn.BatchNorm3d(before), nn.ReLU(), DoublingConvolution(before, after)]
         self.layers = nn.Sequential(*layers)
         self.apply(_initialise)
         self.to(memory_format=torch.channels_last_3d)  # half the time on a CPU
@@ -104,11 +99,11 @@ class SilhouetteDiscriminator(nn.Module):
 
     def __init__(self, channels: Sequence[int] = DISCRIMINATOR_CHANNELS) -> None:
         super().__init__()
-        layers = [
+        self.first, *others = (
             nn.Sequential(nn.Conv2d(before, after, 5, stride=2, padding=2), nn.BatchNorm2d(after), nn.LeakyReLU(0.2))
             for before, after in itertools.pairwise((1, *channels))
-        ]
-        self.first, self.others = layers[0], nn.Sequential(*layers[1:])
+        )
+        self.others = nn.Sequential(*others)
         self.last = nn.Linear(channels[-1] * (IMAGE_SIZE // 16) ** 2, 1)
         self.apply(_initialise)
         self.to(memory_format=torch.channels_last)
@@ -219,7 +214,7 @@ def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) 
     above, low = position - low, low.long()
     pixel = torch.arange(size * size).reshape(size, size, 1).expand(points.shape[:3])
     pixels, voxels, values = [], [], []
-    for corner in ((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)):
+    for corner in itertools.product((0, 1), repeat=3):
         x, y, z = (low[..., axis] + corner[axis] for axis in range(3))
         weight = math.prod(above[..., axis] if corner[axis] else 1 - above[..., axis] for axis in range(3))
         inside = (weight > 0) & (x >= 0) & (x < size) & (y >= 0) & (y < size) & (z >= 0) & (z < size)

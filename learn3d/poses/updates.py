@@ -13,7 +13,7 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
-from learn3d.methods.method import MeshMethod
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.poses.estimate import SIZE, TEMPERATURE
 
 _IMAGES = 128  # at a time

@@ -167,9 +167,7 @@ def load_method(
     with torch.random.fork_rng(devices=[]):
         method = create_method(metadata.config.settings, metadata.info, **how)
     restore_networks(method, tensors, path, "ema" if starting_with("ema.", tensors) else "network")
-    method.set_training(False)
-    for network in method.networks.values():
-        network.requires_grad_(False)
+    method.networks.eval().requires_grad_(False)
     return method, metadata.config, metadata
 
 

@@ -16,7 +16,7 @@ from learn3d.networks.layers import linear_layers
 
 
 class TinyEncoder(SmallConvEncoder):
-    def __init__(self) -> None:
+    def __init__(self, inverted: bool = True) -> None:
         nn.Module.__init__(self)
         self.convolutions = nn.Sequential(nn.Conv2d(4, 4, 8, stride=8), nn.ReLU())
         self.layers = nn.Linear(256, CODE_SIZE)
@@ -49,7 +49,7 @@ class FixedMethod(Method):
     image_size = 64
 
     def __init__(self) -> None:
-        self.networks, self.optimizers, self.device, self.precision = {}, {}, torch.device("cpu"), "fp32"
+        self.networks, self.optimizers, self.device, self.precision = nn.ModuleDict(), {}, torch.device("cpu"), "fp32"
 
     def create_networks(self):
         raise NotImplementedError

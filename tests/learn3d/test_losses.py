@@ -19,7 +19,7 @@ from learn3d.losses import (
     silhouette_energy_distance,
     silhouette_pyramid_loss,
 )
-from learn3d.networks import PoseDiscriminator
+from learn3d.networks.discriminators import pose_discriminator
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +28,9 @@ def case() -> dict[str, Tensor]:
 
 
 @pytest.fixture
-def discriminator(case) -> PoseDiscriminator:
-    network = PoseDiscriminator(24)
-    for i, layer in enumerate(m for m in network.layers if isinstance(m, torch.nn.Linear)):
+def discriminator(case) -> torch.nn.Sequential:
+    network = pose_discriminator(24)
+    for i, layer in enumerate(m for m in network if isinstance(m, torch.nn.Linear)):
         layer.weight.data.copy_(case[f"W{i}"])
         layer.bias.data.copy_(case[f"b{i}"])
     return network
@@ -54,7 +54,7 @@ def test_losses_on_codes(case, discriminator, name: str) -> None:
     close(loss, case[name], 1e-5)
     close(codes.grad, case[f"grad_z_{name}"], 1e-5)
     if name == "adv_code":
-        close(discriminator.layers[-1].bias.grad, case["grad_b2_adv_code"], 1e-5)
+        close(discriminator[-1].bias.grad, case["grad_b2_adv_code"], 1e-5)
 
 
 def test_confusion_of_confident_and_of_uniform_logits(case) -> None:
@@ -73,8 +73,8 @@ def test_pose_classification(case, discriminator) -> None:
     loss = pose_classification_loss(logits, case["labels"].long())
     loss.backward()
     close(loss, case["cls"])
-    close(discriminator.layers[-1].weight.grad, case["grad_W2_cls"])
-    close(discriminator.layers[-1].bias.grad, case["grad_b2_cls"])
+    close(discriminator[-1].weight.grad, case["grad_W2_cls"])
+    close(discriminator[-1].bias.grad, case["grad_b2_cls"])
 
 
 @pytest.mark.parametrize("form", ["squared", "norm"])

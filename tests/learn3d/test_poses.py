@@ -24,8 +24,8 @@ from learn3d.data.sampling import batches
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.experiments import measurement
 from learn3d.files.reading import DamagedFile
+from learn3d.methods.method import Meshes
 from learn3d.methods.plus import Plus
-from learn3d.methods.surfaces import Meshes
 from learn3d.pictures.sheets import HEADER, MARGIN
 from learn3d.poses.estimate import SIZE, Candidates, Estimate, Masks, PoseOptions, _common_frame, _peak_votes, _turns
 from learn3d.poses.updates import update_poses, update_steps

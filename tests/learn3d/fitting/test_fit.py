@@ -18,7 +18,7 @@ from learn3d.fitting.familiarity import KnownCodes, known_codes, learn_others
 from learn3d.fitting.fit import AZIMUTHS, CENTRED_SIZE, View, find_view, fit, frame_view, predict
 from learn3d.fitting.smoothing import joined
 from learn3d.methods import create_method
-from learn3d.methods.method import MeshMethod
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import centre
 from learn3d.pictures.studio import photograph
 from learn3d.presets import PRESETS

@@ -35,10 +35,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> kato.ViewDataset:
 
 def confusion(method: PoseInvariant, batch: Batch) -> float:
     """How sure the discriminator is of the views of the codes; 0 if it gives every view the same probability."""
-    method.set_training(False)
+    method.networks.eval()
     with torch.no_grad():
         loss = domain_confusion_loss(method.discriminator(method.encode(batch.images)), "log")
-    method.set_training(True)
+    method.networks.train()
     return float(loss)
 
 

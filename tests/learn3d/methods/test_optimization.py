@@ -95,7 +95,7 @@ def test_schedules() -> None:
 def test_the_average_is_the_one_of_a_slow_reference() -> None:
     torch.manual_seed(0)
     network = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4))
-    average = EMA({"net": network}, decay=0.5)
+    average = EMA(nn.ModuleDict({"net": network}), decay=0.5)
     wanted = {f"net.{name}": value.double().clone() for name, value in network.state_dict().items()}
     for step in range(1, 12):
         with torch.no_grad():

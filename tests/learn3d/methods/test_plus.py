@@ -103,21 +103,21 @@ def test_the_loss_at_novel_views_waits_for_a_full_mask_bank(batch) -> None:
 
 def test_the_loss_at_novel_views_moves_vertices_where_the_projection_does_not(batch) -> None:
     method = make()
-    method._novel_view_loss(0.5 * method.generator.sphere.expand(4, -1, -1), batch)
+    method.novel_view_loss(0.5 * method.generator.sphere.expand(4, -1, -1), batch)
     vertices = (0.5 * method.generator.sphere).repeat(4, 1, 1).requires_grad_()
-    (gradient,) = torch.autograd.grad(method._novel_view_loss(vertices, batch)["novel_view"], vertices)
+    (gradient,) = torch.autograd.grad(method.novel_view_loss(vertices, batch)["novel_view"], vertices)
     assert torch.isfinite(gradient).all()
     assert gradient.abs().sum() > 0
 
 
 def test_every_second_image_is_flipped_to_a_view_of_its_own_if_shapes_are_symmetric(batch, monkeypatch) -> None:
-    seen, pictures, original = [], [], Plus._losses_on_codes
+    seen, pictures, original = [], [], Plus.losses_on_codes
 
     def losses_on_codes(self, codes, views, step):
         seen.append(views)
         return original(self, codes, views, step)
 
-    monkeypatch.setattr(Plus, "_losses_on_codes", losses_on_codes)
+    monkeypatch.setattr(Plus, "losses_on_codes", losses_on_codes)
     for plane, flipped, views in ((90.0, [1, 3], [0, 25, 0, 24]), (None, [], [0, 1, 0, 0])):
         method, images = make(plane), batch.images.clone()
         images[flipped] = images[flipped].flip(3)

@@ -19,9 +19,8 @@ from learn3d.evaluation import evaluate
 from learn3d.losses import depth_loss
 from learn3d.make_data.render import DatasetConfig, make_shards
 from learn3d.methods import create_method
-from learn3d.methods.many_views import ManyViews
-from learn3d.methods.method import DatasetInfo, check_groups
-from learn3d.methods.multi_view import MultiView, MultiViewSettings
+from learn3d.methods.method import DatasetInfo
+from learn3d.methods.multi_view import ManyViews, MultiView, MultiViewSettings, check_groups
 from learn3d.methods.optimization import SparseGradientAdam, TrainingSchedule
 from learn3d.networks.generators import deform_bounded_sphere
 from learn3d.presets import PRESETS

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import nmr
-from learn3d.methods import DatasetInfo, create_method, refinement
-from learn3d.methods.refinement import refine
-from learn3d.methods.surfaces import grid_surface
+from learn3d.methods import DatasetInfo, create_method, mesh_method
+from learn3d.methods.mesh_method import refine
+from learn3d.methods.method import grid_surface
 from learn3d.presets import PRESETS
 from learn3d.reconstruction import reconstruct_dataset
 
@@ -47,8 +47,8 @@ def make(plane: float | None):
 
 def take_steps(monkeypatch: pytest.MonkeyPatch, code: int, vertices: int) -> None:
     """Let `refine` take this many steps."""
-    monkeypatch.setattr(refinement, "CODE_STEPS", code)
-    monkeypatch.setattr(refinement, "VERTEX_STEPS", vertices)
+    monkeypatch.setattr(mesh_method, "CODE_STEPS", code)
+    monkeypatch.setattr(mesh_method, "VERTEX_STEPS", vertices)
 
 
 @pytest.mark.parametrize("steps", [(60, 0), (0, 30), (15, 15)])

@@ -14,12 +14,17 @@ from vectors import load_vector
 from learn3d import device as precision_module
 from learn3d.device import autocast, resolve_precision
 from learn3d.methods import DatasetInfo, Method, create_method
-from learn3d.networks import ENCODERS, GENERATORS, PoseDiscriminator, create_encoder, network_input
-from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
+from learn3d.networks import ENCODERS, GENERATORS, network_input
+from learn3d.networks.discriminators import (
+    OneHotViewDiscriminator,
+    PatchDiscriminator,
+    SpectralPatchDiscriminator,
+    pose_discriminator,
+)
 from learn3d.networks.encoders import CENTRED_SIZE, EncoderName, PreactResNet18, centre, grey_background
 from learn3d.networks.generators import ConvCubeGenerator, LinearCubeGenerator, deform_sphere
 from learn3d.networks.layers import reverse_gradient
-from learn3d.networks.resnet import FlatResNet18
+from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.networks.voxel_gan import InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
 from learn3d.presets import PRESETS
 
@@ -40,7 +45,7 @@ PUBLISHED: dict[str, tuple[Callable[[], nn.Module], list, list, list]] = {
     "bounded": (GENERATORS["bounded"], [(512, 1024), (1024, 2048), (2048, 1926), (2048, 3)], [], []),
     "cube-conv": (ConvCubeGenerator, [(512, 2048)] * 6, SIDE * 6, [512, 256, 128, 64] * 6),
     "cube-fc": (LinearCubeGenerator, [(512, 4096), (4096, 4096), (4096, 4056)], [], []),
-    "discriminator": (lambda: PoseDiscriminator(24), [(512, 256), (256, 128), (128, 24)], [], []),
+    "discriminator": (lambda: pose_discriminator(24), [(512, 256), (256, 128), (128, 24)], [], []),
     "dcgan": (
         lambda: OneHotViewDiscriminator(24),
         [(16384, 1)],
@@ -100,7 +105,7 @@ def test_layers_are_the_published_ones(name: str) -> None:
 def narrow_encoder(name: str) -> nn.Module:
     if name == "preact":
         return PreactResNet18(96, channels=4)
-    return FlatResNet18(96) if name == "flat" else create_encoder(name, inverted=True)
+    return ResNet18Encoder(flat_size=96) if name == "flat" else ENCODERS[name]()
 
 
 #: A network of small width, the shapes of its inputs (an integer: classes below it), and of its output.
@@ -111,7 +116,7 @@ SMALL: dict[str, tuple[Callable[[], nn.Module], list, tuple[int, ...]]] = {
     "symmetric": (lambda: GENERATORS["sphere-small"](30.0), [(2, 512)], (2, 642, 3)),
     "cube-conv": (lambda: ConvCubeGenerator(channels=16), [(2, 512)], (2, 1352, 3)),
     "cube-fc": (lambda: LinearCubeGenerator("z", channels=32), [(2, 512)], (2, 1352, 3)),
-    "discriminator": (lambda: PoseDiscriminator(24), [(2, 512)], (2, 24)),
+    "discriminator": (lambda: pose_discriminator(24), [(2, 512)], (2, 24)),
     "dcgan": (lambda: OneHotViewDiscriminator(5, channels=4), [(2, 64, 64), 5], (2,)),
     "spectral-patch": (lambda: SpectralPatchDiscriminator(3, channels=4), [(2, 224, 224), (2, 3)], (2, 4, 4)),
     "classes": (lambda: SpectralPatchDiscriminator(3, 4, num_classes=3), [(2, 224, 224), (2, 3), 3], (2, 4, 4)),
@@ -210,7 +215,7 @@ def test_encoders_with_he_weights_tell_images_apart_from_the_start(name: Encoder
         codes = []
         for stored, inverted in ((images, True), (natural, False)):
             torch.manual_seed(seed)
-            codes.append(create_encoder(name, inverted=inverted)(stored))
+            codes.append(ENCODERS[name](inverted)(stored))
         assert codes[0].std(0).norm() > 0.2 * codes[0].mean(0).norm()
         torch.testing.assert_close(*codes)
 
@@ -237,7 +242,7 @@ def test_centred_objects_take_the_same_part_of_the_image() -> None:
         assert np.abs(np.subtract(box(image), (first, first, first + extent, first + extent))).max() <= 1
     assert (centred[1:] - centred[:1]).abs().mean() < 0.02
     torch.manual_seed(0)
-    encoder = create_encoder("conv-centred", inverted=False)
+    encoder = ENCODERS["conv-centred"](inverted=False)
     with torch.no_grad():
         small, large, other = encoder(torch.cat([wedge(30, 3, 30), wedge(60, 2, 2), wedge(60, 2, 2).flip(2)]))
     assert (small - large).norm() < 0.2 * (large - other).norm()

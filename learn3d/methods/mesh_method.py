@@ -1,0 +1,225 @@
+"""What is asked of methods that learn meshes from rendered silhouettes: settings, networks, losses of the surface."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+import nmr
+from learn3d.data.dataset import MASK_SIZE, Batch, DatasetInfo
+from learn3d.data.poses import LookAtPoses, Poses
+from learn3d.data.view_bins import AngleBins
+from learn3d.losses import pose_classification_loss
+from learn3d.methods.method import Meshes, Method, MethodSettings
+from learn3d.networks import (
+    ENCODERS,
+    GENERATORS,
+    EncoderName,
+    GeneratorName,
+    MeshGenerator,
+    SymmetryOption,
+    network_input,
+)
+from learn3d.networks.encoders import ViewClassifier
+from learn3d.networks.resnet import load_pretrained
+from learn3d.settings import FilePath, Positive, checked
+
+AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)  # classes of the view classifier: the azimuth cells of `fitting.fit`
+MIN_COMPACT_SOLIDITY = 0.8  # objects count as compact if the data's solidity is at least this
+CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts a face on the border (0.5) as outside
+
+
+@checked
+class MeshSettings(MethodSettings):
+    """Networks from images to meshes."""
+
+    lambda_view = 0.0  # methods that learn to classify the azimuth of an image make it a field
+
+    encoder: EncoderName = "conv"
+    """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask. conv-light: half the channels,
+    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights. conv-centred: a tenth of the
+    weights, for objects that are all scaled to one size (cameras at unknown distances). conv-relu: conv with a ReLU on
+    the code (Kato et al. 2018). resnet18: on 224-pixel RGB."""
+    generator: GeneratorName = "sphere"
+    """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same; neighbours learn to move
+    together first. auto: sphere-smooth if the training masks are compact, else sphere. sphere-small: sphere with half
+    the weights. bounded: the generator of Kato et al. 2018. cube-conv, cube-fc: 1352 vertices of a cube's surface, from
+    convolutions or from linear layers (Kato and Harada 2019)."""
+    symmetry: SymmetryOption = None
+    """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
+    it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
+    learning_rate: Positive = 1e-4
+    """Adam's learning rate, the same for all networks."""
+    clamp_to_cube: bool = False
+    """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers find
+    no inside in a shape that exceeds their grid."""
+    pretrained: FilePath | None = None
+    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
+    weights). VPL then freezes its batch norms."""
+
+    def __post_init__(self) -> None:
+        if self.pretrained is not None and self.encoder != "resnet18":
+            raise ValueError(
+                f"pretrained weights are for the encoder 'resnet18', got encoder {self.encoder!r}; choose that encoder "
+                "(it takes images of 224 pixels), or leave pretrained out"
+            )
+
+    @property
+    def image_size(self) -> int:
+        return ENCODERS[self.encoder].image_size
+
+    @property
+    def wants_mirror_plane(self) -> bool:
+        return self.symmetry == "auto"
+
+    @property
+    def wants_solidity(self) -> bool:
+        return self.generator == "auto"
+
+    def for_data(self, info: DatasetInfo) -> MeshSettings:
+        plane = info.mirror_plane_deg if self.symmetry == "auto" else self.symmetry
+        sphere = "sphere-smooth" if is_compact(info) else "sphere"
+        generator = sphere if self.generator == "auto" else self.generator
+        return dataclasses.replace(self, symmetry=plane, generator=generator)
+
+
+def is_compact(info: DatasetInfo) -> bool:
+    """Whether the training masks nearly fill their convex hulls; False if that is not known."""
+    return info.solidity is not None and info.solidity >= MIN_COMPACT_SOLIDITY
+
+
+class MeshMethod(Method):
+    """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes.
+
+    A subclass may add a network that classifies the azimuth of an image (`create_view_classifier`, `view_loss`).
+    """
+
+    averages_mirror_images: ClassVar[bool] = False  # whether a code is the mean over an image and its mirror image
+    settings: MeshSettings
+    encoder: nn.Module
+    generator: MeshGenerator
+    view_classifier: nn.Module
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.faces, self.edges = self.generator.faces.cpu(), self.generator.edges.cpu()  # for the renderer
+
+    def create_networks(self) -> dict[str, nn.Module]:
+        encoder = ENCODERS[self.settings.encoder](self.info.inverted)
+        generator = GENERATORS[self.settings.generator](symmetry=self.settings.symmetry)
+        return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
+
+    def create_view_classifier(self) -> dict[str, nn.Module]:
+        """The network "view_classifier", if `lambda_view` is above 0."""
+        if self.settings.lambda_view == 0:
+            return {}
+        classifier = ViewClassifier(AZIMUTHS.count, self.info.inverted)
+        return {"view_classifier": classifier.to(memory_format=torch.channels_last)}
+
+    def start_from_pretrained(self) -> None:
+        if self.settings.pretrained is not None:
+            load_pretrained(self.encoder, self.settings.pretrained)
+
+    def check_batch(self, batch: Batch) -> None:
+        if self.settings.lambda_view > 0 and not isinstance(batch.poses, LookAtPoses):
+            raise ValueError("--lambda-view needs azimuths, and the poses of these data are rotations; leave it out")
+
+    def encode(self, images: Tensor) -> Tensor:
+        codes = self._apply(self.encoder, images)
+        if self.averages_mirror_images and self.generator.mirror is not None:
+            codes = (codes + self._apply(self.encoder, images.flip(3))) / 2
+        return codes
+
+    def decode(self, codes: Tensor) -> Meshes:
+        with self.autocast():
+            vertices = self.generator(codes).cpu()
+        if self.settings.clamp_to_cube and self.info.cube_side is not None:
+            limit = CLAMP_LIMIT * self.info.cube_side
+            vertices = vertices.clamp(-limit, limit)
+        return Meshes(vertices, self.faces)
+
+    def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's device."""
+        with self.autocast():
+            codes = self.encoder(network_input(images, self.device, self.image_size))
+            vertices = self.generator(codes)
+        return codes.float(), vertices
+
+    @torch.no_grad()
+    def view_probabilities(self, images: Tensor) -> Tensor | None:
+        return self._apply(self.view_classifier, images).softmax(1).cpu() if self.settings.lambda_view > 0 else None
+
+    def view_loss(self, images: Tensor, poses: LookAtPoses) -> Tensor:
+        """The loss of the network "view_classifier" on stored images of these poses."""
+        logits = self._apply(self.view_classifier, images)
+        return pose_classification_loss(logits, AZIMUTHS.ids(poses).to(self.device, non_blocking=True))
+
+    def _apply(self, network: nn.Module, images: Tensor) -> Tensor:
+        with self.autocast():
+            return network(network_input(images, self.device, self.image_size)).float()
+
+    def flip_every_second(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Flip every second image if shapes are symmetric: the images, and bool [B], whether each is flipped.
+
+        A flipped image of a symmetric object shows the same shape, so mask and pose stay the same.
+        """
+        flipped = (torch.arange(len(images)) % 2 == 1) & (self.generator.mirror is not None)
+        return torch.where(flipped[:, None, None, None], images.flip(3), images), flipped
+
+    def render(self, vertices: Tensor, poses: Poses) -> Tensor:
+        """Silhouettes float32 [B, 64, 64] of vertices [B, V, 3]. Rendering runs on the CPU."""
+        return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
+
+    def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
+        """The losses smoothness, inflation and area, each only if its weight is above 0."""
+        losses = {
+            "smoothness": (nmr.losses.smoothness_loss, self.edges),
+            "inflation": (nmr.losses.inflation_loss, self.faces),
+            "area": (nmr.losses.area_loss, self.faces),
+        }
+        wanted = {name: parts for name, parts in losses.items() if self.weights.get(name, 0.0) > 0}
+        return {name: loss(vertices, table) for name, (loss, table) in wanted.items()}
+
+
+CODE_STEPS, VERTEX_STEPS = 40, 40  # steps of `refine`
+CODE_LEARNING_RATE = 0.1  # in units of the root mean square of the codes' entries
+VERTEX_LEARNING_RATE = 0.002  # in units of the object frame
+SMOOTHNESS = 0.001  # weight of the smoothness loss, as in the proposed method
+
+
+@torch.no_grad()
+def refine(method: Method, images: Tensor, masks: Tensor, poses: Poses) -> Meshes:
+    """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] at the B cameras of `poses`.
+
+    Adam minimises soft IoU loss + 0.001 smoothness over the codes, which keeps shapes plausible, and then over the
+    vertices. Symmetric shapes stay symmetric. Raises ValueError if the method predicts voxels.
+    """
+    if not isinstance(method, MeshMethod):
+        raise ValueError("only meshes can be fitted to masks, and this run predicts voxels; leave out --refine")
+
+    def decode(codes: Tensor) -> Tensor:
+        with method.autocast():
+            return method.generator(codes.to(method.device, non_blocking=True)).float().cpu()
+
+    @torch.enable_grad()
+    def descend(start: Tensor, shape: Callable[[Tensor], Tensor], learning_rate: float, steps: int) -> Tensor:
+        """The variables after some steps; `shape` computes vertices from them."""
+        values = start.clone().requires_grad_()
+        optimizer = torch.optim.Adam([values], lr=learning_rate)
+        for _ in range(steps):
+            vertices = shape(values)
+            silhouettes = nmr.render_silhouette(vertices, method.faces, poses.cameras(), image_size=masks.shape[-1])
+            fit = nmr.losses.soft_iou_loss(silhouettes, masks)
+            loss = fit + SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
+            (values.grad,) = torch.autograd.grad(loss, values)
+            optimizer.step()
+        return values.detach()
+
+    codes, symmetrized = method.encode(images).cpu(), method.generator.symmetrized
+    codes = descend(codes, decode, CODE_LEARNING_RATE * float(codes.square().mean().sqrt()), CODE_STEPS)
+    vertices = descend(decode(codes), symmetrized, VERTEX_LEARNING_RATE, VERTEX_STEPS)
+    return Meshes(symmetrized(vertices), method.faces)
