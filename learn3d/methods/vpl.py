@@ -132,7 +132,8 @@ class VPL(MeshMethod):
             num_classes = info.num_classes if settings.class_conditional else None
             discriminator = SpectralPatchDiscriminator(info.pose_features, channels, num_classes)
         elif info.num_views < 2:
-            raise ValueError(f"discriminator 'dcgan' tells views by their class and needs two, got {info.num_views}")
+            wanted = "tells views by their class and needs at least 2"
+            raise ValueError(f"discriminator 'dcgan' {wanted}, got {info.num_views}")
         else:
             discriminator = OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
         return networks | {"discriminator": discriminator}
