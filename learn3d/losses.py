@@ -102,18 +102,16 @@ def mmd(xx: Tensor, yy: Tensor, xy: Tensor, form: Literal["released", "paper"] =
     rows = 2 * xx.shape[0]
     width = ((xx.sum() + yy.sum() + 2 * xy.sum()) / (rows * rows - rows)).detach()
     width = width.clamp_min(1e-30)  # all codes equal: every kernel is 1, the MMD is 0
-    if form == "released":
-        means = [_five_kernels(d, width).mean() for d in (xx, yy, xy)]
-        return means[0] + means[1] - 2 * means[2]
-    means = [torch.exp(-d / width).mean() for d in (xx, yy, xy)]
-    return (means[0] + means[1] - 2 * means[2]).clamp_min(0).sqrt()
 
+    def mean_kernel(distances: Tensor) -> Tensor:
+        if form == "paper":
+            return torch.exp(-distances / width).mean()
+        kernel = torch.exp(-distances / (4 * width))  # the widest; squaring it gives the next
+        total = kernel
+        for _ in range(4):
+            kernel = kernel.square()
+            total = total + kernel
+        return total.mean()
 
-def _five_kernels(distances: Tensor, bandwidth: Tensor) -> Tensor:
-    """sum_i exp(-d / (b 2^i)), i = -2..2, of squared distances d."""
-    kernel = torch.exp(-distances / (4 * bandwidth))  # the widest; squaring it gives the next
-    total = kernel
-    for _ in range(4):
-        kernel = kernel.square()
-        total = total + kernel
-    return total
+    value = mean_kernel(xx) + mean_kernel(yy) - 2 * mean_kernel(xy)
+    return value if form == "released" else value.clamp_min(0).sqrt()

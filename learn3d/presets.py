@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Augmentation, Sampling
@@ -33,30 +33,21 @@ class Preset:
     ema_decay: float = 0.0
 
 
-class NamedMethod(NamedTuple):
-    """A method with a short name."""
-
-    preset: str  # its preset for Kato's data
-    summary: str  # a line for `learn3d train --help`
-
-
-#: Short names of the methods, accepted wherever a preset is.
+#: Short names of the methods, accepted wherever a preset is: the preset for Kato's data, and a line for `train --help`.
 METHODS = {
-    "plus": NamedMethod("plus-kato", "the default: proposed, with mirror symmetry and a loss at novel views"),
-    "proposed": NamedMethod("peng2020-kato", "pose-invariant codes from single views (Peng et al. 2020)"),
-    "vanilla": NamedMethod("peng2020-kato-vanilla", "encoder and mesh generator alone, on single views"),
-    "multi-view": NamedMethod("kato2018-kato", "vanilla on pairs of views of an object (Kato et al. 2018)"),
-    "many-views": NamedMethod(
-        "many-views-kato", "multi-view supervision: a shape must explain five views of its object"
-    ),
-    "vpl": NamedMethod("peng2020-kato-vpl", "view prior learning: novel views must look real (Kato and Harada 2019)"),
-    "prgan": NamedMethod("gadelha2017-kato", "a GAN of voxel grids, then an encoder (PrGAN, Gadelha et al. 2017)"),
+    "plus": ("plus-kato", "the default: proposed, with mirror symmetry and a loss at novel views"),
+    "proposed": ("peng2020-kato", "pose-invariant codes from single views (Peng et al. 2020)"),
+    "vanilla": ("peng2020-kato-vanilla", "encoder and mesh generator alone, on single views"),
+    "multi-view": ("kato2018-kato", "vanilla on pairs of views of an object (Kato et al. 2018)"),
+    "many-views": ("many-views-kato", "multi-view supervision: a shape must explain five views of its object"),
+    "vpl": ("peng2020-kato-vpl", "view prior learning: novel views must look real (Kato and Harada 2019)"),
+    "prgan": ("gadelha2017-kato", "a GAN of voxel grids, then an encoder (PrGAN, Gadelha et al. 2017)"),
 }
 
 
 def full_name(name: str) -> str:
     """The name of a preset, given that name or the short name of a method. Raises ValueError for other names."""
-    preset = METHODS[name].preset if name in METHODS else name
+    preset = METHODS[name][0] if name in METHODS else name
     if preset not in PRESETS:
         raise ValueError(unknown_name("preset", name, [*METHODS, *PRESETS]))
     return preset
@@ -121,8 +112,6 @@ _KAR_VPL = VPLSettings(
     **_VPL,
     encoder="preact-resnet18",
     generator="cube-conv",
-    vertex_scale=0.01,
-    object_scale=0.5,
     discriminator="spectral-patch",
     discriminator_channels=32,
     other_views="reversed",
@@ -142,7 +131,6 @@ _PASCAL_VPL = VPLSettings(
     discriminator="patch",
     discriminator_channels=64,
     other_views="next",
-    silhouette_loss="iou",
     learning_rate=2e-5,
     lambda_inflation=3e-5,
     lambda_discriminator=0.5,

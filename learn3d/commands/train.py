@@ -35,7 +35,7 @@ class Train(Command):
 
     @classmethod
     def about(cls, everything: bool) -> str:
-        lines = ["Methods (--preset NAME):", *(f"  {name:10}  {method.summary}" for name, method in METHODS.items())]
+        lines = ["Methods (--preset NAME):", *(f"  {name:10}  {summary}" for name, (_, summary) in METHODS.items())]
         if everything:
             lines += ["", "Presets (--preset NAME --help-all shows the settings of one):"]
             lines += [f"  {name:23}  {preset.label}; {preset.source}" for name, preset in PRESETS.items()]

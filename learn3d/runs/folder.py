@@ -3,7 +3,7 @@
 config.json           options; the first file of a run
 last.safetensors      last checkpoint, with all that --resume needs; never incomplete
 previous.safetensors  the checkpoint before it
-best.safetensors      networks with the best validation IoU, see `validation.validate`
+best.safetensors      networks with the best validation IoU, see `training.validate`
 metrics.jsonl         losses and metrics
 tensorboard/, metrics.csv or wandb.txt (id of the run at Weights & Biases), by --log
 pictures/             picture grids of validation images

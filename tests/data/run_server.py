@@ -56,13 +56,13 @@ def serve() -> None:
     import tiny_networks
     import torch.utils.tensorboard  # noqa: F401
 
-    from learn3d import training, validation
+    from learn3d import training
     from learn3d.config import config_from_dict
     from learn3d.runs.checkpoint import versions
 
     versions()  # once for all runs, so that a commit made during the tests does not tell them apart
     tiny_networks.put_in_place()
-    validation.PICTURE_ROWS = 1
+    training.PICTURE_ROWS = 1
     read, sets = training.load_splits, None
     for line in sys.stdin:
         sets = sets or read(config_from_dict(json.loads(line)["config"]))  # once, and not in every copy

@@ -16,7 +16,7 @@ import time
 
 import tiny_networks
 
-from learn3d import training, validation
+from learn3d import training
 from learn3d.config import config_from_dict
 from learn3d.runs import log
 
@@ -43,6 +43,6 @@ if __name__ == "__main__":
     config = config_from_dict(json.loads(sys.argv[1]))
     Soaked.every = int(sys.argv[2])
     tiny_networks.put_in_place()
-    validation.PICTURE_ROWS = 1
+    training.PICTURE_ROWS = 1
     training.RunLog = Soaked
     training.train(config)

@@ -14,7 +14,7 @@ import pytest
 import tiny_networks
 import torch
 
-from learn3d import commands, validation
+from learn3d import commands, training
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
@@ -141,7 +141,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 def small_picture_grids() -> Iterator[None]:
     """Two rows instead of eight in the grids that a run draws."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(validation, "PICTURE_ROWS", 2)
+        patch.setattr(training, "PICTURE_ROWS", 2)
         yield
 
 

@@ -16,7 +16,6 @@ FLOORS = (
     {"pages", "demo"},
     {"experiments"},
     {"training", "reconstruction"},
-    {"validation"},
     {"figures"},
     {"evaluation"},
     {"make_data"},

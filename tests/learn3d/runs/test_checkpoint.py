@@ -41,7 +41,7 @@ def test_load_method_opens_a_run_for_use(finished_run) -> None:
     tensors, _ = checkpoint.load(finished_run / "last.safetensors")
     assert torch.equal(method.networks["encoder"].layers[0].weight, tensors["network.encoder.layers.0.weight"])
     assert not any(p.requires_grad for network in method.networks.values() for p in network.parameters())
-    assert not method.training
+    assert not method.networks.training
     assert (config.category, about.progress.step) == ("airplane", 4)
     assert about.versions["torch"] == torch.__version__
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from runs import check_same
 
-from learn3d import training, validation
+from learn3d import training
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.runs import checkpoint, log
 from learn3d.training import train
@@ -72,7 +72,7 @@ def test_full_disk_while_a_checkpoint_is_written(tiny_run, undisturbed, run_fold
 def test_a_disk_that_fails_stops_the_run_and_it_goes_on(
     tiny_run, undisturbed, run_folder, monkeypatch, what: str
 ) -> None:
-    broken = {"metrics": (log.json, "dumps"), "pictures": (validation, "save_png"), "sync": (os, "fsync")}[what]
+    broken = {"metrics": (log.json, "dumps"), "pictures": (training, "save_png"), "sync": (os, "fsync")}[what]
     with monkeypatch.context() as patch:
         before_step(patch, 4, lambda: patch.setattr(*broken, full))
         with pytest.raises(OSError, match=r"No space left on device .*last good checkpoint is .*last.safetensors"):

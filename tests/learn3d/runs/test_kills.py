@@ -19,7 +19,7 @@ from run_server import ENVIRONMENT, RunServer
 from runs import check_same
 
 import learn3d
-from learn3d import validation
+from learn3d import training
 from learn3d.config import TrainConfig
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -136,7 +136,7 @@ def test_signals_at_any_time(server, killed_config, uninterrupted) -> None:
 
 @pytest.mark.slow
 def test_the_command_killed_at_any_time(killed_config, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(validation, "PICTURE_ROWS", 8)  # as the command draws them
+    monkeypatch.setattr(training, "PICTURE_ROWS", 8)  # as the command draws them
     reference = dataclasses.replace(killed_config, output=tmp_path / "uninterrupted")
     train(reference)
     names = ("iterations", "seed", "batch_size", "precision", "threads", "max_val_images")
