@@ -12,8 +12,7 @@ from scipy import ndimage
 
 import nmr
 from learn3d.shapes import CATEGORIES, make_shape, parts
-from learn3d.shapes.draw import ellipse, rectangle
-from learn3d.shapes.parts import Part, assemble, bar, box
+from learn3d.shapes.parts import Part, assemble, bar, box, ellipse, rectangle
 
 every_category = pytest.mark.parametrize("category", CATEGORIES)
 
