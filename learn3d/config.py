@@ -1,7 +1,5 @@
 """The options of a training run: a frozen dataclass with defaults from a preset, its checks and its JSON form."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import typing

@@ -1,7 +1,5 @@
 """Device and precision of the networks, and memory allocation."""
 
-from __future__ import annotations
-
 import ctypes
 from pathlib import Path
 from typing import Literal

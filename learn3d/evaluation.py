@@ -1,7 +1,5 @@
 """Voxel IoU, silhouette IoU, surface distances and pose invariance (MMD) of a trained method on one split."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Losses on shape codes, pose logits, silhouettes and depth, and the MMD, all in float32. See also nmr.losses."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Presets: default options of each experiment. Names are <publication or method>-<data set>[-<variant>]."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Reconstruction: from images with masks to mesh files and pictures of them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence

@@ -8,8 +8,6 @@
 Values are never converted: "1" and true are not numbers. NaN and infinity are refused.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 from collections.abc import Callable

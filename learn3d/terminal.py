@@ -1,7 +1,5 @@
 """The terminal: errors and lines of a command, and signals that stop it."""
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import functools

@@ -1,7 +1,5 @@
 """The training loop: configuration, data, networks, steps, validation, checkpoints."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import time

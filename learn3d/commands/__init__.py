@@ -3,8 +3,6 @@
 torch takes seconds to import. So it is imported inside of `main`, which handles Ctrl-C.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import sys

@@ -4,8 +4,6 @@ tyro parses the command line and writes the help. If a field holds a dataclass, 
 default means "not given", the help text explains it in parentheses: "(default: ...)".
 """
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import typing

@@ -1,7 +1,5 @@
 """Commands on data sets: fetch meshes, make, convert and check a data set, estimate its poses."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands on trained models: measure, show and export them, reconstruct images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

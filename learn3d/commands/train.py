@@ -1,7 +1,5 @@
 """`learn3d train` and `learn3d experiment`."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path

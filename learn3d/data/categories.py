@@ -1,7 +1,5 @@
 """The 13 ShapeNet categories of Kato's data set, the splits, and the names of their files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 SPLITS = ("train", "val", "test")

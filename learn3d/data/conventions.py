@@ -6,8 +6,6 @@ is then converted to the axes of the stored ground truth. Sources: the published
 docs/methods/README.md.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Loads and checks data sets by the name of their layout."""
 
-from __future__ import annotations
-
 import contextlib
 import shlex
 from collections.abc import Sequence

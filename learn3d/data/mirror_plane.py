@@ -5,8 +5,6 @@ at the same elevation. So the mean mask of the views around 2 p - a, flipped lef
 a. This needs no symmetry of a single object and no two views of one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset

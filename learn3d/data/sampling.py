@@ -4,8 +4,6 @@ They depend on the data set, the seed, the step and the weights of the candidate
 weights.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence

@@ -17,8 +17,6 @@ Its metadata are the names of the objects, and a CRC-32 of names and tables. The
 alone. Axes and colours are those of the layout (`kato`, `kar` ...).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

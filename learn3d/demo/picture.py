@@ -1,7 +1,5 @@
 """Turns the pixels that a browser sends into a mask and meshes, with a message for each step; example pictures."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Callable, Mapping

@@ -3,8 +3,6 @@
 Other web pages in the same browser cannot use it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ipaddress

@@ -4,8 +4,6 @@ Our values are not subtracted from the paper's, which are for other meshes. Inte
 bootstrap, intervals over seeds by Student's t.
 """
 
-from __future__ import annotations
-
 import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`learn3d experiment`: plan the runs of a table, train and test the missing ones, write the report."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Measures trained networks on a split, for `learn3d evaluate` and for experiments."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple

@@ -1,7 +1,5 @@
 """Plans the training runs of a table: their names, folders and options."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shlex

@@ -4,8 +4,6 @@ A new table is a new entry of `TABLES`, and a line of tables.csv for each row. R
 variant share their runs. Categories have the names of this package: the paper's "Dresser" is ShapeNet's cabinet.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Pictures of shapes in rows: the grid shown during training, the comparison of runs, and interpolations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

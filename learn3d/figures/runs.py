@@ -1,7 +1,5 @@
 """Opens runs for figures and pages: the trained method, a data set and a label of each."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

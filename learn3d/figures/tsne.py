@@ -1,7 +1,5 @@
 """The paper's t-SNE maps of shape codes, coloured by the view."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from pathlib import Path

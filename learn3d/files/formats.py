@@ -1,7 +1,5 @@
 """Reads untrusted meshes, voxel grids and pretrained weights in the sandbox."""
 
-from __future__ import annotations
-
 import io
 import os
 from dataclasses import dataclass

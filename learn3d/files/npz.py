@@ -4,8 +4,6 @@ NumPy stores object arrays, for example images of different sizes, as pickles. H
 that make NumPy arrays, so it cannot run other code.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import os

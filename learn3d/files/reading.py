@@ -3,8 +3,6 @@
 A fault is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError), whose message names the file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import stat

@@ -1,7 +1,5 @@
 """Decodes untrusted images with Pillow in the sandbox, and reads the renderings of data sets."""
 
-from __future__ import annotations
-
 import functools
 import io
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ with the name of the file, and a dead worker is replaced. This module imports ne
 starts in a tenth of a second. It needs a POSIX system.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import math

@@ -1,7 +1,5 @@
 """Writes files and folders atomically: they appear complete or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

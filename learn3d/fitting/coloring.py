@@ -3,8 +3,6 @@
 Hidden parts get blurred colours of their neighbours. Each face has a triangle of its own in the texture image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Masks of photographs without one: by the colour of a plain background, or by GrabCut (OpenCV)."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np

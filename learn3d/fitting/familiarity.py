@@ -1,7 +1,5 @@
 """Predicts the category of a picture, and whether it is an unknown object, by comparing its code with known ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import NamedTuple
 

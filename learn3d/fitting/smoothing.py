@@ -1,7 +1,5 @@
 """Finer, smoother meshes: divided edges, sharp edges, and the outer surface of meshes that cross themselves."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A template has the thin legs, gaps and straight edges that a deformed sphere can
 templates; the shapes themselves are made again from their numbers.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Settings of `learn3d make-dataset`, and the meshes of each split: of a folder, of a mesh pack, or generated."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Makes a data set from meshes: scales, colours and renders them. `writers` has cameras and files by layout."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Methods, one file each with its own training step; `create_method` builds the method of given settings."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

@@ -4,8 +4,6 @@ Multi-view is Vanilla-AE as Kato et al. 2018 published it: the shape of each of 
 the shape of one image must explain other views of its object, whose depth is used if it is known.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

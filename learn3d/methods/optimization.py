@@ -1,7 +1,5 @@
 """Optimization in every method: learning-rate schedules, EMA, Adam, and the step from losses to gradients."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator, Mapping

@@ -3,8 +3,6 @@
 The supervision is that of Peng et al. 2020: single images, each with its mask and its pose.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

@@ -4,8 +4,6 @@ A discriminator learns to separate silhouettes of predicted shapes at the view o
 at other views ("fake"); encoder and generator learn to fool it. docs/methods/vpl.md has the equations.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Annotated, Literal

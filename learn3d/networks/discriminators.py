@@ -4,8 +4,6 @@ Those of silhouettes take silhouettes float [B,S,S] and their views, and return 
 view of the input image".
 """
 
-from __future__ import annotations
-
 import itertools
 
 import torch

@@ -1,7 +1,5 @@
 """Image encoders: images -> shape codes."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Mesh generators, shape codes -> vertices: deformed spheres and cubes, with mirror symmetry about a vertical plane."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Parts that several networks share: layers, initial weights, gradient reversal."""
 
-from __future__ import annotations
-
 import itertools
 
 from torch import Tensor, nn

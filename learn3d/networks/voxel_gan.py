@@ -8,8 +8,6 @@ view that is a linear map from voxels to pixels. Here it is a sparse matrix, fiv
 and backward on one core (40 ms for a batch of 16 instead of 200).
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

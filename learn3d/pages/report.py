@@ -1,7 +1,5 @@
 """Writes one HTML file about trained runs: their settings and curves, their IoU, and meshes to turn by hand."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Sequence

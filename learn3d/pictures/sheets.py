@@ -1,7 +1,5 @@
 """Pictures in rows and columns with titles, image files, and the contact sheet of a data set."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Collection, Mapping, Sequence

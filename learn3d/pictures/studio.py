@@ -1,7 +1,5 @@
 """Pictures of meshes for data sets and figures: studio lights, white background."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Pictures of reconstructed shapes, and the cameras around them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple

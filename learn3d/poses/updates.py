@@ -5,8 +5,6 @@ and the table's probability give the weights. As all images share the networks, 
 is still predicted in the frame of the others, so its IoU is best at the right pose.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

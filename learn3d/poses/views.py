@@ -1,7 +1,5 @@
 """Estimates the poses of all images of a data set, compares them with true poses, and draws a sheet of them."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The header has two entries: "learn3d", the JSON of `Metadata`, and "crc32", the 
 dtypes, shapes and bytes of all tensors.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib.metadata

@@ -1,7 +1,5 @@
 """Export: the encoder and generator of a run in one small file to share."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -10,8 +10,6 @@ pictures/             picture grids of validation images
 .lock                 lock of the process that works here; .<name>.partial: a file being written
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shlex

@@ -1,7 +1,5 @@
 """The log of a run: progress on the terminal, metrics.jsonl, and CSV, TensorBoard or Weights & Biases."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import importlib.util

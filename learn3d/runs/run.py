@@ -1,7 +1,5 @@
 """A run: its state, saved and restored bit-identically, the first lines of its log and its summary."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path

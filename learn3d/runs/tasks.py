@@ -4,8 +4,6 @@ A task is a function call that writes files and continues from them when it is c
 `run_tasks` is resumed by the same call.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

@@ -4,8 +4,6 @@ Threads synchronise hundreds of times a step. If cores are oversubscribed, a ste
 as long as with one; on an idle machine it takes a fraction. So both are measured.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 from collections import deque

@@ -5,8 +5,6 @@ of view in 14 .. 40 degrees, and see the whole object. Every view has a depth ma
 classes are 24 cells of azimuth.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NoReturn
 

@@ -14,8 +14,6 @@ There are no voxels: measure with the points (Chamfer distance, F-score). Kato's
 objects may have another order than the lists.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -20,8 +20,6 @@ Deviations from the published code of Peng et al. 2020 are marked (*):
 - Three objects with broken renders are skipped, as by Kato and Harada 2019 (*).
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

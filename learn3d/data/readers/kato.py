@@ -7,8 +7,6 @@
 - Voxel axes (1, 2, 3) are (y, x, -z) of the object frame, and the box [-0.5, 0.5] fills cells 0.5 .. 31.5 of the grid.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -13,8 +13,6 @@
 - Objects lie in [-1, 1], upright and mirror-symmetric about z = 0. Voxels are 32^3 over the same box.
 """
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

@@ -8,8 +8,6 @@
 `docs/your-own-category.md` defines angles and distances with a drawing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import hashlib

@@ -18,8 +18,6 @@ the side 1 for meshes of any size. If so, predictions and voxels differ in size:
 with those on another.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Shared functions of the readers kar, r2n2 and dvr: read the files of many objects, and join them to arrays."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ trimesh does not read AC3D. From OBJ it makes a fan of each polygon, which fills
 the backs of some chairs.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 

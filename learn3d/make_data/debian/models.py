@@ -5,8 +5,6 @@
 packages give the same bytes.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 import subprocess

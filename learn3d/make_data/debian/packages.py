@@ -4,8 +4,6 @@ A catalogue (.sh3f) is a zip archive with a properties file (name#N, model#N, mo
 model. AI aircraft are AC3D files (.ac) with XML files beside them.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import zipfile

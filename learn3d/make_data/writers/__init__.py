@@ -1,7 +1,5 @@
 """Writers of data sets, one for each layout."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from learn3d.make_data.writers.kato import AROUND, DVR, KATO

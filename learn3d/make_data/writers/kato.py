@@ -1,7 +1,5 @@
 """Writes Kato's renderings: in his files and in those of DVR's copy; also shards of views from all sides."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Writes renderings on photo-like backgrounds: Pascal3D+ as packed by Kato and Harada 2019, and photo folders."""
 
-from __future__ import annotations
-
 import csv
 import functools
 from collections.abc import Iterable

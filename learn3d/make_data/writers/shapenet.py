@@ -1,7 +1,5 @@
 """Writes renderings in the layouts of Kar et al. 2017 and of 3D-R2N2, with a folder for each object."""
 
-from __future__ import annotations
-
 import functools
 import io
 import itertools

@@ -1,7 +1,5 @@
 """The description of a layout that can be written, and shared functions: random cameras, PNG files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
