@@ -1,0 +1,118 @@
+"""Measure nmr beside deodr, PyTorch3D, Open3D and Mesa (through pyrender), each if it is installed, one thread each.
+
+Prints a table in Markdown: medians in milliseconds, with the backward pass for the two renderers that have one. Stops
+if the images differ. PYOPENGL_PLATFORM=egl takes EGL instead of OSMesa.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from bench import FAR, Work, check_same, deodr, spheres, time_by_turns, time_passes
+from torch import Tensor
+
+import nmr
+from learn3d.device import keep_freed_memory
+
+Draw = Callable[[Tensor], Tensor]  # images [1, S, S] of vertices [1, V, 3] in world space
+
+
+def pytorch3d_soft(work: Work) -> tuple[Draw, Draw]:
+    """Soft silhouettes by nmr and by PyTorch3D, whose x axis points to the left."""
+    from pytorch3d.renderer.mesh.rasterize_meshes import rasterize_meshes
+    from pytorch3d.structures import Meshes
+
+    sigma, faces_per_pixel = 1e-4, 50
+    blur, flip = math.log(1 / 1e-4 - 1) * sigma, torch.tensor([-1.0, 1.0, 1.0])
+
+    def ours(vertices: Tensor) -> Tensor:
+        return nmr.render_soft_silhouette(vertices, work.faces, work.camera, sigma=sigma, image_size=work.size)
+
+    def theirs(vertices: Tensor) -> Tensor:
+        meshes = Meshes(work.camera.transform(vertices) * flip, work.faces.expand(len(vertices), -1, -1))
+        found, _, _, distances = rasterize_meshes(meshes, work.size, blur, faces_per_pixel)
+        return 1 - (1 - torch.sigmoid(-distances / sigma) * (found >= 0)).prod(-1)
+
+    return ours, theirs
+
+
+def in_camera(work: Work) -> tuple[np.ndarray, float]:
+    """Vertices in camera axes (x right, y up, z away), and the tangent of half the field of view."""
+    tangent = math.tan(math.radians(float(work.camera.half_fov_deg)))
+    points = work.camera.transform(work.vertices)[0].double()
+    points[:, :2] *= points[:, 2:] * tangent
+    return points.float().numpy(), tangent
+
+
+def open3d_rays(work: Work) -> tuple[Draw, Draw]:
+    """Depth by nmr and by Open3D's ray caster, whose bounding boxes are built before the measurement."""
+    import open3d
+
+    points, tangent = in_camera(work)
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(points, work.faces.numpy().astype(np.uint32))
+    centres = ((np.arange(work.size) + 0.5) * 2 / work.size - 1) * tangent
+    rays = np.zeros((work.size, work.size, 6), dtype=np.float32)
+    rays[..., 3], rays[..., 4], rays[..., 5] = centres[None], -centres[:, None], 1
+
+    def theirs(_: Tensor) -> Tensor:
+        hits = scene.cast_rays(open3d.core.Tensor(rays), nthreads=1)["t_hit"]
+        return torch.from_numpy(hits.numpy()).clamp(max=FAR)[None]
+
+    return work.draw, theirs
+
+
+def mesa(work: Work) -> tuple[Draw, Draw]:
+    """Depth by nmr and by Mesa behind pyrender. The mesh is uploaded before the measurement."""
+    os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
+    import pyrender
+
+    points, tangent = in_camera(work)
+    mesh = pyrender.Primitive(positions=points * np.float32([1, 1, -1]), indices=work.faces.flip(1).numpy())
+    scene = pyrender.Scene()
+    scene.add(pyrender.Mesh([mesh]))
+    scene.add(pyrender.PerspectiveCamera(2 * math.atan(tangent), znear=0.1, zfar=FAR, aspectRatio=1.0))
+    renderer = pyrender.OffscreenRenderer(work.size, work.size)
+
+    def theirs(_: Tensor) -> Tensor:
+        depth = torch.from_numpy(renderer.render(scene, flags=pyrender.RenderFlags.DEPTH_ONLY).copy())
+        return torch.where(depth > 0, depth, FAR)[None]
+
+    return work.draw, theirs
+
+
+#: Name of each peer: the function that makes both programs, and options of `spheres`.
+PEERS: dict[str, tuple[Callable[[Work], tuple[Draw, Draw]], dict[str, Any]]] = {
+    "deodr": (lambda work: (work.draw, deodr(work)), {"subdivisions": 3, "size": 256}),
+    "PyTorch3D": (pytorch3d_soft, {"subdivisions": 3, "size": 64}),
+    "Open3D": (open3d_rays, {"subdivisions": 4, "size": 512, "output": "depth"}),
+    "Mesa": (mesa, {"subdivisions": 4, "size": 512, "output": "depth"}),
+}
+
+
+def main(repeats: int = 15) -> None:
+    print("| one thread, milliseconds | peer | nmr | |\n|---|---|---|---|")
+    for peer, (make, options) in PEERS.items():
+        work = spheres(batch=1, anti_aliasing=False, **options)
+        try:
+            ours, theirs = make(work)
+        except Exception as error:  # libraries behind bindings fail in their own ways
+            print(f"| ({peer}: {type(error).__name__}, {str(error).splitlines()[0]}) | | | |")
+            continue
+        check_same(peer, ours(work.vertices), theirs(work.vertices))
+        gradients = work.output == "alpha"
+        then = (lambda images: (images - 0.5).square().mean().backward()) if gradients else id
+        run = partial(time_passes, 1, gradients=gradients)
+        programs = {name: partial(run, draw, then, work.vertices) for name, draw in (("a", theirs), ("b", ours))}
+        a, b = (1e3 * float(np.median([total for _, total in times])) for times in time_by_turns(programs, repeats))
+        print(f"| {work}{', with gradient' * gradients} | {peer} {a:.1f} | {b:.1f} | {a / b:.1f} times |", flush=True)
+
+
+if __name__ == "__main__":
+    keep_freed_memory()
+    tyro.cli(main, description=__doc__)
