@@ -1,6 +1,7 @@
-"""tools/bench/bench.py: every program does the same work, and each workload runs."""
+"""tools/bench: every program does the same work, and each workload runs."""
 
 import importlib.util
+import re
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
@@ -12,6 +13,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools" / "bench"))
 
 import bench
+import peers
 
 
 @pytest.mark.skipif(importlib.util.find_spec("deodr") is None, reason="deodr is not installed")
@@ -52,3 +54,17 @@ def test_every_kind_of_colour_draws_its_own_image_and_reaches_its_values(kind):
     assert torch.equal(inner, torch.ones_like(inner)) == (kind == "white")
     unlit = bench.spheres(2, 3, 32, output="rgb", colors="uv")
     assert torch.equal(image.detach(), unlit.draw(work.vertices)) == (kind == "uv")
+
+
+def test_peers_are_timed_if_they_are_installed_and_draw_the_same(monkeypatch, capsys) -> None:
+    def absent(work: bench.Work) -> None:
+        raise ModuleNotFoundError("No module named 'absent'")
+
+    same, options = (lambda work: (work.draw, work.draw)), {"subdivisions": 1, "size": 32}
+    monkeypatch.setattr(peers, "PEERS", {"itself": (same, options), "absent": (absent, options)})
+    peers.main(repeats=1)
+    rows = r"80 faces, 32x32, with gradient \| itself [\d.]+ \| [\d.]+ \| .*\n\| \(absent: ModuleNotFoundError"
+    assert re.search(rows, capsys.readouterr().out)
+    monkeypatch.setattr(peers, "PEERS", {"other": (lambda work: (work.draw, torch.zeros_like), options)})
+    with pytest.raises(SystemExit, match="nmr and other draw different images"):
+        peers.main(repeats=1)
