@@ -65,6 +65,7 @@ def test_peers_are_timed_if_they_are_installed_and_draw_the_same(monkeypatch, ca
     peers.main(repeats=1)
     rows = r"80 faces, 32x32, with gradient \| itself [\d.]+ \| [\d.]+ \| .*\n\| \(absent: ModuleNotFoundError"
     assert re.search(rows, capsys.readouterr().out)
-    monkeypatch.setattr(peers, "PEERS", {"other": (lambda work: (work.draw, lambda _: torch.zeros(1, 32, 32)), options)})
+    other = (lambda work: (work.draw, lambda _: torch.zeros(1, 32, 32))), options
+    monkeypatch.setattr(peers, "PEERS", {"other": other})
     with pytest.raises(SystemExit, match="nmr and other draw different images"):
         peers.main(repeats=1)
