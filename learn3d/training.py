@@ -1,12 +1,10 @@
 """The training loop: configuration, data, networks, steps, validation, checkpoints."""
 
 import dataclasses
-import functools
 import time
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
@@ -16,7 +14,7 @@ from learn3d.methods import MeshMethod, Method, create_method
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.updates import update_poses, update_steps
 from learn3d.runs import folder as run_folder
-from learn3d.runs.checkpoint import Progress
+from learn3d.runs.checkpoint import Progress, load_data
 from learn3d.runs.log import RunLog, check_log
 from learn3d.runs.run import Run, Summary, describe_images
 from learn3d.runs.threads import ThreadTuner
@@ -99,10 +97,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
 
 def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
     """The training and the validation split of a run."""
-    options = {"image_size": config.settings.image_size, "view_bins": config.view_bins, "poses": config.poses}
-    load = functools.partial(load_dataset, config.layout, config.data, config.category, **options)
-    train_set = load("train", views_per_object=config.views_per_object)
-    return train_set, load(config.val_split)
+    return load_data(config, "train"), load_data(config, config.val_split)
 
 
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:

@@ -42,10 +42,12 @@ def versions() -> dict[str, str | None]:
 
 def _git_commit() -> str | None:
     """The commit that the package was built from, or of the checkout of this file ("-dirty" if it has changes)."""
-    built_from = Path(__file__).parents[1] / "commit.txt"  # CMakeLists.txt writes it
-    if built_from.exists():
+    built_from, sources = Path(__file__).parents[1] / "commit.txt", Path(__file__).parents[2]
+    if built_from.exists():  # CMakeLists.txt wrote it
         return built_from.read_text().strip() or None
-    command = ["git", "-C", str(built_from.parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    if not (sources / ".git").exists():  # a copy of the sources, perhaps inside of another repository
+        return None
+    command = ["git", "-C", str(sources), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):

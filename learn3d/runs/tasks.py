@@ -38,7 +38,7 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int = 1) -> dict[str, str]:
     """Run `tasks`, at most `jobs` at a time; return the end of the log of every failed task, by the task's name.
 
     A failing task does not stop the others. After SIGINT, SIGTERM or SIGHUP no task is started, and each running one
-    saves its state and ends. Raises OSError if a log cannot be written.
+    saves its state and ends.
     """
     waiting, running, failed = list(tasks), {}, {}
     with stop_on_signal() as asked:
@@ -46,7 +46,11 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int = 1) -> dict[str, str]:
             while (waiting or running) and not asked.name:
                 while waiting and len(running) < jobs:
                     task = waiting.pop(0)
-                    running[_start(task)] = task
+                    try:
+                        running[_start(task)] = task
+                    except OSError as error:  # its log cannot be written
+                        failed[task.name] = str(error)
+                        note(f"{task.name}: failed; {error}")
                 time.sleep(0.1)
                 for process in [process for process in running if process.poll() is not None]:
                     task, status = running.pop(process), process.wait()
@@ -93,6 +97,7 @@ def _stop_with_parent() -> None:
 
 def _tail(log: Path, status: int) -> str:
     """The last lines of a task's log, and the signal that ended its process."""
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()] or ["..."]
+    text = log.read_text(errors="replace") if log.is_file() else ""
+    lines = [line.strip() for line in text.splitlines() if line.strip()] or ["..."]
     ended = [f"(ended by {signal.Signals(-status).name})"] if status < 0 else []
     return "\n".join(lines[-TAIL_LINES:] + ended)

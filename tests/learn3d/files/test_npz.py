@@ -62,7 +62,7 @@ def test_what_numpy_writes_is_read_and_can_be_changed(tmp_path, dtype, order):
 def test_names_and_arrays_with_items(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, a=np.arange(6), images=object_array(*IMAGES), boxes=np.ones((2, 4)))
-    assert sandbox.read(npz.keys, path) == ["a", "images", "boxes"]
+    assert sandbox.read(npz.names, path) == ["a", "images", "boxes"]
     assert [array.shape for array in sandbox.read(npz.read_several, path, ["boxes", "a"])] == [(2, 4), (6,)]
     found = sandbox.read(npz.read_ragged, path, "images", {"boxes": 32})
     assert found[0][1] == [(3, 2, 3), (20, 7, 3)] and found[1].shape == (2, 4)

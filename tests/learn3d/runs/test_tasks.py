@@ -41,13 +41,15 @@ def begun(folder: Path, *names: str) -> bool:
 
 
 def test_tasks_of_all_kinds(tmp_path, capsys) -> None:
-    failed = run_tasks(tasks(tmp_path, "a", "fails", "dies", "b", "c"), jobs=2)
-    assert set(failed) == {"fails", "dies"}
+    no_log = Task("no log", stub_work.steps, (), tmp_path)
+    failed = run_tasks([no_log, *tasks(tmp_path, "a", "fails", "dies", "b", "c")], jobs=2)
+    assert set(failed) == {"no log", "fails", "dies"}
+    assert "Is a directory" in failed["no log"]
     assert "error: no such thing" in failed["fails"]
     assert "(ended by SIGKILL)" in failed["dies"]
     assert finished(tmp_path, "a", "b", "c")
     said = capsys.readouterr().err.splitlines()
-    assert len(said) == 5 and said[-1].startswith("[5/5] ")
+    assert len(said) == 6 and said[-1].startswith("[6/6] ")
 
 
 def test_an_interruption_lets_tasks_save_and_the_next_call_goes_on(tmp_path, capsys) -> None:
