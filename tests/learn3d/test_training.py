@@ -166,9 +166,9 @@ def test_resume_refuses_another_mirror_plane(tiny_config, finished_run, monkeypa
 
 def test_the_best_of_other_validation_images_is_forgotten(tiny_config, finished_run, tmp_path) -> None:
     run = shutil.copytree(finished_run, tmp_path / "run")
-    assert train(tiny_config(run), resume=True).best_step > 0
+    assert train(tiny_config(run), resume=True).progress.best_step > 0
     other = tiny_config(run, max_val_images=6)
-    assert train(other, resume=True).best_step == 0, "nothing was left to do"
+    assert train(other, resume=True).progress.best_step == 0, "nothing was left to do"
     summary = train(dataclasses.replace(other, iterations=5), resume=True)
     assert (summary.progress.step, summary.progress.best_step) == (5, 5)
 
@@ -181,7 +181,7 @@ def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"augment": ("crop",)}, "crop needs the original images"),
+        ({"augment": ("crop",)}, "crop must be the first augmentation, and needs"),
         ({"preset": "kato2018-kato", "sampling": "views"}, "choose sampling 'pairs'"),
         ({"preset": "peng2020-kato-vpl", "batch_size": 1}, "batches of at least 2, got 1"),
         ({"preset": "gadelha2017-kato", "encoder_from_step": 1, "elevation_deg": 20.0}, "PrGAN needs images from 24"),
