@@ -138,38 +138,31 @@ class ViewDataset:
         sizes = self.num_views, self.inverted, self.num_classes, features
         return DatasetInfo(*sizes, mirror_plane_deg, cube_side, solidity)
 
-    def read(self, samples: np.ndarray) -> tuple[np.ndarray | None, ...]:
-        """The images, masks and depth of the samples `samples`, int64 [B], as they are stored."""
-        return tuple(None if part is None else part[samples] for part in (self.images, self.masks, self.depth))
-
-    def batch(
-        self, indices: Tensor, *, voxels: bool = True, pixels: tuple[np.ndarray | None, ...] | None = None
-    ) -> Batch:
+    def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
         """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU. ValueError for other indices.
 
-        voxels: False for training, which needs none; they are twice as large as the images. pixels: the result of
-        `read` for these samples; None to read them now.
+        voxels: False for training, which needs none; they are twice as large as the images.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64)
         samples = indices.numpy()
         if len(samples) and not 0 <= samples.min() <= samples.max() < len(self):
             given = f"{samples.min()} .. {samples.max()}"
             raise ValueError(f"indices must lie in 0 .. {len(self) - 1}, got {given}")  # --indices of commands
-        pixels = self.read(samples) if pixels is None else pixels
-        images, masks, depth = (None if part is None else torch.from_numpy(part) for part in pixels)
+        images = self.images[samples]
+        masks = images[:, 3] if self.masks is None else self.masks[samples]
         poses = None if self.poses is None else self.poses[indices]
         view_ids, objects = (array[samples].astype(np.int64) for array in (self.view_ids, self.object_ids))
         classes = np.zeros_like(objects) if self.class_ids is None else self.class_ids[objects]
         return Batch(
-            images=images,
-            masks=(images[:, 3] if masks is None else masks).to(torch.float32) / 255,
+            images=torch.from_numpy(images),
+            masks=torch.from_numpy(np.divide(masks, 255, dtype=np.float32)),
             poses=poses,
             view_ids=torch.from_numpy(view_ids),
             object_ids=torch.from_numpy(objects),
             class_ids=torch.from_numpy(classes),
             voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
             crops=None if self.crops is None else self.crops[samples],
-            depth=None if depth is None else depth_of_levels(depth, poses),
+            depth=None if self.depth is None else depth_of_levels(torch.from_numpy(self.depth[samples]), poses),
         )
 
     def digest(self, *, voxels: bool = True) -> int:
@@ -216,9 +209,8 @@ class ViewDataset:
         sides = []
         for axis in (1, 2):
             seen = masks.any(axis=axis)
-            size = seen.shape[1]
-            first, last = seen.argmax(axis=1), size - 1 - seen[:, ::-1].argmax(axis=1)
-            sides.append(np.where(seen.any(axis=1), last - first + 1, 0) / size)
+            before, after = seen.argmax(axis=1), seen[:, ::-1].argmax(axis=1)
+            sides.append(np.where(seen.any(axis=1), seen.shape[1] - before - after, 0) / seen.shape[1])
         return np.maximum(*sides)
 
     def with_bins(self, bins: AngleBins) -> ViewDataset:

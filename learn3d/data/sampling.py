@@ -26,20 +26,22 @@ def batches(dataset: ViewDataset, options: Any, start: int = 1) -> Iterator[Batc
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
     options: `sampling`, `batch_size`, `augment`, `seed` and `iterations`, as in `TrainConfig`.
-    A thread reads the images of the next batch during a step.
+    A thread reads the next batch during a step.
     """
-    sample = functools.partial(sample_indices, dataset, options.sampling, options.batch_size, options.seed)
-    indices = sample(start)
+
+    def read(step: int) -> tuple[Tensor, Batch]:
+        indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, step)
+        return indices, dataset.batch(indices, voxels=False)
+
     with ThreadPoolExecutor(1, "read ahead") as reader:
-        ahead = reader.submit(dataset.read, indices.numpy())
+        ahead = reader.submit(read, start)
         for step in range(start, options.iterations + 1):
-            batch = dataset.batch(indices, voxels=False, pixels=ahead.result())
-            if dataset.candidates is not None:
+            indices, batch = ahead.result()
+            if step < options.iterations:
+                ahead = reader.submit(read, step + 1)
+            if dataset.candidates is not None:  # their weights may have changed in the last step
                 poses, view_ids = dataset.candidates.draw(indices, options.seed, step)
                 batch = dataclasses.replace(batch, poses=poses, view_ids=view_ids)
-            if step < options.iterations:
-                indices = sample(step + 1)
-                ahead = reader.submit(dataset.read, indices.numpy())
             yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted)
 
 
@@ -73,13 +75,8 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
 
 def shuffled_epochs(num_samples: int, batch_size: int, seed: int, step: int) -> Tensor:
     """Samples of step `step` (from 1) from a sequence of shuffled epochs, int64 [batch_size]."""
-    positions = range((step - 1) * batch_size, step * batch_size)
-    pieces = []
-    for epoch in range(positions.start // num_samples, (positions.stop - 1) // num_samples + 1):
-        first = max(positions.start - epoch * num_samples, 0)
-        end = min(positions.stop - epoch * num_samples, num_samples)
-        pieces.append(_epoch_order(num_samples, seed, epoch)[first:end])
-    return torch.cat(pieces)
+    epochs, places = np.divmod(np.arange((step - 1) * batch_size, step * batch_size), num_samples)
+    return torch.cat([_epoch_order(num_samples, seed, e)[places[epochs == e]] for e in np.unique(epochs).tolist()])
 
 
 @functools.lru_cache(maxsize=2)

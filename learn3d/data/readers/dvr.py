@@ -90,15 +90,14 @@ def _fit_world(path: Path, cameras: list[np.ndarray]) -> np.ndarray:
     if not (skew <= 1e-3).all() or not np.isfinite(matrices).all():
         raise DamagedFile(path, f"the left 3x3 part of a matrix is no rotation, or not finite; expected {_CAMERAS}")
     eyes = -np.einsum("kij,ki->kj", rotations, matrices[:, :, 3])
-    true_eyes = view_poses(torch.arange(NUM_VIEWS)).features().double().numpy()
+    poses = view_poses(torch.arange(NUM_VIEWS))
+    true_eyes = poses.features().double().numpy()
     u, _, v = np.linalg.svd(true_eyes.T @ eyes)
     to_object = u @ v
-    forward = -true_eyes / np.linalg.norm(true_eyes, axis=1, keepdims=True)
-    right = np.cross([0.0, 1.0, 0.0], forward)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    cosines = [(rotations[:, row] @ to_object.T * axis).sum(1) for row, axis in ((0, right), (2, forward))]
+    true_rotations = poses.cameras().projection().matrix[:, :, :3].numpy()  # rows: right, down, forward
+    cosines = (rotations @ to_object.T * true_rotations).sum(axis=2)[:, [0, 2]].min(axis=1)
     off = np.linalg.norm(eyes @ to_object.T - true_eyes, axis=1)
-    fault = np.maximum(off / _EYE_TOLERANCE, (1 - np.minimum(*cosines)) / (1 - _MIN_COSINE))
+    fault = np.maximum(off / _EYE_TOLERANCE, (1 - cosines) / (1 - _MIN_COSINE))
     if fault.max() > 1:
         raise DamagedFile(
             path,

@@ -86,7 +86,7 @@ def load(
         return check_poses(path, table[:, [0, 1, 3]], _TABLE), volume
 
     objects = read_objects(ids, files, build, image_size, findings, f"{category} {split}")
-    return objects and join_objects(*objects, ids, category, split, PROPERTIES, HALF_FOV_DEG, VIEW_BINS)
+    return join_objects(objects, ids, HALF_FOV_DEG, VIEW_BINS, PROPERTIES.about(category, split))
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:

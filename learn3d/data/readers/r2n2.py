@@ -68,7 +68,7 @@ def load(
         ]
 
     objects = read_objects(chosen, files, _build, image_size, findings, f"{category} {split}")
-    return objects and join_objects(*objects, chosen, category, split, PROPERTIES, HALF_FOV_DEG, VIEW_BINS)
+    return join_objects(objects, chosen, HALF_FOV_DEG, VIEW_BINS, PROPERTIES.about(category, split))
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:

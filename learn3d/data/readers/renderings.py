@@ -1,7 +1,8 @@
 """Shared functions of the readers kar, r2n2 and dvr: read the files of many objects, and join them to arrays."""
 
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import torch
 from tqdm import tqdm
 
 from learn3d.data.categories import synset_of
-from learn3d.data.conventions import LayoutProperties
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import AngleBins
@@ -36,19 +36,16 @@ def read_objects(
     an image, a mask and the mask's largest value. build: the poses and the shape of an object, from the paths and the
     content of the first two files; it may raise DamagedFile. title: of the progress bar.
     """
-    findings.objects, asked = len(names), deque()
-
-    def groups() -> Iterator[list[Call]]:
-        for calls in map(files, names):
-            if findings.attempt(_require_folder, calls[0].path.parent):
-                asked.append([call.path for call in calls])
-                yield calls
-
+    findings.objects = len(names)
+    whole = (calls for calls in map(files, names) if findings.attempt(_require_folder, calls[0].path.parent))
+    sent, asked = itertools.tee(whole)
     count = len(names) * (len(files(names[0])) - 2) if findings.strict else 0
     images, masks = (np.empty((count, *shape), np.uint8) for shape in ((4, image_size, image_size), (MASK_SIZE,) * 2))
     poses, shapes, row = [], [], 0
-    for results in tqdm(read_all(groups()), title, len(names), disable=not is_watched(), unit="object"):
-        (cameras_path, shape_path, *paths), (cameras, shape, *views) = asked.popleft(), map(findings.take, results)
+    found = tqdm(read_all(sent), title, len(names), disable=not is_watched(), unit="object")
+    for results, calls in zip(found, asked, strict=True):
+        cameras_path, shape_path, *paths = (call.path for call in calls)
+        cameras, shape, *views = map(findings.take, results)
         if cameras is not None and shape is not None:
             if built := findings.attempt(build, cameras_path, cameras, shape_path, shape):
                 if not built[1].any():
@@ -71,24 +68,22 @@ def _require_folder(path: Path) -> bool:
 
 
 def join_objects(
-    images: np.ndarray,
-    masks: np.ndarray | None,
-    poses: list[np.ndarray],
-    voxels: list[np.ndarray],
+    objects: tuple[np.ndarray, np.ndarray | None, list[np.ndarray], list[np.ndarray]] | None,
     names: Sequence[str],
-    category: str,
-    split: str,
-    properties: LayoutProperties,
     half_fov_deg: float,
     view_bins: str,
-) -> ViewDataset:
-    """The data set of the result of `read_objects`, with poses as of `check_poses`.
+    about: dict[str, Any],
+) -> ViewDataset | None:
+    """The data set of the result of `read_objects`, with poses as of `check_poses`; None if that is None.
 
-    view_bins: cells of the view classes, see `AngleBins.parse`.
+    view_bins: cells of the view classes, see `AngleBins.parse`. about: the result of `LayoutProperties.about`.
     """
+    if objects is None:
+        return None
+    images, masks, poses, voxels = objects
     cameras, bins = LookAtPoses(*np.concatenate(poses).T, half_fov_deg), AngleBins.parse(view_bins)
     return ViewDataset(
-        **properties.about(category, split),
+        **about,
         images=images,
         masks=masks,
         poses=cameras,

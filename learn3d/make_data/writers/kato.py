@@ -93,8 +93,7 @@ def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -
         depth.append(depth_levels(seen, item.poses).numpy())
     poses = LookAtPoses.join([item.poses for item in objects] or [LookAtPoses(*np.zeros((4, 0), np.float32))])
     return ViewDataset(
-        category=category,
-        split=split,
+        **around.PROPERTIES.about(category, split),
         images=np.concatenate(images),
         depth=np.concatenate(depth),
         poses=poses,
@@ -103,8 +102,6 @@ def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -
         object_ids=np.repeat(np.arange(len(objects)), len(poses) // max(1, len(objects))),
         object_names=tuple(item.name for item in objects),
         voxels=_voxels(objects),
-        convention=around.PROPERTIES.convention,
-        inverted=around.PROPERTIES.inverted,
     )
 
 
