@@ -143,14 +143,9 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read the config.json of a run. Raises ValueError if it is missing or damaged."""
-    try:
-        values = read_json(path, limits.CONFIG_BYTES, "the options of a run")
-    except FileNotFoundError:
-        raise ValueError(
-            f"{path} is missing: is this the folder of a run? To start a new run, leave out --resume."
-        ) from None
-    return config_from_dict(values, source=str(path))
+    """Read the config.json of a run. Raises MissingFile or ValueError if it is missing or damaged."""
+    wanted = "the options of a run; to start a new run, leave out --resume"
+    return config_from_dict(read_json(path, limits.CONFIG_BYTES, wanted), source=str(path))
 
 
 _MAY_DIFFER_NAMES = {
@@ -162,11 +157,13 @@ _MAY_DIFFER_NAMES = {
 
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     """A line for each option that must not change, but differs between `config` and the run `saved`."""
-    old, new = (_flat(c) for c in (saved, config))
+    old, new = (
+        {"method": type(c.settings).__name__.removesuffix("Settings"), **all_options(c)} for c in (saved, config)
+    )
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
     updates = "pose_updates" if config.poses is not None and config.pose_updates > 0 else ""
     varies = schedule or config.settings.varies_over_run or updates
-    allowed = _MAY_DIFFER_NAMES - ({"iterations"} if varies else set())
+    allowed = (_MAY_DIFFER_NAMES | {"preset"}) - ({"iterations"} if varies else set())  # a preset only sets defaults
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
         + f" ({varies} depends on it)" * (name == "iterations")
@@ -181,8 +178,7 @@ def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
         raise ValueError("cannot resume with different options (" + "; ".join(changed) + "); start a new run for that")
 
 
-def _flat(config: TrainConfig) -> dict[str, Any]:
-    """All options by name, with those of the method. The preset is left out: it only sets defaults."""
-    values = {"method": type(config.settings).__name__.removesuffix("Settings"), **vars(config)}
-    del values["preset"], values["settings"]
-    return values | dataclasses.asdict(config.settings)
+def all_options(config: TrainConfig) -> dict[str, Any]:
+    """All options by name, with those of the method in place of `settings`."""
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return values | dataclasses.asdict(values.pop("settings"))

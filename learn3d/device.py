@@ -22,11 +22,6 @@ def resolve_precision(precision: Literal["auto", "bf16", "fp32"], device: str) -
     return "bf16" if "avx512_bf16" in flags or "amx_bf16" in flags else "fp32"
 
 
-def autocast(device: torch.device | str, precision: Literal["bf16", "fp32"]) -> torch.autocast:
-    """Context in which the networks run at the given precision; losses and rendering belong outside it."""
-    return torch.autocast(torch.device(device).type, dtype=torch.bfloat16, enabled=precision == "bf16")
-
-
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>
 
 

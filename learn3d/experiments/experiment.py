@@ -89,7 +89,7 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
     an unknown method or option, for runs with other options in the output folder, and for damaged files.
     """
     threads = request.threads or max(1, torch.get_num_threads() // request.jobs)
-    runs, failed = plan_runs(dataclasses.replace(request, threads=threads)), {}
+    runs, failed = plan_runs(dataclasses.replace(request, threads=threads)), []
     if conflicts := [text for run in runs if (text := find_conflict(run))]:
         advice = "ask for the same options, choose another --output, or remove these folders"
         raise ValueError("\n  ".join([*conflicts, advice]))
@@ -108,10 +108,8 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
     writing.write_json(path.with_suffix(".json"), tables)
     say(align(tables["main"]))
     note(f"report: {path}; its tables for other programs: {path.with_suffix('.json').name}")
-    for name, tail in failed.items():
-        note(f"\nFAILED {name}; the end of its log:\n{tail}")
     if failed:
-        note(f"\n{len(failed)} of {len(runs)} runs failed; the same command tries them again")
+        note(f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}); the same command tries them again")
         return 1
     if len(results) < len(runs) and not request.report_only:
         note("stopped; the same command goes on")

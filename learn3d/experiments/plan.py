@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from learn3d.config import TrainConfig
+from learn3d.config import TrainConfig, all_options
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.experiments.tables import BATCH_DIVISOR, TABLES, VARIANTS, Row
 from learn3d.presets import PRESETS
@@ -142,7 +142,7 @@ def _configure(
 
 def _parse_changes(variants: Sequence[str], texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The changes NAME=VALUE and VARIANT:NAME=VALUE, by variant."""
-    known = {name: _flatten(TrainConfig(Path(), "-", Path(), VARIANTS[name].preset)) for name in variants}
+    known = {name: all_options(TrainConfig(Path(), "-", Path(), VARIANTS[name].preset)) for name in variants}
     changes: dict[str, dict[str, Any]] = {variant: {} for variant in variants}
     for text in texts:
         target, separator, value = text.partition("=")
@@ -171,7 +171,10 @@ def _parse_value(text: str, is_list: bool = False) -> Any:
 
 def command_line(config: TrainConfig, **placeholders: str) -> str:
     """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of options' values."""
-    values, usual = _flatten(config), _flatten(TrainConfig(config.data, config.category, config.output, config.preset))
+    values, usual = (
+        all_options(config),
+        all_options(TrainConfig(config.data, config.category, config.output, config.preset)),
+    )
     names = [n for n in values if n not in (*_FIRST, "device", "threads") and values[n] != usual[n]]
     words = ["learn3d", "train"]
     for name in (*_FIRST, *names):
@@ -184,9 +187,3 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
             items = value if isinstance(value, tuple) else (value,)
             words += [f"--{option}", *(shlex.quote(str(item)) for item in items)]
     return " ".join(words)
-
-
-def _flatten(config: TrainConfig) -> dict[str, Any]:
-    """All options by name, the method's settings included."""
-    values = {field.name: getattr(config, field.name) for field in fields(config)}
-    return values | dataclasses.asdict(values.pop("settings"))

@@ -160,8 +160,6 @@ def make_shards(config: DatasetConfig) -> int:
     missing = [task for path, task in tasks.items() if not path.is_file()]
     note(f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}")
     failed = run_tasks(missing, jobs=config.jobs)
-    for name, tail in failed.items():
-        note(f"\nFAILED {name}; the end of the log:\n{tail}")
     if count := sum(not path.is_file() for path in tasks):
         note(f"{count} shards are missing; the same command makes them")
         return 1 if failed else INTERRUPTED

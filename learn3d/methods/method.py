@@ -15,7 +15,6 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch, DatasetInfo
-from learn3d.device import autocast
 from learn3d.methods.optimization import EMA, TrainingSchedule, adam, backpropagate
 from learn3d.pictures.surfaces import Surface
 from learn3d.settings import checked
@@ -205,5 +204,5 @@ class Method(abc.ABC):
             self.networks.train(was_training)
 
     def autocast(self) -> torch.autocast:
-        """Context in which the networks run at the method's precision."""
-        return autocast(self.device, self.precision)
+        """Context in which the networks run at the method's precision; losses and rendering belong outside it."""
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16")

@@ -225,9 +225,7 @@ def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, 
     return {f"optimizer.{name}.{index}.{key}": value for index, found in state.items() for key, value in found.items()}
 
 
-def restore_optimizer(
-    name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path | str = "the checkpoint"
-) -> None:
+def restore_optimizer(name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path) -> None:
     """Restore the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the parameters.
 
     Fused kernels index parameter, gradient and state by position in memory, so each tensor must have its parameter's

@@ -34,13 +34,13 @@ class Task:
     log: Path  # file to which its output is appended
 
 
-def run_tasks(tasks: Sequence[Task], *, jobs: int = 1) -> dict[str, str]:
-    """Run `tasks`, at most `jobs` at a time; return the end of the log of every failed task, by the task's name.
+def run_tasks(tasks: Sequence[Task], *, jobs: int = 1) -> list[str]:
+    """Run `tasks`, at most `jobs` at a time; return the names of those that failed.
 
-    A failing task does not stop the others. After SIGINT, SIGTERM or SIGHUP no task is started, and each running one
-    saves its state and ends.
+    A failing task does not stop the others; the end of its log is shown. After SIGINT, SIGTERM or SIGHUP no task is
+    started, and each running one saves its state and ends.
     """
-    waiting, running, failed = list(tasks), {}, {}
+    waiting, running, failed = list(tasks), {}, []
     with stop_on_signal() as asked:
         try:
             while (waiting or running) and not asked.name:
@@ -49,17 +49,18 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int = 1) -> dict[str, str]:
                     try:
                         running[_start(task)] = task
                     except OSError as error:  # its log cannot be written
-                        failed[task.name] = str(error)
-                        note(f"{task.name}: failed; {error}")
+                        failed.append(task.name)
+                        note(f"FAILED {task.name}: {error}")
                 time.sleep(0.1)
                 for process in [process for process in running if process.poll() is not None]:
                     task, status = running.pop(process), process.wait()
+                    ended = f"[{len(tasks) - len(waiting) - len(running)}/{len(tasks)}]"
                     tail = _tail(task.log, status)
-                    if status not in (0, INTERRUPTED) and not asked.name:
-                        failed[task.name] = tail
-                    end = "failed" if task.name in failed else "stopped" if status else "done"
-                    ended = len(tasks) - len(waiting) - len(running)
-                    note(f"[{ended}/{len(tasks)}] {task.name}: {end}; {tail.splitlines()[-1]}")
+                    if status in (0, INTERRUPTED) or asked.name:
+                        note(f"{ended} {task.name}: {'stopped' if status else 'done'}; {tail.splitlines()[-1]}")
+                    else:
+                        failed.append(task.name)
+                        note(f"{ended} FAILED {task.name}; the end of its log:\n{tail}")
         finally:
             if running:
                 note("stopping: running tasks save their state")

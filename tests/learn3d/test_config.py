@@ -75,10 +75,7 @@ def test_the_length_of_a_run_whose_poses_are_weighted_anew_is_kept(tiny_config, 
 
 def test_files_that_are_no_json_or_too_large(tmp_path, monkeypatch):
     path = tmp_path / "config.json"
-    with pytest.raises(
-        ValueError,
-        match=r"config\.json is missing: is this the folder of a run\? To start a new run, leave out --resume",
-    ):
+    with pytest.raises(FileNotFoundError, match=r"config\.json: is missing; expected .* run, leave out --resume"):
         load_config(path)
     for text in ("[" * 100_000, '{"seed": NaN}', "{", "\xff"):
         path.write_text(text, encoding="latin-1")

@@ -136,7 +136,7 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
     ("words", "message"),
     [
         ("train --data {tmp} --category airplane --output {tmp}/run", "02691156_train_images.npz"),
-        ("train --output {tmp} --resume", "is this the folder of a run?"),
+        ("train --output {tmp} --resume", "to start a new run, leave out --resume"),
         ("train --out {tmp} --resume", "--resume needs --output: the folder of the run"),
         ("train --data {tmp}/no --category chair --output {tmp}/run", "data set with --data"),
         ("train --output {run} --resume --preset vanilla", "with the preset peng2020-kato, got peng2020-kato-vanilla"),

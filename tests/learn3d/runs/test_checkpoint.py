@@ -126,8 +126,8 @@ def test_states_of_adam_that_do_not_fit(change: dict[str, torch.Tensor], message
     """The fused kernel would read and write beyond a tensor that is too small."""
     tensors = checkpoint.optimizer_tensors("encoder", StandIn().optimizer)
     tensors |= {f"optimizer.encoder.{key}": value for key, value in change.items()}
-    with pytest.raises(ValueError, match=f"the checkpoint does not fit the optimizer encoder: {message}"):
-        checkpoint.restore_optimizer("encoder", StandIn().optimizer, tensors)
+    with pytest.raises(ValueError, match=f"a does not fit the optimizer encoder: {message}"):
+        checkpoint.restore_optimizer("encoder", StandIn().optimizer, tensors, Path("a"))
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_any_optimizer_goes_on_as_if_it_had_not_been_saved(tmp_path, make) -> No
     checkpoint.save(tmp_path / "a.safetensors", tensors, metadata())
     loaded, _ = checkpoint.load(tmp_path / "a.safetensors")
     other.load_state_dict(network.state_dict())
-    checkpoint.restore_optimizer("encoder", resumed, loaded)
+    checkpoint.restore_optimizer("encoder", resumed, loaded, tmp_path)
     assert all(torch.equal(a, b) for a, b in zip(steps(network, optimizer), steps(other, resumed), strict=True))
 
 
