@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -26,6 +26,7 @@ from learn3d.data.framing import (
     threshold_mask,
 )
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
+from learn3d.data.poses import Poses
 from learn3d.files import limits, writing
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, cut_out
@@ -39,6 +40,7 @@ from learn3d.networks.encoders import CENTRED_SIZE, centre
 from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
 from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable
 from learn3d.runs import checkpoint
+from learn3d.settings import split_names
 from learn3d.terminal import note
 
 MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
@@ -62,9 +64,9 @@ class Model(NamedTuple):
     templates: Templates | None = None  # None if its file has none
 
     @property
-    def categories(self) -> list[str]:
+    def categories(self) -> tuple[str, ...]:
         """The categories that it was trained on."""
-        return [name.strip() for name in self.config.category.split(",")]
+        return split_names(self.config.category)
 
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
         """Call `prepare_image` with the image size, object size and layout of these networks."""
@@ -119,10 +121,9 @@ def reconstruct_files(
     if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
         raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
     model = load_model(run, which)
-    find = threshold_mask if plain_background else functools.partial(cut_out, box=box) if box else None
-    photos = map(_read, images, masks or [None] * len(images), [find] * len(images))
+    read = functools.partial(_read, plain_background=plain_background, box=box)
     made = []
-    for name, photo in zip(names, photos, strict=True):
+    for name, photo in zip(names, map(read, images, masks or [None] * len(images)), strict=True):
         made.append(reconstruct_picture(model, *photo, crop=crop, refined=refined))
         if made[-1].warning:
             note(f"warning: {name}: {made[-1].warning}")
@@ -131,7 +132,6 @@ def reconstruct_files(
     return save(folder, names, made, model, mesh_format)
 
 
-@torch.no_grad()
 def reconstruct_dataset(
     run: Path | None,
     folder: Path,
@@ -155,27 +155,39 @@ def reconstruct_dataset(
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     if refined and batch.poses is None:
         raise ValueError(f"the data of {dataset.category} have no poses, which fitting needs; leave out --refine")
-    if refined:
-        shapes = refine(model.method, batch.images, batch.masks, batch.poses)
+    surfaces = reconstruct(model.method, batch.images, *((batch.masks, batch.poses) if refined else ()))
+    stored = batch.images.numpy()
+    if batch.poses is None:
+        azimuths = [input_azimuth_deg(surface, image[3]) for surface, image in zip(surfaces, stored, strict=True)]
     else:
-        shapes = model.method.decode(model.method.encode(batch.images))
-    made = []
-    for row, (surface, stored) in enumerate(zip(shapes.surfaces(), batch.images.numpy(), strict=True)):
-        known = batch.poses is not None
-        azimuth_deg = float(azimuths_deg(batch.poses)[row]) if known else input_azimuth_deg(surface, stored[3])
-        made.append(Reconstruction(surface, stored, azimuth_deg))
-    return save(folder, [f"{dataset.category}_{split}_{index:06}" for index in indices], made, model, mesh_format)
+        azimuths = azimuths_deg(batch.poses).tolist()
+    names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
+    return save(folder, names, list(map(Reconstruction, surfaces, stored, azimuths)), model, mesh_format)
+
+
+@torch.no_grad()
+def reconstruct(
+    method: Method, images: np.ndarray | Tensor, masks: Tensor | None = None, poses: Poses | None = None
+) -> list[Surface]:
+    """Shapes, in the object frame, of stored images uint8 [B,4,S,S], for example from `prepare_image`.
+
+    With masks float32 [B,64,64] and poses, the shapes are fitted to them; ValueError if the method predicts voxels.
+    """
+    images = torch.as_tensor(images)
+    if poses is not None:
+        return refine(method, images, masks, poses).surfaces()
+    return method.decode(method.encode(images)).surfaces()
 
 
 def _read(
-    path: Path, mask_path: Path | None, find: Callable[[np.ndarray], np.ndarray] | None
+    path: Path, mask_path: Path | None = None, plain_background: bool = False, box: Box | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path` or from `find`."""
-    searched = find is not None and mask_path is None
-    side = _PLAIN_SIDE if find is threshold_mask else limits.IMAGE_SIDE  # a box is in pixels of the file
+    """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path`, or found in the image."""
+    searched = mask_path is None and (plain_background or box is not None)
+    side = limits.IMAGE_SIDE if box else _PLAIN_SIDE  # a box is in pixels of the file
     colors, mask = read_photo(path, max_side=side) if searched else read_photo(path, mask_path)
-    if searched and (mask is None or find is not threshold_mask):  # a box counts even if the file has transparency
-        mask, more = largest_region(find(colors))
+    if searched and (box or mask is None):  # a box counts even if the file has transparency
+        mask, more = largest_region(cut_out(colors, box) if box else threshold_mask(colors))
         if more:
             note(f"note: {path}: several parts were found, and only the largest is used")
     try:
@@ -258,7 +270,7 @@ def reconstruct_picture(
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
     if not refined or not isinstance(method, MeshMethod):
-        (surface,) = method.decode(method.encode(image[None])).surfaces()
+        (surface,) = reconstruct(method, image[None])
         found = method.view_probabilities(image[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
         return Reconstruction(surface, stored, azimuth_deg)

@@ -12,7 +12,7 @@ from learn3d.evaluation import NO_MMD, evaluate, spread_samples
 from learn3d.figures.grids import picture_grid
 from learn3d.methods import MeshMethod, Method, create_method
 from learn3d.pictures.sheets import save_png
-from learn3d.poses.updates import update_poses, update_steps
+from learn3d.poses.views import update_poses, update_steps
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress, load_data
 from learn3d.runs.log import RunLog, check_log

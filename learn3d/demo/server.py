@@ -95,7 +95,7 @@ def _json_line(message: dict) -> bytes:
 def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlette:
     """The page for these models, by their displayed names, served under the name `host`."""
     pictures = {category: example(category) for category in EXAMPLES}
-    kinds = [kind.strip() for model in models.values() for kind in model.config.category.split(",")]
+    kinds = [kind for model in models.values() for kind in model.categories]
 
     def about(_: Request) -> Response:
         return JSONResponse({"kinds": list(dict.fromkeys(kinds)), "examples": list(pictures), "side": SIDE})

@@ -18,22 +18,21 @@ _AROUND = 16  # width in pixels of the region around the strokes that GrabCut se
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
 
 
-def find_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+def find_mask(colors: np.ndarray) -> np.ndarray:
     """Guess the mask uint8 [H, W], 0 or 255, of the object in a photograph uint8 [H, W, 3].
 
-    If the background is plain, or without OpenCV, the object is everything that differs from the border's colour by
-    `tolerance`. Otherwise GrabCut separates it from the picture's border.
+    If the background is plain, or without OpenCV, the object is everything that differs from the border's colour.
+    Otherwise GrabCut separates it from the picture's border.
     """
-    if is_plain(colors, tolerance) or importlib.util.find_spec("cv2") is None:
-        return threshold_mask(colors, tolerance)
-    return cut_out(colors)
+    plain = is_plain(colors) or importlib.util.find_spec("cv2") is None
+    return threshold_mask(colors) if plain else cut_out(colors)
 
 
-def is_plain(colors: np.ndarray, tolerance: float = TOLERANCE) -> bool:
+def is_plain(colors: np.ndarray) -> bool:
     """Whether the border of a picture uint8 [H, W, 3] has one colour, except for a tenth of its pixels."""
     border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]]).astype(np.float64)
     difference = np.abs(border - np.median(border, axis=0)).max(axis=1)
-    return bool((difference < 255 * tolerance).mean() > PLAIN)
+    return bool((difference < 255 * TOLERANCE).mean() > PLAIN)
 
 
 def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
@@ -83,9 +82,7 @@ def _grab_cut(colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray, rounds
         ) from None
     if inside.all() or not inside.any():
         return inside
-    labels = np.uint8([[cv2.GC_BGD, cv2.GC_PR_BGD], [cv2.GC_FGD, cv2.GC_PR_FGD]])[
-        inside.astype(int), unsure.astype(int)
-    ]
+    labels = inside + np.uint8(2) * unsure  # GC_BGD, GC_FGD, GC_PR_BGD, GC_PR_FGD
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(np.ascontiguousarray(colors[..., ::-1]), labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)

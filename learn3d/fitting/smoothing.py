@@ -108,8 +108,8 @@ def sharpen(surface: Surface, angle_deg: float = 40.0) -> Surface:
     corners = np.stack([mesh.faces.ravel(), np.repeat(patch, 3)], 1)
     kept, faces = np.unique(corners, axis=0, return_inverse=True)
     rows = torch.from_numpy(kept[:, 0].astype(np.int64))
-    colors = None if surface.colors is None else surface.colors[rows]
-    return Surface(surface.vertices[rows], torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)), colors)
+    faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64))
+    return Surface(surface.vertices[rows], faces, surface.colors[rows])
 
 
 def joined(faces: np.ndarray, count: int) -> coo_array:

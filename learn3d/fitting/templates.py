@@ -5,7 +5,6 @@ templates; the shapes themselves are made again from their numbers.
 """
 
 import math
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -58,28 +57,26 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
     They are the objects that `make-dataset --procedural` generates with the seed `SEED`. They are recognised by their
     names, and by their voxels, which must be those of the shape with the number in the name.
     """
-    categories = [name.strip() for name in dataset.category.split(",")]
-    object_ids = np.asarray(dataset.object_ids)
-    numbers: list[list[int]] = [[] for _ in categories]
-    codes: list[list[Tensor]] = [[] for _ in categories]
-    for item, name in enumerate(dataset.object_names):
-        kind = 0 if dataset.class_ids is None else int(dataset.class_ids[item])
-        match = re.fullmatch(rf"{categories[kind]}_(\d+)", name)
-        if match and dataset.voxels is not None and categories[kind] in CATEGORIES and len(numbers[kind]) < COUNT:
-            views = torch.from_numpy(np.flatnonzero(object_ids == item))
-            vertices, faces = template(categories[kind], int(match[1]))
-            voxels = dataset.batch(views[:1]).voxels
-            if nmr.metrics.voxel_iou(dataset.convention.voxelize(vertices[None], faces), voxels) > 0.98:
-                of_views = F.normalize(method.encode(dataset.batch(views, voxels=False).images), dim=1)
-                numbers[kind].append(int(match[1]))
-                codes[kind].append(F.normalize(of_views.mean(0), dim=0))
-    if not (count := min(map(len, numbers))):
+    found = {category: [] for category in dataset.class_names or (dataset.category,)}  # numbers and codes
+    if dataset.voxels is None or not found.keys() <= set(CATEGORIES):
         return None
-    numbers = torch.tensor([of_kind[:count] for of_kind in numbers], dtype=torch.int32)
-    codes = torch.stack([code for of_kind in codes for code in of_kind[:count]])
+    for item, name in enumerate(dataset.object_names):
+        category, _, number = name.rpartition("_")
+        if category not in found or not number.isdecimal() or len(found[category]) >= COUNT:
+            continue
+        batch = dataset.batch(torch.from_numpy(np.flatnonzero(dataset.object_ids == item)))
+        vertices, faces = template(category, int(number))
+        if nmr.metrics.voxel_iou(dataset.convention.voxelize(vertices[None], faces), batch.voxels[:1]) > 0.98:
+            of_views = F.normalize(method.encode(batch.images), dim=1)
+            found[category].append((int(number), F.normalize(of_views.mean(0), dim=0)))
+    if not (count := min(map(len, found.values()))):
+        return None
+    numbers, codes = zip(*(each for of_kind in found.values() for each in of_kind[:count]), strict=True)
+    codes, shape = torch.stack(codes), (len(found), count)
     mean = codes.mean(0)
     axes = torch.linalg.svd(codes - mean, full_matrices=False).Vh[:AXES]
-    return Templates(numbers, ((codes - mean) @ axes.T).view(*numbers.shape, -1), torch.cat([mean[None], axes]))
+    reduced = ((codes - mean) @ axes.T).view(*shape, -1)
+    return Templates(torch.tensor(numbers, dtype=torch.int32).view(shape), reduced, torch.cat([mean[None], axes]))
 
 
 def template(category: str, number: int) -> tuple[Tensor, Tensor]:

@@ -51,6 +51,8 @@ _FAR = 9.0  # distance of masks that must not be neighbours
 _PEAK_WIDTH = 5  # peaks of upper outlines are narrower, in pixels
 _PEAK_WEIGHT = 0.002  # weight of their votes; that of nearly equal masks is 1
 
+Tick = Callable[[], object]  # called after each of the `PoseOptions.all_steps` steps
+
 
 @checked
 class PoseOptions:
@@ -111,12 +113,11 @@ class Estimate:
 
 
 def estimate(
-    data: Masks, fitted: Tensor, candidates: Candidates, options: PoseOptions, tick: Callable[[], object] = lambda: None
+    data: Masks, fitted: Tensor, candidates: Candidates, options: PoseOptions, tick: Tick = lambda: None
 ) -> Estimate:
     """Estimate the poses of N masks, none of them empty. The same arguments and number of threads give the same bits.
 
     fitted: int64, rows of the masks that shapes are fitted to; of more than MAX_FITTED rows, a random part is used.
-    tick: called after each of the `options.all_steps` steps.
     """
     rng = torch.Generator().manual_seed(options.seed)
     fitted = fitted[torch.randperm(len(fitted), generator=rng)[:MAX_FITTED].sort().values]
@@ -196,16 +197,11 @@ def _estimate_once(
 class Shapes:
     """M shapes, symmetric about x = 0: a generator network, a code for each shape, and one offset for all.
 
-    They are fitted to the masks `data`. tick: called after each step.
+    They are fitted to the masks `data`.
     """
 
     def __init__(
-        self,
-        data: Masks,
-        candidates: Candidates,
-        options: PoseOptions,
-        rng: torch.Generator,
-        tick: Callable[[], object],
+        self, data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, tick: Tick
     ) -> None:
         self.data, self.candidates, self.options, self.rng, self.tick = data, candidates, options, rng, tick
         self.network = GENERATORS["sphere-small"](symmetry="x")

@@ -1,7 +1,12 @@
-"""Estimates the poses of all images of a data set, compares them with true poses, and draws a sheet of them."""
+"""Poses of all images of a data set: estimated from masks, corrected in a training, compared with true ones, drawn.
+
+A training gives the candidate poses of an image new probabilities: the shape that the model predicts from the image is
+rendered at all of them. As all images share the networks, the shape of an image with a wrong pose is still predicted in
+the frame of the others, so its IoU with the mask is best at the right pose.
+"""
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,15 +17,28 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
+import nmr
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.pose_table import MAX_CANDIDATES, PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.files import limits
 from learn3d.files.reading import MissingFile
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.pictures.sheets import natural_colors, tile
 from learn3d.pictures.surfaces import Surface, draw_surface, orbit
-from learn3d.poses.estimate import MIN_IMAGES, NEAR_DEG, SIZE, Candidates, Estimate, Masks, PoseOptions, estimate
+from learn3d.poses.estimate import (
+    MIN_IMAGES,
+    NEAR_DEG,
+    SIZE,
+    TEMPERATURE,
+    Candidates,
+    Estimate,
+    Masks,
+    PoseOptions,
+    Tick,
+    estimate,
+)
 from learn3d.settings import checked
 
 MAX_ELEVATION_STEP_DEG = 15.0  # between neighbouring candidates
@@ -31,6 +49,10 @@ PROTOTYPES, ROWS = 6, 8  # rows of prototypes, and of images, at most
 TILE = 64  # side of a picture in pixels
 LEGEND = "columns: azimuths; first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
 _MIN_FRONT_VOTES = 0.8  # `Estimate.front_votes` of objects whose front and back differ
+_IMAGES = 128  # images whose poses are reweighted at a time
+_CELL_DEG = 15  # width of the cells of azimuth whose frequency is kept
+_LEAST_PRIOR = 0.01  # probability of candidates that the table leaves out
+_ROUNDS = 20  # rounds of scaling to these frequencies
 
 
 @checked
@@ -49,14 +71,11 @@ class CameraOptions:
         """The lowest and the highest elevation; None if no elevation is given. Raises ValueError for bad text."""
         if self.elevation is None:
             return None
-        try:
-            low, _, high = self.elevation.partition(":")
-            low, high = float(low), float(high or low)
-        except ValueError:
-            low, high = 1.0, 0.0
-        if not -90 < low <= high < 90:
-            raise ValueError(f"elevation must be degrees within -90 .. 90, or LOW:HIGH, got {self.elevation!r}")
-        return low, high
+        low, _, high = self.elevation.partition(":")
+        with contextlib.suppress(ValueError):
+            if -90 < float(low) <= float(high or low) < 90:
+                return float(low), float(high or low)
+        raise ValueError(f"elevation must be degrees within -90 .. 90, or LOW:HIGH, got {self.elevation!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,16 +117,12 @@ def load_views(layout: Layout, data: Path, category: str, views_per_object: int 
 
 
 def estimate_views(
-    datasets: Sequence[ViewDataset],
-    cameras: CameraOptions,
-    options: PoseOptions,
-    tick: Callable[[], object] = lambda: None,
+    datasets: Sequence[ViewDataset], cameras: CameraOptions, options: PoseOptions, tick: Tick = lambda: None
 ) -> EstimatedViews:
     """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
-    The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight. tick: called after each of
-    `options.all_steps` steps. Raises ValueError if all training masks are empty, or if the data set's poses are
-    rotations.
+    The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight. Raises ValueError if all
+    training masks are empty, or if the data set's poses are rotations.
     """
     elevation, distance, half_fov = _cameras(datasets, cameras)
     size = distance * torch.tan(half_fov.deg2rad())
@@ -152,18 +167,13 @@ def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[T
     if any(dataset.poses is not None for dataset in datasets):
         if not all(isinstance(dataset.poses, LookAtPoses) for dataset in datasets):
             raise ValueError("poses can only be estimated for look-at cameras; the poses of this layout are rotations")
-        own = [_column(datasets, name) for name in ("elevation_deg", "distance", "half_fov_deg")]
-        elevation = own[0] if cameras.elevation is None else elevation
-        distance, half_fov = own[1], half_fov if cameras.fov_deg else own[2]
+        poses = vars(LookAtPoses.join([dataset.poses for dataset in datasets])).values()
+        _, own_elevation, distance, own_fov = (torch.as_tensor(part).expand(len(half_fov)) for part in poses)
+        elevation = own_elevation if cameras.elevation is None else elevation
+        half_fov = half_fov if cameras.fov_deg else own_fov
     if cameras.distance is not None:
         distance = torch.full_like(half_fov, cameras.distance)
     return elevation, distance, half_fov
-
-
-def _column(datasets: Sequence[ViewDataset], name: str) -> Tensor:
-    """One field of the poses of all images, float32 [N]."""
-    columns = [torch.as_tensor(getattr(d.poses, name), dtype=torch.float32).expand(len(d)) for d in datasets]
-    return torch.cat(columns)
 
 
 def _objects(datasets: Sequence[ViewDataset]) -> Tensor:
@@ -191,6 +201,52 @@ def _masks(datasets: Sequence[ViewDataset], factor: Tensor) -> Tensor:
             reduced.append(F.avg_pool2d(masks, MASK_SIZE // SIZE).flatten(1))
             start += len(rows)
     return torch.cat(reduced)
+
+
+def update_steps(iterations: int, count: int) -> tuple[int, ...]:
+    """The steps of a run after which poses are reweighted: 1/2, 1/4, ... of its length."""
+    return tuple(iterations >> k for k in range(count, 0, -1) if iterations >> k)
+
+
+@torch.no_grad()
+def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
+    """Reweight the candidates of all images of `dataset`; returns the share of images whose best pose changed.
+
+    The weights are softmax(IoU / TEMPERATURE + log p + b) over the candidates, with masks and renderings of SIZE
+    pixels. p is the candidate's probability in the table, at least _LEAST_PRIOR. b is a number for each 15 degrees of
+    azimuth, chosen so that each such cell keeps its frequency in the table.
+    """
+    candidates, logits = dataset.candidates, []
+    count = candidates.weights.shape[1]
+    with method.in_use():
+        for rows in torch.arange(len(dataset)).split(_IMAGES):
+            batch = dataset.batch(rows, voxels=False)
+            shapes = method.decode(method.encode(batch.images))
+            poses = candidates.poses[(rows[:, None] * count + torch.arange(count)).flatten()]
+            vertices = shapes.vertices.repeat_interleave(count, 0)
+            silhouettes = nmr.render_silhouette(vertices, shapes.faces, poses.cameras(), image_size=SIZE)
+            masks = F.avg_pool2d(batch.masks[:, None], MASK_SIZE // SIZE).expand(-1, count, -1, -1)
+            silhouettes = silhouettes.view(masks.shape)
+            common = (silhouettes * masks).sum((2, 3))
+            logits.append(common / ((silhouettes + masks).sum((2, 3)) - common).clamp_min(1e-6) / TEMPERATURE)
+    prior = torch.from_numpy(candidates.prior)
+    logits = torch.cat(logits) + prior.clamp_min(_LEAST_PRIOR).log()
+    weights = _with_marginal(logits, candidates.poses.azimuth_deg.view(prior.shape), prior).numpy()
+    changed = float((weights.argmax(1) != candidates.weights.argmax(1)).mean())
+    candidates.weights[:] = weights
+    return changed
+
+
+def _with_marginal(logits: Tensor, azimuth_deg: Tensor, prior: Tensor) -> Tensor:
+    """Softmax of logits [M, C] plus a number for each cell of azimuths, which gives the cell its share in `prior`."""
+    cells = 360 // _CELL_DEG
+    cell = ((azimuth_deg / _CELL_DEG).round().long() % cells).flatten()
+    wanted = torch.bincount(cell, prior.flatten(), minlength=cells).clamp_min(1e-6)
+    weights, shift = logits.softmax(1), torch.zeros(cells, dtype=torch.float64)
+    for _ in range(_ROUNDS):
+        shift += (wanted / torch.bincount(cell, weights.flatten(), minlength=cells).clamp_min(1e-6)).log()
+        weights = (logits + shift[cell].float().view(logits.shape)).softmax(1)
+    return weights
 
 
 @dataclass(frozen=True)
@@ -226,7 +282,8 @@ def compare(views: EstimatedViews) -> Comparison:
     """
     if any(dataset.poses is None for dataset in views.datasets):
         raise ValueError("--compare needs true poses, but this data set has none")
-    true, found = _column(views.datasets, "azimuth_deg"), torch.from_numpy(views.table.azimuth_deg[:, 0])
+    true = torch.cat([dataset.poses.azimuth_deg for dataset in views.datasets])
+    found = torch.from_numpy(views.table.azimuth_deg[:, 0])
     chosen = torch.cat([torch.full((len(dataset),), dataset.split != "test") for dataset in views.datasets])
     offsets = torch.arange(360.0)
     turned = (wrap_deg(found[chosen] + o - true[chosen]).abs() for o in offsets)

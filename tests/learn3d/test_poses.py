@@ -28,8 +28,17 @@ from learn3d.methods.method import Meshes
 from learn3d.methods.plus import Plus
 from learn3d.pictures.sheets import HEADER, MARGIN
 from learn3d.poses.estimate import SIZE, Candidates, Estimate, Masks, PoseOptions, _common_frame, _peak_votes, _turns
-from learn3d.poses.updates import update_poses, update_steps
-from learn3d.poses.views import COLUMNS, TILE, CameraOptions, EstimatedViews, compare, draw_sheet, estimate_views
+from learn3d.poses.views import (
+    COLUMNS,
+    TILE,
+    CameraOptions,
+    EstimatedViews,
+    compare,
+    draw_sheet,
+    estimate_views,
+    update_poses,
+    update_steps,
+)
 from learn3d.runs import checkpoint
 from learn3d.training import train
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.data.framing import Crops, threshold_mask
+from learn3d.data.framing import Crops
 from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import (
     _read,
@@ -46,11 +46,11 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
     assert len(trimesh.load(written[0], force="mesh").faces) > 100
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
     with pytest.raises(ValueError, match=r"plain.png: no object was found .* or give --masks"):
-        _read(tmp_path / "plain.png", None, threshold_mask)
+        _read(tmp_path / "plain.png", plain_background=True)
     picture[40:80, 120:150] = 0
     Image.fromarray(picture).save(tmp_path / "two.png")
     for name, said in (("box.png", ""), ("two.png", "several parts were found, and only the largest is used")):
-        mask = _read(tmp_path / name, None, threshold_mask)[1]
+        mask = _read(tmp_path / name, plain_background=True)[1]
         assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60 and said in capsys.readouterr().err
 
 
