@@ -242,14 +242,14 @@ def read_metrics(folder: Path) -> Log:
             valid = all(title.isprintable() and len(title) <= limits.CURVE_NAME for title in titles)
             if type(step) is not int or not 0 <= step <= limits.ITERATIONS or not valid:
                 raise ValueError
-        except (KeyError, TypeError, AttributeError, ValueError):
+            known = {k: float(v) for k, v in record.items() if type(v) in (int, float) and k not in _NOT_CURVES}
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
             if number == len(lines) and number > 1:
                 break
             wanted = f"record with a step, a split and names of up to {limits.CURVE_NAME} characters"
             raise ValueError(f"{file}, line {number} is no {wanted}: {line[:60]!r}") from None
-        for name, value in record.items():
-            if type(value) in (int, float) and name not in _NOT_CURVES:
-                curves.setdefault((split, name), {})[step] = float(value)
+        for name, value in known.items():
+            curves.setdefault((split, name), {})[step] = value
     if not 0 < len(curves) <= limits.CURVES:
         raise ValueError(f"{file} holds {len(curves)} different numbers; from 1 to {limits.CURVES} are drawn")
     return {key: dict(sorted(curve.items())) for key, curve in curves.items()}

@@ -15,7 +15,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import filelock
@@ -81,9 +81,7 @@ def check_can_start(folder: Path, overwrite: bool) -> None:
 def remove_old_run(folder: Path, overwrite: bool) -> None:
     """Remove the files of an older run, if `check_can_start` allows it."""
     check_can_start(folder, overwrite)
-    for pattern in WRITTEN:
-        for path in folder.glob(pattern):
-            path.unlink()
+    _remove(folder, WRITTEN)
     for name in (PICTURES, TENSORBOARD):
         with contextlib.suppress(OSError):  # missing, or with files of the user
             (folder / name).rmdir()
@@ -92,8 +90,13 @@ def remove_old_run(folder: Path, overwrite: bool) -> None:
 
 def remove_partials(folder: Path) -> None:
     """Remove the half-written files of a killed run; those of safetensors are named .tmp??????."""
-    for path in [p for name in (".*.partial", f"{PICTURES}/.*.partial", ".tmp??????") for p in folder.glob(name)]:
-        path.unlink()
+    _remove(folder, (".*.partial", f"{PICTURES}/.*.partial", ".tmp??????"))
+
+
+def _remove(folder: Path, patterns: Sequence[str]) -> None:
+    for pattern in patterns:
+        for path in folder.glob(pattern):
+            path.unlink()
 
 
 def checkpoints(folder: Path) -> list[Path]:
