@@ -37,16 +37,16 @@ _POSE_ERRORS = {  # fields of the JSON file beside a table of poses, and the col
 }
 
 
-def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray], *, seed: int = 0) -> np.ndarray:
+def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray]) -> np.ndarray:
     """Means of 2,000 resampled test sets, float64 [2000]; NaN if no image of a set has a value.
 
     sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c, and their number.
     Objects are drawn with replacement within each category, because the images of an object depend on each other. The
-    result is the mean over the images of a category, then over categories. The draws depend only on the seed and the
-    numbers of objects. So results on the same objects can be subtracted: the bootstrap of their difference is paired.
+    result is the mean over the images of a category, then over categories. The draws depend only on the numbers of
+    objects. So results on the same objects can be subtracted: the bootstrap of their difference is paired.
     (scipy.stats.bootstrap has neither strata nor weights.)
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     means = []
     for of_objects, images in zip(sums, counts, strict=True):
         drawn = rng.integers(len(images), size=(RESAMPLES, len(images)))
@@ -127,23 +127,20 @@ def _compare(measure: str, *sides: Side) -> str:
         return "-"
     form = ".3f" if len(sides) == 1 else "+.3f"
     means = [np.mean([np.mean(v) for v in side]) for side in values]
-    text = format(_subtract(means), form)
+    text = format(means[0] - sum(means[1:]), form)
     seeds = list(sides[0][0])
     if len(seeds) > 1 and all(list(by_seed) == seeds for side in sides for by_seed in side):
-        by_seed = _subtract([np.mean(side, axis=0) for side in values])
-        text += f" ±{stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(by_seed):.3f}"
+        ours, *theirs = (np.mean(side, axis=0) for side in values)
+        text += f" ±{stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(ours - sum(theirs)):.3f}"
     if measure == "mmd":
         return text + (f" (x {means[0] / means[1]:.2f})" if len(means) == 2 else "")
     for of_category in zip(*sides, strict=True):
         if len({tuple(o.name for o in r.objects) for by_seed in of_category for r in by_seed.values()}) > 1:
             return text  # on different objects: they cannot be resampled together
-    if interval := percentile_interval(_subtract([_resample(measure, side) for side in sides])):
+    ours, *theirs = (_resample(measure, side) for side in sides)
+    if interval := percentile_interval(ours - sum(theirs)):
         text += f" [{interval[0]:{form}}, {interval[1]:{form}}]"
     return text
-
-
-def _subtract(values: list) -> np.ndarray:
-    return values[0] - values[1] if len(values) == 2 else values[0]
 
 
 def _resample(measure: str, side: Side) -> np.ndarray:

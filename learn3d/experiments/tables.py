@@ -1,6 +1,6 @@
-"""The tables of the paper (Peng et al. 2020) as data. Rows and printed figures are in tables.csv.
+"""The tables of the paper (Peng et al. 2020), and three of our own: tables.csv, and rows.csv with the printed figures.
 
-A new table is a new entry of `TABLES`, and a line of tables.csv for each row. Rows of several tables that name the same
+A new table is a line of tables.csv, and a line of rows.csv for each row. Rows of several tables that name the same
 variant share their runs. Categories have the names of this package: the paper's "Dresser" is ShapeNet's cabinet.
 """
 
@@ -40,17 +40,6 @@ class Row(NamedTuple):
     variant: str | None  # name in `VARIANTS`; None: a quoted row, never trained here
     about: str  # the voxelizer of the printed figures, and their source if they are quoted
     printed: dict[str, float]  # the paper's figures by category, and their "mean"; without those that it lacks
-
-
-def read_rows() -> dict[str, dict[str, Row]]:
-    """The rows of tables.csv, by table and label."""
-    tables: dict[str, dict[str, Row]] = {}
-    with open(Path(__file__).with_suffix(".csv"), encoding="utf-8", newline="") as file:
-        for line in csv.DictReader(file):
-            printed = {name: float(line[name]) for name in (*CATEGORIES, MEAN) if line[name]}
-            row = Row(line["variant"] or None, line["source"], printed)
-            tables.setdefault(line["experiment"], {})[line["method"]] = row
-    return tables
 
 
 _PLUS = PlusSettings()
@@ -98,52 +87,36 @@ VARIANTS: dict[str, Variant] = {
 }
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """One table."""
 
-    rows: Mapping[str, Row]  # by label
-    baseline: str  # label of the row that is subtracted from the others
     title: str
-    measure: Literal["voxel_iou", "mmd"] = "voxel_iou"
-    layout: Layout = "kato"
-    categories: tuple[str, ...] = CATEGORIES
-    seeds: int = 1
+    baseline: str  # label of the row that is subtracted from the others
+    measure: Literal["voxel_iou", "mmd"]
+    layout: Layout
+    categories: tuple[str, ...]
+    seeds: int
+    rows: Mapping[str, Row]  # by label
 
 
-_ROWS = read_rows()
-_OURS: dict[str, Any] = {"categories": ("airplane", "chair", "table"), "seeds": 3}
-_NO_TABLE = "voxel IoU on Kato's data (no table of the paper)"
-_THREE = ("airplane", "car", "chair")
+def read_tables() -> dict[str, Table]:
+    """The tables by name, from tables.csv and rows.csv beside this module."""
+    rows: dict[str, dict[str, Row]] = {}
+    for line in _read_csv("rows.csv"):
+        printed = {name: float(line[name]) for name in (*CATEGORIES, MEAN) if line[name]}
+        row = Row(line["variant"] or None, line["source"], printed)
+        rows.setdefault(line["experiment"], {})[line["method"]] = row
+    tables = {}
+    for line in _read_csv("tables.csv"):
+        name, categories = line.pop("experiment"), tuple(line["categories"].split()) or CATEGORIES
+        tables[name] = Table(**line | {"categories": categories, "seeds": int(line["seeds"]), "rows": rows[name]})
+    return tables
 
-#: By name: the tables of the paper, and three of our own.
-TABLES: dict[str, Table] = {
-    "kato": Table(_ROWS["kato"], "Vanilla-AE", "Voxel IoU on Kato's data (Table 1)"),
-    "prgan": Table(
-        _ROWS["prgan"], "PrGAN", "Comparison with PrGAN, voxel IoU on Kato's data (Table 2)", categories=_THREE
-    ),
-    "kar": Table(_ROWS["kar"], "Vanilla-AE", "Voxel IoU on Kar's data, continuous viewpoints (Table 3)", layout="kar"),
-    "ablation": Table(_ROWS["ablation"], "Proposed", "One loss term off at a time, voxel IoU on Kato's data (Table 4)"),
-    "bins": Table(
-        _ROWS["bins"], "15x20 degrees", "Number of view bins, voxel IoU on Kar's data (Table 5)", layout="kar"
-    ),
-    "mmd": Table(
-        _ROWS["mmd"],
-        "Vanilla-AE",
-        "MMD between the shape codes of different views on Kato's data (Table 6); lower is better",
-        "mmd",
-    ),
-    "pascal": Table(
-        _ROWS["pascal"],
-        "Baseline",
-        "Voxel IoU on Pascal3D+, mean of five runs (Table 7)",
-        layout="pascal3d",
-        categories=_THREE,
-        seeds=5,
-    ),
-    "plus": Table(_ROWS["plus"], "Proposed", f"What Plus adds to the proposed method, {_NO_TABLE}", **_OURS),
-    "supervision": Table(
-        _ROWS["supervision"], "Single views", f"One, two or five views behind each shape, {_NO_TABLE}", **_OURS
-    ),
-    "poses": Table(_ROWS["poses"], "Known poses", f"Plus on estimated azimuths, {_NO_TABLE}", **_OURS),
-}
+
+def _read_csv(name: str) -> list[dict[str, str]]:
+    with open(Path(__file__).with_name(name), encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+#: By name.
+TABLES = read_tables()

@@ -110,13 +110,10 @@ def save_grid(
 
     images, indices: the samples of each data set, see `choose_samples`.
     """
-    groups: dict[int, list[Run]] = {}
-    for run in runs:
-        groups.setdefault(id(run.dataset), []).append(run)
-    blocks = []
-    for group in groups.values():
-        dataset = group[0].dataset
-        samples, title = choose_samples(dataset, images, indices), dataset.category if len(groups) > 1 else "input"
+    blocks, datasets = [], {id(run.dataset): run.dataset for run in runs}.values()
+    for dataset in datasets:
+        group, samples = [run for run in runs if run.dataset is dataset], choose_samples(dataset, images, indices)
+        title = dataset.category if len(datasets) > 1 else "input"
         blocks.append(comparison_grid(group, samples, truth=truth, title=title))
     return _save(blocks, output)
 

@@ -49,7 +49,7 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
         dataset = run.dataset
         samples = spread_samples(dataset.object_ids, dataset.view_ids, MOST_CODES)
         batches = [run.method.encode(dataset.batch(part).images).float().cpu() for part in samples.split(256)]
-        codes, rows = torch.cat(batches).numpy(), samples.numpy()
+        codes = torch.cat(batches).numpy()
         points, color = embed(codes), wheel(azimuths_deg(dataset.poses)[samples].numpy() / 360 % 1.0)
         order = np.random.default_rng(0).permutation(len(points))  # so that no view covers all others
         size = float(np.clip(7000 / len(points), 4, 16))
@@ -57,7 +57,7 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
         axes.scatter(*points[order].T, c=color[order], s=size, linewidths=0)
         axes.set(xticks=[], yticks=[])
         axes.set_title(run.label, fontsize=11, pad=18)
-        accuracy = view_accuracy(codes, dataset.view_ids[rows], dataset.object_ids[rows])
+        accuracy = view_accuracy(codes, dataset.view_ids[samples.numpy()], dataset.object_ids[samples.numpy()])
         caption = "view told from the code: {:.0%} (chance {:.0%})".format(*accuracy) if accuracy else ""
         axes.text(0.5, 1.02, caption.replace("%", " %"), transform=axes.transAxes, ha="center", va="bottom", fontsize=8)
         axes.margins(0.06)

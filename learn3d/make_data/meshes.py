@@ -1,5 +1,6 @@
 """Settings of `learn3d make-dataset`, and the meshes of each split: of a folder, of a mesh pack, or generated."""
 
+import itertools
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -81,19 +82,12 @@ class DatasetConfig:
             raise ValueError("--jobs and the layout around are for shards: add --shards")
         synset_of(self.category)
         conventions.mesh_to_object(self.up, self.front_axis)
-        for name in ("views", "test", "val"):
-            value = getattr(writer, f"default_{name}")
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
-            if value == 0 and getattr(self, name) != 0:
-                raise ValueError(f"the layout {self.layout} has no {name} split; leave {name} at 0")
-        if writer.views is None and self.views != writer.default_views:
-            raise ValueError(f"the layout {self.layout} has {writer.default_views} views per object, not {self.views}")
-        if writer.fixed_splits and (self.test != writer.default_test or self.augment):
-            raise ValueError(
-                f"the splits of the layout {self.layout} are fixed: the first 80 % of the sorted ids are for training; "
-                "leave test at 0.2 and augment at 0, or choose another layout"
-            )
+        for name in ("views", "test", "val", "augment"):
+            given, usual = getattr(self, name), getattr(writer, f"default_{name}", 0)
+            if given is None:
+                object.__setattr__(self, name, usual)
+            elif given != usual and name in writer.fixed:
+                raise ValueError(f"{name} is always {usual:g} in the layout {self.layout}, got {given}; leave it out")
 
     @property
     def front_axis(self) -> str:
@@ -184,10 +178,8 @@ def object_names(files: Iterable[str]) -> list[str]:
     names: dict[str, str] = {}  # keys in lower case, as some file systems ignore case
     for file in files:
         plain = re.sub(r"\W+", "_", str(Path(file).with_suffix(""))).strip("_")[-80:] or "mesh"
-        name, number = plain, 1
-        while name.lower() in names:
-            number += 1
-            name = f"{plain}_{number}"
+        free = itertools.chain([plain], (f"{plain}_{n}" for n in itertools.count(2)))
+        name = next(name for name in free if name.lower() not in names)
         names[name.lower()] = name
     return list(names.values())
 

@@ -192,16 +192,16 @@ def make_shard(config: DatasetConfig, path: Path, number: int, items: Sequence[I
     return True
 
 
-def _parts(items: Sequence[Item]) -> Iterator[list[Item]]:
+def _parts(items: Sequence[Item]) -> list[list[Item]]:
     """The meshes of each shard: as many as make `OBJECTS_PER_SHARD` objects at most, and at least one."""
-    part: list[Item] = []
+    parts, room = [], 0
     for item in items:
-        if part and sum(each.copies for each in part) + item.copies > OBJECTS_PER_SHARD:
-            yield part
-            part = []
-        part.append(item)
-    if part:
-        yield part
+        if item.copies > room:
+            parts.append([])
+            room = OBJECTS_PER_SHARD
+        parts[-1].append(item)
+        room -= item.copies
+    return parts
 
 
 def _check_settings(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]]) -> None:

@@ -6,6 +6,7 @@ packages give the same bytes.
 """
 
 import csv
+import itertools
 import re
 import subprocess
 import tempfile
@@ -128,10 +129,8 @@ def _write_model(
             if iou > DUPLICATE_IOU:
                 raise ValueError(f"{kind}near-duplicate of {name} (surface IoU {iou:.3f})")
     stem = f"{facts['category']}/" + (re.sub(r"[^a-z0-9]+", "-", facts["stem"].lower()).strip("-") or "model")
-    name, number = stem, 1
-    while name in kept:
-        number += 1
-        name = f"{stem}-{number}"
+    free = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
+    name = next(name for name in free if name not in kept)
     kept[name] = surface
     (folder / facts["category"]).mkdir(exist_ok=True)
     (folder / f"{name}.ply").write_bytes(mesh.export(file_type="ply"))

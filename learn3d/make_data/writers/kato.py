@@ -39,19 +39,20 @@ def _images(item: RenderedObject) -> np.ndarray:
 
 
 def _join_kato(objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:
-    images = np.stack([_images(item) for item in objects]) if objects else np.zeros((0, 24, 4, 64, 64), np.uint8)
+    images = np.array([_images(item) for item in objects], np.uint8).reshape(-1, 24, 4, 64, 64)
     dataset = kato.from_arrays(images, _voxels(objects), category, split)
     return dataclasses.replace(dataset, object_names=tuple(item.name for item in objects))
 
 
 def _voxels(objects: Sequence[RenderedObject]) -> np.ndarray:
-    return np.stack([item.voxels for item in objects]) if objects else np.zeros((0, 32, 32, 32), bool)
+    return np.array([item.voxels for item in objects], bool).reshape(-1, 32, 32, 32)
 
 
 KATO = Writer(
     paths=lambda category: tuple(path.name for split in SPLITS for path in kato.split_paths("", category, split)),
     write=_write_kato,
     join=_join_kato,
+    fixed=("views",),
 )
 
 
@@ -82,20 +83,19 @@ def _write_dvr(objects: Iterable[RenderedObject], category: str, root: Path, _: 
             listing.write(f"{item.name}\n")
 
 
-DVR = Writer(paths=lambda category: (synset_of(category),), write=_write_dvr)
+DVR = Writer(paths=lambda category: (synset_of(category),), write=_write_dvr, fixed=("views",))
 
 
 def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:
-    images, depth = [np.zeros((0, 4, 64, 64), np.uint8)], [np.zeros((0, 64, 64), np.uint8)]
+    depth = []
     for item in objects:
-        images.append(_images(item))
         seen = nmr.render_depth(item.vertices, item.faces, item.poses.cameras(), image_size=64, anti_aliasing=False)
         depth.append(depth_levels(seen, item.poses).numpy())
     poses = LookAtPoses.join([item.poses for item in objects] or [LookAtPoses(*np.zeros((4, 0), np.float32))])
     return ViewDataset(
         **around.PROPERTIES.about(category, split),
-        images=np.concatenate(images),
-        depth=np.concatenate(depth),
+        images=np.array([_images(item) for item in objects], np.uint8).reshape(-1, 4, 64, 64),
+        depth=np.array(depth, np.uint8).reshape(-1, 64, 64),
         poses=poses,
         view_ids=around.BINS.ids(poses).numpy(),
         view_names=tuple(around.BINS.names()),

@@ -81,6 +81,7 @@ PASCAL3D = Writer(
     default_views=8,
     default_test=0.0,
     default_val=0.2,
+    fixed=("test",),
     convention=pascal3d.PASCAL3D,
     turn=WORLD_FROM_OBJECT,
     diagonal=2.0,

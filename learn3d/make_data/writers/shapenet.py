@@ -115,6 +115,7 @@ R2N2 = Writer(
     views=_r2n2_views,
     image_size=137,
     default_val=0.0,
+    fixed=("test", "val", "augment"),
     fixed_splits=True,
     convention=R2N2_AXES,
     tight_grid=True,

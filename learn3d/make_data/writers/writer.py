@@ -66,6 +66,7 @@ class Writer:
     default_views: int = NUM_VIEWS  # per object
     default_test: float = 0.2  # share of the test split; 0 if the layout has none
     default_val: float = 0.1  # share of the validation split; 0 if the layout has none
+    fixed: tuple[str, ...] = ()  # options (views, test, val, augment) that must have their default values
     fixed_splits: bool = False  # True if readers train on the first 80 % of the objects and test on the rest
     shared: tuple[str, ...] = ()  # files with entries for all categories of the folder
     convention: VoxelConvention = KATO
