@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 import nmr
-from learn3d.data.conventions import Definition
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
@@ -106,23 +105,19 @@ def evaluate(
 
 
 def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, detailed: bool) -> dict[str, Tensor]:
-    def occupied(definition: Definition) -> Tensor:
-        """Bool [B, 32, 32, 32] in the data set's axes."""
-        if isinstance(shapes, Meshes):
-            return dataset.convention.voxelize(shapes.vertices, shapes.faces, definition)
-        if dataset.convention.cube_side != 1.0:
-            name = dataset.convention.name
-            raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {name} voxels")
-        return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
-
-    grid = occupied("kato18")
-    precision, recall = nmr.metrics.voxel_precision_recall(grid, batch.voxels)
-    found = {"voxel_iou": nmr.metrics.voxel_iou(grid, batch.voxels), "precision": precision, "recall": recall}
-    if detailed:
-        found["voxel_iou_kato19"] = nmr.metrics.voxel_iou(occupied("kato19"), batch.voxels)
-    is_mesh = isinstance(shapes, Meshes)
-    found["hollow"] = dataset.convention.exceeds_grid(shapes.vertices, "kato18") if is_mesh else torch.zeros(len(grid))
-    return found
+    convention, definitions = dataset.convention, ("kato18", "kato19")[: 1 + detailed]
+    if isinstance(shapes, Meshes):
+        grids = [convention.voxelize(shapes.vertices, shapes.faces, definition) for definition in definitions]
+        hollow = convention.exceeds_grid(shapes.vertices, "kato18")
+    elif convention.cube_side == 1.0:
+        grids = [convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))] * len(definitions)
+        hollow = torch.zeros(len(batch))
+    else:
+        raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {convention.name} voxels")
+    precision, recall = nmr.metrics.voxel_precision_recall(grids[0], batch.voxels)
+    ious = (nmr.metrics.voxel_iou(grid, batch.voxels) for grid in grids)
+    found = dict(zip(("voxel_iou", "voxel_iou_kato19"), ious, strict=False))
+    return found | {"precision": precision, "recall": recall, "hollow": hollow}
 
 
 def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:

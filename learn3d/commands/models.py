@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 import tyro
 
 from learn3d.commands.command import Command, OnDataset, Runs, Which
-from learn3d.experiments.measurement import class_means, describe_measures, evaluate_runs, format_table
+from learn3d.experiments.measurement import MEASURES, class_means, evaluate_runs, format_table
 from learn3d.files.writing import check_target, write_json
 from learn3d.reconstruction import cut_out_pictures, load_model, reconstruct_dataset, reconstruct_files
 from learn3d.runs.export import export
-from learn3d.terminal import say
+from learn3d.terminal import align, say
 
 
 class Evaluate(OnDataset):
@@ -32,7 +32,8 @@ class Evaluate(OnDataset):
     @classmethod
     def about(cls, everything: bool) -> str:
         columns = "Columns of the table (means over the images, then over the categories; - if there is no value):"
-        return f"{super().about(everything)}\n\n{columns}\n{describe_measures()}"
+        measures = align([("", *measure) for measure in MEASURES.values()])
+        return f"{super().about(everything)}\n\n{columns}\n{measures}"
 
     def run(self) -> None:
         if self.json is not None:

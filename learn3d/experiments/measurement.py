@@ -144,11 +144,6 @@ def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[Objec
     return objects
 
 
-def describe_measures() -> str:
-    """One line for each measure: its header and definition."""
-    return align([("", *measure) for measure in MEASURES.values()])
-
-
 def format_table(results: Sequence[Result]) -> str:
     """The results as a text table: a line per result, then the mean over categories of each method."""
     rows = [("class", "method", "seed", "iterations", "images", *HEADERS)]
