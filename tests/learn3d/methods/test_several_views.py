@@ -243,7 +243,7 @@ def test_it_learns_the_shapes(dataset: ViewDataset) -> None:
 
 
 def test_the_layout_is_made_as_shards_alone(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="layout around is made as shards: add --shards"):
+    with pytest.raises(ValueError, match="the layout around are for shards: add --shards"):
         DatasetConfig(output=tmp_path, category="table", procedural=4, layout="around")
     with pytest.raises(FileNotFoundError, match="has no shards of table, train"):
         load_dataset("around", tmp_path, "table", "train")
