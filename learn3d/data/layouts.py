@@ -76,9 +76,7 @@ def load_dataset(
     try:
         dataset = concatenate([_read_split(layout, folder, name, split, **options) for name in names])
     except (DamagedFile, MissingFile) as error:
-        if others := _other_layouts(folder, layout):
-            hint = f"this is a data set of the layout {others[0]!r}, not {layout!r}; give another folder, or train "
-            raise MissingFile(Path(folder), f"{hint}with a preset for it, or with --layout {others[0]}") from None
+        _check_layout(folder, layout)
         check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
         message = f"{error.message}. To list all faults of the data set, run: {check}"
         raise type(error)(error.path, message) from error
@@ -100,13 +98,16 @@ def _read_split(
     return READERS[layout].load(folder, category, split, findings=findings, **known)
 
 
-def _other_layouts(folder: Path | str, asked: str) -> list[str]:
-    """The layouts of a folder's data sets; [] if `asked` is one of them."""
+def _check_layout(folder: Path | str, asked: str) -> None:
+    """Raise MissingFile if all data sets of a folder have other layouts."""
     found = []
     for layout, reader in READERS.items():
         with contextlib.suppress(ValueError, OSError):  # a list of objects is damaged, or of another layout
             found += [layout] * bool(reader.contents(folder))
-    return [] if asked in found else found
+    if found and asked not in found:
+        advice = f"add --layout {found[0]}, or choose another folder or preset"
+        message = f"this is a data set of the layout {found[0]!r}, not {asked!r}; {advice}"
+        raise MissingFile(Path(folder), message) from None
 
 
 @dataclass(frozen=True)
@@ -156,9 +157,8 @@ def check_folder(
         for category, there in READERS[layout].contents(folder).items():
             found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))
     if not found and not categories:
-        others = _other_layouts(folder, layout)
-        hint = f"it is a data set of the layout {others[0]!r}: add --layout {others[0]}" if others else "see its files"
-        raise FileNotFoundError(f"{folder} holds nothing of the layout {layout!r}; {hint} (docs/data-sets.md)")
+        _check_layout(folder, layout)
+        raise MissingFile(Path(folder), f"holds nothing of the layout {layout!r}; its files: docs/data-sets.md")
     reports = []
     for category in categories or found:
         for split in splits or found.get(category) or found.get(synset_of(category)) or SPLITS:

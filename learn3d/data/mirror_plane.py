@@ -34,24 +34,20 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
         )
     sectors = np.rint(dataset.poses.azimuth_deg.numpy() / SECTOR_DEG).astype(int) % _SECTORS
     means = np.zeros((_SECTORS, MASK_SIZE, MASK_SIZE))
-    known = np.zeros(_SECTORS, bool)
     noise = np.zeros(_SECTORS)  # expected squared error of each mean, summed over pixels
-    for sector in range(_SECTORS):
+    known = np.bincount(sectors, minlength=_SECTORS) >= _MIN_IMAGES
+    for sector in np.flatnonzero(known):
         samples = np.flatnonzero(sectors == sector)
-        if len(samples) < _MIN_IMAGES:
-            continue
         part = np.linspace(0, len(samples) - 1, min(len(samples), _MAX_IMAGES)).round().astype(int)
         masks = dataset.read_masks(samples[part]) / np.float32(255)
-        means[sector], known[sector] = masks.mean(axis=0), True
-        noise[sector] = masks.var(axis=0).sum() / (len(masks) - 1)
+        means[sector], noise[sector] = masks.mean(axis=0), masks.var(axis=0).sum() / (len(masks) - 1)
     differences = np.full(_SECTORS, np.inf)
     for plane in range(_SECTORS):  # its azimuth is plane * SECTOR_DEG / 2
         other = (plane - np.arange(_SECTORS)) % _SECTORS
         compared = known & known[other]
-        if compared.sum() < max(1, min(_MIN_SECTORS, known.sum())):
-            continue
-        squares = np.square(means - means[other][..., ::-1]).sum(axis=(1, 2))
-        differences[plane] = np.mean((squares - (noise + noise[other]))[compared])
+        if compared.sum() >= max(1, min(_MIN_SECTORS, known.sum())):
+            squares = np.square(means - means[other][..., ::-1]).sum(axis=(1, 2))
+            differences[plane] = np.mean((squares - (noise + noise[other]))[compared])
     seen = np.isfinite(differences)
     if seen.sum() < max(_MIN_PLANES, known.sum()):
         return None

@@ -16,7 +16,7 @@ import torch
 
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import LookAtPoses, PoseCandidates, wrap_deg
-from learn3d.data.readers.photos import view_classes
+from learn3d.data.view_bins import view_classes
 from learn3d.files import npz
 from learn3d.files.reading import DamagedFile
 from learn3d.files.sandbox import read

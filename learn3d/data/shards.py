@@ -68,7 +68,7 @@ class SetFile:
     image_size: Annotated[int, Field(ge=1, le=4096)]
     view_names: Annotated[list[Text], Field(max_length=limits.VIEW_CLASSES)]
     poses: Literal[(None, *_POSES)]  # class of the poses; None if they are unknown
-    constants: dict[Text, Annotated[float, Field(allow_inf_nan=False)]]  # fields of the poses with one value for all
+    constants: dict[Text, float]  # fields of the poses with one value for all
 
 
 def split_folder(folder: Path | str, category: str, split: str) -> Path:

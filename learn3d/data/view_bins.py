@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Annotated
 
@@ -10,9 +11,14 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+import nmr
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.files import limits
 from learn3d.settings import Positive, checked
+
+AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
+ELEVATION_WIDTH_DEG = 20
+IMAGES_PER_CLASS = 8  # smallest mean number of images per view class
 
 
 @checked
@@ -88,3 +94,33 @@ def training_classes(
     cells[unseen] = training[0][(views[1][unseen] @ training[1].T).argmax(axis=1)]
     kept = np.unique(training[0])
     return np.searchsorted(kept, cells), kept
+
+
+def choose_bins(poses: LookAtPoses) -> AngleBins:
+    """Cells of azimuth and elevation for images with these poses.
+
+    The elevation width is about 20 degrees. The azimuth width is the smallest of AZIMUTH_WIDTHS_DEG for which occupied
+    cells have IMAGES_PER_CLASS images or more on average.
+    """
+    elevations = torch.as_tensor(poses.elevation_deg)
+    low = math.floor(float(elevations.min()))
+    high = max(math.ceil(float(elevations.max())), low + 1)
+    rows = max(1, round((high - low) / ELEVATION_WIDTH_DEG))
+    for width in AZIMUTH_WIDTHS_DEG:
+        bins = AngleBins(width, (high - low) / rows, low, high)
+        if len(poses) >= IMAGES_PER_CLASS * len(bins.ids(poses).unique()):
+            break
+    return bins
+
+
+def view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Class int64 [M] in 0 .. K-1 of each of M poses, and the K names. Classes are the cells of `training`."""
+    bins = choose_bins(training)
+    names = bins.names()
+
+    def describe(poses: LookAtPoses) -> tuple[np.ndarray, np.ndarray]:
+        eyes = nmr.cameras.points_from_angles(1.0, poses.elevation_deg, poses.azimuth_deg)
+        return bins.ids(poses).numpy(), eyes.numpy()
+
+    ids, kept = training_classes(describe(poses), describe(training))
+    return ids, tuple(names[k] for k in kept)

@@ -17,17 +17,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
 from pydantic import Field
 from tqdm import tqdm
 
-import nmr
 from learn3d.data.categories import SPLITS, synset_of
 from learn3d.data.conventions import KATO, LayoutProperties
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
-from learn3d.data.view_bins import AngleBins, training_classes
+from learn3d.data.view_bins import view_classes
 from learn3d.files import limits
 from learn3d.files.reading import STRICT, DamagedFile, Findings, read_text
 from learn3d.files.sandbox import Call, read_all
@@ -35,9 +33,6 @@ from learn3d.settings import checked
 from learn3d.terminal import is_watched
 
 PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("image_size",))
-AZIMUTH_WIDTHS_DEG = (15, 20, 30, 45, 60, 90)
-ELEVATION_WIDTH_DEG = 20
-PHOTOS_PER_CLASS = 8  # smallest mean number of photographs per view class
 _SCALE_ODD = 1.7  # factor between sizes in images and table that gives a warning; half angles for whole ones give 2
 _SCALE_OFF = 5.0  # factor that is an error: distances are in another unit
 TABLE = "poses.csv"
@@ -68,7 +63,7 @@ def load(
     """Read a split of the photographs in `folder/category`.
 
     image_size: side of the images in pixels. They have Kato's form (`framing.frame`), for which methods and presets are
-    made. View classes are the cells of azimuth and elevation (`choose_bins`) with training photographs. Another
+    made. View classes are the cells of azimuth and elevation (`view_bins.choose_bins`) with training photographs. Another
     photograph gets the class of the training photograph with the nearest direction.
     """
     synset_of(category)  # raises ValueError for a path, which would lead to other folders
@@ -120,36 +115,6 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
             splits = set(split_objects(table, read_table(table, Findings())).values()) or splits
         found[table.parent.name] = tuple(name for name in SPLITS if name in splits)
     return found
-
-
-def choose_bins(poses: LookAtPoses) -> AngleBins:
-    """Cells of azimuth and elevation for photographs with these poses.
-
-    The elevation width is about 20 degrees. The azimuth width is the smallest of AZIMUTH_WIDTHS_DEG for which occupied
-    cells have PHOTOS_PER_CLASS photographs or more on average.
-    """
-    elevations = torch.as_tensor(poses.elevation_deg)
-    low = math.floor(float(elevations.min()))
-    high = max(math.ceil(float(elevations.max())), low + 1)
-    rows = max(1, round((high - low) / ELEVATION_WIDTH_DEG))
-    for width in AZIMUTH_WIDTHS_DEG:
-        bins = AngleBins(width, (high - low) / rows, low, high)
-        if len(poses) >= PHOTOS_PER_CLASS * len(bins.ids(poses).unique()):
-            break
-    return bins
-
-
-def view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Class int64 [M] in 0 .. K-1 of each of M poses, and the K names. Classes are the cells of `training`."""
-    bins = choose_bins(training)
-    names = bins.names()
-
-    def describe(poses: LookAtPoses) -> tuple[np.ndarray, np.ndarray]:
-        eyes = nmr.cameras.points_from_angles(1.0, poses.elevation_deg, poses.azimuth_deg)
-        return bins.ids(poses).numpy(), eyes.numpy()
-
-    ids, kept = training_classes(describe(poses), describe(training))
-    return ids, tuple(names[k] for k in kept)
 
 
 def _poses(photos: list[Photo]) -> LookAtPoses:

@@ -20,6 +20,7 @@ from learn3d.data.layouts import check_folder, load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import photos
 from learn3d.data.readers.photos import split_objects
+from learn3d.data.view_bins import choose_bins, view_classes
 from learn3d.evaluation import evaluate
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
@@ -158,7 +159,7 @@ def test_the_split_of_an_object_is_a_matter_of_its_name(made: Path) -> None:
 def test_default_view_classes_suit_the_photos(elevations, azimuths, count, width, rows) -> None:
     rng = np.random.default_rng(0)
     poses = LookAtPoses(rng.uniform(*azimuths, count), rng.uniform(*elevations, count), 3.0, 20.0)
-    bins = photos.choose_bins(poses)
+    bins = choose_bins(poses)
     assert bins.azimuth_width_deg == width and bins.shape[1] == rows
     assert bins.elevation_low_deg <= elevations[0] + 1 and bins.elevation_high_deg >= elevations[1] - 1
 
@@ -166,7 +167,7 @@ def test_default_view_classes_suit_the_photos(elevations, azimuths, count, width
 def test_a_direction_without_training_photos_gets_the_nearest_class() -> None:
     training = LookAtPoses(torch.tensor([0.0] * 8 + [100.0] * 8), torch.full((16,), 20.0), 3.0, 20.0)
     other = LookAtPoses(torch.tensor([1.0, 140.0, -60.0, -100.0]), torch.full((4,), 20.0), 3.0, 20.0)
-    ids, names = photos.view_classes(other, training)
+    ids, names = view_classes(other, training)
     assert len(names) == 2 and ids.tolist() == [0, 1, 0, 0]
 
 
