@@ -10,7 +10,6 @@ import numpy as np
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile, MissingFile, open_file, read_bytes
 
-WEIGHTS_LIMITS = {"memory": 2**30, "seconds": 30.0}  # of `read_state_dict`, for importing torch
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # trimesh reads these without further packages
 _MEMORY_PER_BYTE = 30  # trimesh takes about 20 times the size of a text file
 _BYTES_PER_SECOND = 1e6  # trimesh is about twice as fast
@@ -104,11 +103,11 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
 
     No code in the file is executed (weights_only). Raises DamagedFile if it is not a state dict.
     """
+    with open_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18") as file:
+        sandbox.allow(3 * 2**28 + 4 * os.fstat(file.fileno()).st_size, 25.0)  # most of it for importing torch
     import torch
     from safetensors.torch import load_file
 
-    with open_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18") as file:
-        sandbox.allow(4 * os.fstat(file.fileno()).st_size)
     is_torch = path.suffix != ".safetensors"
     weights = torch.load(path, map_location="cpu", weights_only=True) if is_torch else load_file(path)
     if not isinstance(weights, dict) or not all(isinstance(value, torch.Tensor) for value in weights.values()):

@@ -89,7 +89,7 @@ def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
     Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has weights of another network.
     """
     wanted = "weights of torchvision's resnet18"
-    read = sandbox.read(formats.read_state_dict, path, wanted=wanted, **formats.WEIGHTS_LIMITS)
+    read = sandbox.read(formats.read_state_dict, path, wanted=wanted)
     given = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
     own = {name: value for name, value in encoder.state_dict().items() if not name.startswith("code.")}
     for name in sorted(own.keys() | given.keys()):

@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime
+import functools
 import importlib.util
 import json
 import os
@@ -74,7 +75,9 @@ class RunLog(contextlib.ExitStack):
         self._metrics.write(json.dumps({"step": step, "split": split, **values}).encode() + b"\n")
         self._metrics.flush()
         if self._writer is not None:
-            _add_numbers(self._writer, step, split, **values)
+            for name, value in values.items():
+                if isinstance(value, (int, float)):
+                    self._writer.add_scalar(f"{split}/{name}", value, step)
 
     def picture(self, step: int, name: str, rgb: np.ndarray) -> None:
         """Pass a picture uint8 [H,W,3] to the writer."""
@@ -102,7 +105,8 @@ def check_log(config: TrainConfig) -> None:
 def _open_writer(config: TrainConfig, start: int) -> Any:
     """The second log: TensorBoard's SummaryWriter, or an object with its methods."""
     if config.log == "csv":
-        return _Csv(config.output)
+        write, ignore = functools.partial(_write_csv, config.output), lambda *_, **__: None
+        return types.SimpleNamespace(add_scalar=ignore, add_image=ignore, flush=write, close=write)
     if config.log == "wandb":
         return _open_wandb(config)
     from torch.utils.tensorboard import SummaryWriter
@@ -110,32 +114,15 @@ def _open_writer(config: TrainConfig, start: int) -> Any:
     return SummaryWriter(str(config.output / TENSORBOARD), purge_step=start + 1)
 
 
-def _add_numbers(writer: Any, step: int, split: str, **values: Any) -> None:
-    """Pass the numbers in a line of metrics.jsonl to a writer."""
-    for name, value in values.items():
-        if isinstance(value, (int, float)):
-            writer.add_scalar(f"{split}/{name}", value, step)
-
-
-class _Csv:
-    """metrics.csv: a row for each number, with the columns step, name, value. Earlier rows come from metrics.jsonl."""
-
-    def __init__(self, folder: Path) -> None:
-        writing.write_bytes(folder / METRICS_CSV, b"step,name,value\n", sync=True)
-        self._file = open(folder / METRICS_CSV, "a")
-        self.close = self._file.close
-        for values in map(json.loads, (folder / METRICS).read_bytes().splitlines()):
-            _add_numbers(self, **values)
-
-    def add_scalar(self, name: str, value: float, step: int) -> None:
-        self._file.write(f"{step},{name},{value}\n")
-
-    def add_image(self, name: str, rgb: np.ndarray, step: int, dataformats: str) -> None:
-        """Do nothing: a table holds no pictures."""
-
-    def flush(self) -> None:
-        self._file.flush()
-        os.fsync(self._file.fileno())
+def _write_csv(folder: Path) -> None:
+    """Write metrics.csv: a row for each number in metrics.jsonl, with the columns step, name, value."""
+    rows = ["step,name,value\n"]
+    for record in map(json.loads, (folder / METRICS).read_bytes().splitlines()):
+        step, split = record.pop("step"), record.pop("split", "")
+        rows += [
+            f"{step},{split}/{name},{value}\n" for name, value in record.items() if isinstance(value, (int, float))
+        ]
+    writing.write_bytes(folder / METRICS_CSV, "".join(rows).encode(), sync=True)
 
 
 def _open_wandb(config: TrainConfig) -> types.SimpleNamespace:

@@ -151,7 +151,7 @@ def weights_target(tmp: Path) -> Target:
 
     def read(folder: Path) -> None:
         for name in ("a.pth", "b.pth"):
-            sandbox.read(formats.read_state_dict, folder / name, **formats.WEIGHTS_LIMITS)
+            sandbox.read(formats.read_state_dict, folder / name)
 
     return Target(tmp, {"a.pth": m.damage_zip(), "b.pth": m.damage}, read)
 
