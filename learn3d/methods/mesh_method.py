@@ -15,16 +15,9 @@ from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.losses import pose_classification_loss
 from learn3d.methods.method import Meshes, Method, MethodSettings
-from learn3d.networks import (
-    ENCODERS,
-    GENERATORS,
-    EncoderName,
-    GeneratorName,
-    MeshGenerator,
-    SymmetryOption,
-    network_input,
-)
-from learn3d.networks.encoders import ViewClassifier
+from learn3d.methods.optimization import adam
+from learn3d.networks.encoders import ENCODERS, EncoderName, ViewClassifier, network_input
+from learn3d.networks.generators import GENERATORS, GeneratorName, MeshGenerator, SymmetryOption
 from learn3d.networks.resnet import load_pretrained
 from learn3d.settings import FilePath, Positive, checked
 
@@ -37,7 +30,9 @@ CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts 
 class MeshSettings(MethodSettings):
     """Networks from images to meshes."""
 
-    lambda_view = 0.0  # methods that learn to classify the azimuth of an image make it a field
+    # Subclasses may make these fields.
+    lambda_view = 0.0  # weight of the loss of a network that classifies the azimuth of an image
+    adam_beta1 = 0.9
 
     encoder: EncoderName = "conv"
     """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask. conv-light: half the channels,
@@ -119,6 +114,12 @@ class MeshMethod(Method):
             return {}
         classifier = ViewClassifier(AZIMUTHS.count, self.info.inverted)
         return {"view_classifier": classifier.to(memory_format=torch.channels_last)}
+
+    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Adam for each network that has weights."""
+        trained = {name: network for name, network in self.networks.items() if list(network.parameters())}
+        rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
+        return {name: adam(network, rate, betas) for name, network in trained.items()}
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

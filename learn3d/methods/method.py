@@ -15,7 +15,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch, DatasetInfo
-from learn3d.methods.optimization import EMA, TrainingSchedule, adam, backpropagate
+from learn3d.methods.optimization import EMA, TrainingSchedule, backpropagate
 from learn3d.pictures.surfaces import Surface
 from learn3d.settings import checked
 
@@ -126,10 +126,9 @@ class Method(abc.ABC):
     def create_networks(self) -> dict[str, nn.Module]:
         """The networks by name, for `settings` and `info`. Raises ValueError if these contradict each other."""
 
+    @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Optimizers by name, with the learning rates of the settings; `take_step` applies the schedule."""
-        trained = {name: network for name, network in self.networks.items() if list(network.parameters())}
-        return {name: adam(network, self.settings.learning_rate) for name, network in trained.items()}
 
     @abc.abstractmethod
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
@@ -205,4 +204,4 @@ class Method(abc.ABC):
 
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision; losses and rendering belong outside it."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16")
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16")

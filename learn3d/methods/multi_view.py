@@ -15,7 +15,8 @@ from learn3d.data.sampling import GROUP_SIZE
 from learn3d.losses import depth_loss, gaussian_prior_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.optimization import SparseGradientAdam
-from learn3d.networks import EncoderName, GeneratorName, SymmetryOption
+from learn3d.networks.encoders import EncoderName
+from learn3d.networks.generators import GeneratorName, SymmetryOption
 from learn3d.settings import Positive, Weight, checked
 
 CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative to the other layers
@@ -37,12 +38,13 @@ class MultiView(MeshMethod):
     settings: MultiViewSettings
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        rate = self.settings.learning_rate
-        layers = {"encoder": list(self.encoder.parameters()), "generator": [], "centroid": []}
-        for name, parameter in self.generator.named_parameters():
-            layers["centroid" if name.startswith("centroid.") else "generator"].append(parameter)
-        rates = {name: CENTROID_LEARNING_RATE * rate if name == "centroid" else rate for name in layers}
-        return {name: SparseGradientAdam(found, lr=rates[name]) for name, found in layers.items() if found}
+        rate, layers = self.settings.learning_rate, dict(self.generator.named_parameters())
+        centroid = [layers.pop(name) for name in list(layers) if name.startswith("centroid.")]
+        trained = {"encoder": self.encoder.parameters(), "generator": layers.values()}
+        optimizers = {name: SparseGradientAdam(parameters, lr=rate) for name, parameters in trained.items()}
+        if centroid:  # the generator "bounded" has this layer
+            optimizers["centroid"] = SparseGradientAdam(centroid, lr=CENTROID_LEARNING_RATE * rate)
+        return optimizers
 
     def check_batch(self, batch: Batch) -> None:
         check_groups(batch, 2, "pairs")

@@ -15,7 +15,7 @@ from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
 from learn3d.methods.method import Grids, Method, MethodSettings
 from learn3d.methods.optimization import adam, frozen
-from learn3d.networks import network_input
+from learn3d.networks.encoders import network_input
 from learn3d.networks.voxel_gan import (
     DISCRIMINATOR_CHANNELS,
     GENERATOR_CHANNELS,

@@ -18,10 +18,10 @@ from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.poses import Poses
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
-from learn3d.methods.optimization import adam, frozen
-from learn3d.networks import ENCODERS, GENERATORS
+from learn3d.methods.optimization import frozen
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
-from learn3d.networks.encoders import PreactResNet18
+from learn3d.networks.encoders import ENCODERS, PreactResNet18
+from learn3d.networks.generators import GENERATORS
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.settings import Channels, Pixels, Positive, Weight, checked
@@ -135,10 +135,6 @@ class VPL(MeshMethod):
         else:
             discriminator = OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
         return networks | {"discriminator": discriminator}
-
-    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
-        return {name: adam(network, rate, betas) for name, network in self.networks.items()}
 
     @property
     def weights(self) -> dict[str, float]:

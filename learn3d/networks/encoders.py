@@ -168,9 +168,10 @@ def network_input(images: Tensor, device: torch.device | str, size: int = 64) ->
 class PreactResNet18(nn.Module):
     """Images [B,4,S,S] in [0,1] -> shape code [B,512], unbounded; S is a multiple of 32 (published: 224).
 
-    As published by Kato and Harada 2019: grey background; 7x7 convolution of stride 2, batch norm, ReLU, 3x3 maximum of
-    stride 2; four stages of two blocks with 64, 128, 256, 512 channels, with batch norm and ReLU before each
-    convolution; batch norm, ReLU; a linear layer from all 512 * (S/32)^2 features. He's initial weights.
+    As published by Kato and Harada 2019: colours in [-1,1], 0 (grey) if the mask is 0; 7x7 convolution of stride 2,
+    batch norm, ReLU, 3x3 maximum of stride 2; four stages of two blocks with 64, 128, 256, 512 channels, with batch
+    norm and ReLU before each convolution; batch norm, ReLU; a linear layer from all 512 * (S/32)^2 features. He's
+    initial weights.
     """
 
     def __init__(self, image_size: int = 224, channels: int = 64) -> None:
@@ -185,7 +186,8 @@ class PreactResNet18(nn.Module):
         self.code = nn.Linear(8 * channels * (image_size // 32) ** 2, CODE_SIZE)
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.code(self.layers(grey_background(images)))
+        # Inverted colours (Kato's files) get the opposite sign, which makes no difference to training from scratch.
+        return self.code(self.layers((2 * images[:, :3] - 1) * images[:, 3:]))
 
 
 class _Block(nn.Module):
@@ -206,11 +208,3 @@ class _Block(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         return self.shortcut(features) + self.residual(features)
-
-
-def grey_background(images: Tensor) -> Tensor:
-    """RGB and mask [B,4,S,S] in [0,1] -> colours [B,3,S,S] in [-1,1], 0 (grey) if the mask is 0.
-
-    Inverted colours (Kato's files) get the opposite sign, which makes no difference to training from scratch.
-    """
-    return (2 * images[:, :3] - 1) * images[:, 3:]

@@ -207,20 +207,16 @@ Table = tuple[Tensor, Tensor, Tensor]  # a sparse matrix by rows: columns int32,
 def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) -> tuple[Table, Table]:
     """The linear map of one view as a sparse matrix [S^2 pixels, S^3 voxels], and its transpose."""
     points = views.sample_points(float(views.azimuth_deg(torch.tensor(view_id))), size)
-    position = (points + 0.5) * size - 0.5  # in voxels; centres are whole numbers
+    position = (points.movedim(3, 0) + 0.5) * size - 0.5  # in voxels; centres are whole numbers
     low = position.floor()
-    above, low = position - low, low.long()
-    pixel = torch.arange(size * size).reshape(size, size, 1).expand(points.shape[:3])
-    pixels, voxels, values = [], [], []
-    for corner in itertools.product((0, 1), repeat=3):
-        x, y, z = (low[..., axis] + corner[axis] for axis in range(3))
-        weight = math.prod(above[..., axis] if corner[axis] else 1 - above[..., axis] for axis in range(3))
-        inside = (weight > 0) & (x >= 0) & (x < size) & (y >= 0) & (y < size) & (z >= 0) & (z < size)
-        pixels.append(pixel[inside])
-        voxels.append(((x * size + y) * size + z)[inside])
-        values.append(weight[inside])
+    corners = torch.cartesian_prod(*[torch.arange(2)] * 3).view(8, 3, 1, 1, 1)
+    cells = low.int() + corners.int()  # [8, 3, size, size, D]: the voxels around each point
+    shares = torch.where(corners == 1, position - low, 1 - (position - low)).prod(1)
+    inside = (shares > 0) & ((cells >= 0) & (cells < size)).all(1)
+    pixels = torch.arange(size**2).view(size, size, 1).expand_as(inside)[inside]
+    voxels = ((cells[:, 0] * size + cells[:, 1]) * size + cells[:, 2])[inside]
     step = 2 * views.half_width  # distance of samples in voxels: (2 half_width / size) / (1 / size)
-    indices, weights = torch.stack([torch.cat(pixels), torch.cat(voxels)]), torch.cat(values) * step
+    indices, weights = torch.stack([pixels, voxels]), shares[inside] * step
     with torch.sparse.check_sparse_tensor_invariants(False):  # older torch warns if nobody chooses
         matrix = torch.sparse_coo_tensor(indices, weights, (size**2, size**3)).coalesce()
         return _by_rows(matrix, device), _by_rows(matrix.t().coalesce(), device)

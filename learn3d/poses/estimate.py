@@ -33,7 +33,8 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.pose_table import MAX_CANDIDATES
-from learn3d.networks import CODE_SIZE, GENERATORS
+from learn3d.networks.encoders import CODE_SIZE
+from learn3d.networks.generators import GENERATORS
 from learn3d.settings import Rare, checked
 
 SIZE = 32  # side of the compared masks and renderings, in pixels

@@ -9,9 +9,8 @@ import torch
 from torch import nn
 
 from learn3d.methods import Method, vpl
-from learn3d.networks import ENCODERS, GENERATORS, Symmetry
-from learn3d.networks.encoders import CODE_SIZE, PreactResNet18, SmallConvEncoder
-from learn3d.networks.generators import SmallSphereGenerator
+from learn3d.networks.encoders import CODE_SIZE, ENCODERS, PreactResNet18, SmallConvEncoder
+from learn3d.networks.generators import GENERATORS, SmallSphereGenerator, Symmetry
 from learn3d.networks.layers import linear_layers
 
 

@@ -19,7 +19,8 @@ from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.methods.pose_invariant import PoseInvariantSettings
-from learn3d.networks import ENCODERS, GENERATORS
+from learn3d.networks.encoders import ENCODERS
+from learn3d.networks.generators import GENERATORS
 from learn3d.presets import PRESETS
 from learn3d.training import train
 

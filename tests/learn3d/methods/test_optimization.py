@@ -14,7 +14,7 @@ from torch import nn
 
 from learn3d.methods import DatasetInfo, Method, TrainingSchedule, create_method
 from learn3d.methods.optimization import EMA, adam, backpropagate
-from learn3d.networks import ENCODERS
+from learn3d.networks.encoders import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.training import train

@@ -19,8 +19,7 @@ from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods import create_method
 from learn3d.methods.method import DatasetInfo
 from learn3d.methods.vpl import VPL, VPLSettings, other_views
-from learn3d.networks import GENERATORS
-from learn3d.networks.generators import ConvCubeGenerator, LinearCubeGenerator
+from learn3d.networks.generators import GENERATORS, ConvCubeGenerator, LinearCubeGenerator
 from learn3d.presets import PRESETS
 
 REIMPLEMENTED = VPLSettings(discriminator_channels=8, lambda_discriminator=0.1, learning_rate=1e-3)

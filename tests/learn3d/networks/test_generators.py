@@ -9,8 +9,15 @@ import torch
 from torch import Tensor, nn
 
 import nmr
-from learn3d.networks import GENERATORS, MeshGenerator, Symmetry
-from learn3d.networks.generators import ConvCubeGenerator, CubeGenerator, LinearCubeGenerator, cube_surface
+from learn3d.networks.generators import (
+    GENERATORS,
+    ConvCubeGenerator,
+    CubeGenerator,
+    LinearCubeGenerator,
+    MeshGenerator,
+    Symmetry,
+    cube_surface,
+)
 
 PLANES = {"x": 0.0, "z": 90.0, 0.0: 0.0, 37.5: 37.5, -90.0: -90.0}
 

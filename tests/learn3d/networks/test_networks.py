@@ -14,15 +14,14 @@ from vectors import load_vector
 from learn3d import device as precision_module
 from learn3d.device import resolve_precision
 from learn3d.methods import DatasetInfo, Method, create_method
-from learn3d.networks import ENCODERS, GENERATORS, network_input
 from learn3d.networks.discriminators import (
     OneHotViewDiscriminator,
     PatchDiscriminator,
     SpectralPatchDiscriminator,
     pose_discriminator,
 )
-from learn3d.networks.encoders import CENTRED_SIZE, EncoderName, PreactResNet18, centre, grey_background
-from learn3d.networks.generators import ConvCubeGenerator, LinearCubeGenerator, deform_sphere
+from learn3d.networks.encoders import CENTRED_SIZE, ENCODERS, EncoderName, PreactResNet18, centre, network_input
+from learn3d.networks.generators import GENERATORS, ConvCubeGenerator, LinearCubeGenerator, deform_sphere
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.networks.voxel_gan import InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
@@ -191,8 +190,11 @@ def test_generator_rule_vectors() -> None:
 
 
 def test_background_of_preact_is_grey() -> None:
-    images = torch.tensor([[0.0, 1.0, 0.5, 0.0], [0.0, 1.0, 0.5, 1.0]])[:, :, None, None]
-    assert grey_background(images).flatten(1).tolist() == [[0, 0, 0], [-1, 1, 0]]
+    images = torch.tensor([[0.0, 1.0, 0.5, 0.0], [0.0, 1.0, 0.5, 1.0]])[:, :, None, None].expand(2, 4, 32, 32)
+    network, seen = PreactResNet18(32, channels=4), []
+    network.layers[0].register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
+    network(images)
+    assert seen[0][:, :, 0, 0].tolist() == [[0, 0, 0], [-1, 1, 0]]
 
 
 def test_network_input_scales_bytes_to_the_unit_interval() -> None:
@@ -262,10 +264,9 @@ def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> Non
     assert torch.equal(centre(image), image)
 
 
-def create(preset: str, seed: int = 0, device: str = "cpu") -> Method:
-    return create_method(
-        PRESETS[preset].settings, DatasetInfo(24, inverted=False), device=device, precision="fp32", seed=seed
-    )
+def create(preset: str, seed: int = 0, device: str = "cpu", precision: str = "fp32") -> Method:
+    info = DatasetInfo(24, inverted=False)
+    return create_method(PRESETS[preset].settings, info, device=device, precision=precision, seed=seed)
 
 
 def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
@@ -290,12 +291,9 @@ def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, flags: str, wante
 
 
 def test_bf16_changes_results_little() -> None:
-    networks = create("peng2020-kato-vanilla").networks
-    images = torch.rand(1, 4, 64, 64)
+    images = torch.randint(256, (1, 4, 64, 64), dtype=torch.uint8)
     with torch.no_grad():
-        exact = networks["generator"](networks["encoder"](images))
-        with torch.autocast("cpu", torch.bfloat16):
-            rough = networks["generator"](networks["encoder"](images))
+        exact, rough = (create("peng2020-kato-vanilla", precision=p).predict(images)[1] for p in ("fp32", "bf16"))
     assert rough.dtype == torch.float32
     assert 0 < (rough - exact).abs().max() < 0.005
 
