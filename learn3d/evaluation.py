@@ -13,8 +13,7 @@ import nmr
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.losses import mmd
 from learn3d.methods import Grids, Meshes, Method
-from learn3d.methods.method import grid_surface
-from learn3d.pictures.surfaces import Surface
+from learn3d.pictures.surfaces import Surface, grid_surface
 
 #: A function that aligns the predicted shapes of a batch with the true ones; see `evaluate`.
 Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]

@@ -13,9 +13,8 @@ from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.evaluation import spread_samples
 from learn3d.figures.runs import Run
 from learn3d.methods import Method
-from learn3d.methods.method import grid_surface
 from learn3d.pictures.sheets import TILE, magnify, natural_colors, save_png, tile
-from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
+from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, grid_surface, orbit
 
 TURNS_DEG = (0, 60, 120, 180, 240, 300)  # views of a shape, counted from the input's view
 TILE_SIZE = 128  # pixels of a picture in a comparison

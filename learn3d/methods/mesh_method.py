@@ -1,4 +1,4 @@
-"""What is asked of methods that learn meshes from rendered silhouettes: settings, networks, losses of the surface."""
+"""Base classes of the methods that learn meshes from silhouettes; and `refine`, which fits meshes to masks."""
 
 from __future__ import annotations
 

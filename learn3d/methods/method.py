@@ -1,4 +1,4 @@
-"""What is asked of every method: settings, training step, and the way from images to shapes."""
+"""Base classes of every method: settings, training step, prediction of shapes from images."""
 
 from __future__ import annotations
 
@@ -8,23 +8,21 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.methods.optimization import EMA, TrainingSchedule, backpropagate
-from learn3d.pictures.surfaces import Surface
+from learn3d.pictures.surfaces import Surface, grid_surface
 from learn3d.settings import checked
 
 
 @checked
 class MethodSettings:
-    """Settings of a method, and what a run asks of them. Subclasses override these values, some by properties."""
+    """Settings of a method. A run also reads the values below, which subclasses override, some by properties."""
 
-    # They have no annotation, as they are no fields.
+    # These values have no annotation, so they are no fields: nobody can set them.
     image_size = 64  # side of the encoder's input images in pixels
     reads_view_ids = False  # whether training depends on the view classes
     wants_mirror_plane = False  # whether networks depend on the mirror plane of the training data
@@ -67,29 +65,8 @@ class Grids:
         return [grid_surface(grid, level=self.threshold) for grid in self.occupancy]
 
     def occupied(self, size: int) -> Tensor:
-        """Bool [B, size, size, size]: whether the mean of a larger cell is above the threshold; s must be a multiple of
-        size.
-        """
-        factor, rest = divmod(self.occupancy.shape[-1], size)
-        if rest or factor < 1:
-            raise ValueError(f"a grid of {self.occupancy.shape[-1]} cells cannot be pooled to {size}")
-        return F.avg_pool3d(self.occupancy[:, None], factor)[:, 0] > self.threshold
-
-
-def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surface:
-    """Marching cubes: the surface of a grid [s, s, s] with axes (x, y, z) over the cube [-box/2, box/2]^3.
-
-    The surface is empty if no cell is above `level`, and closed at the border of the grid. Normals point outwards by
-    the right-hand rule in these axes, as `nmr.icosphere`'s do.
-    """
-    size = grid.shape[-1]
-    padded = np.pad(grid.detach().cpu().float().numpy(), 1)
-    if not padded.max() > level:
-        return Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64))
-    vertices, faces, _, _ = marching_cubes(padded, level, gradient_direction="ascent")
-    centred = (vertices - 0.5) / size - 0.5  # cell i of the padded grid has its centre at (i - 1 + 1/2) / size
-    points = torch.from_numpy((centred * box).astype(np.float32))
-    return Surface(points, torch.from_numpy(faces.astype(np.int64)))
+        """Bool [B, size, size, size], whether the mean of a larger cell is above the threshold; size divides s."""
+        return F.avg_pool3d(self.occupancy[:, None], self.occupancy.shape[-1] // size)[:, 0] > self.threshold
 
 
 class Method(abc.ABC):

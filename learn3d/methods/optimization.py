@@ -22,7 +22,7 @@ class TrainingSchedule:
     ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
-        if 0 < self.iterations <= self.warmup_steps:
+        if self.iterations <= self.warmup_steps:
             raise ValueError(f"warmup_steps must be below the {self.iterations} iterations, got {self.warmup_steps}")
         self.lr_factor(self.warmup_steps + 1)  # raises ValueError for an unknown schedule
 
@@ -34,7 +34,7 @@ class TrainingSchedule:
         """
         if step <= self.warmup_steps:
             return step / self.warmup_steps
-        done = (step - 1 - self.warmup_steps) / max(1, self.iterations - self.warmup_steps)  # 0 .. below 1
+        done = (step - 1 - self.warmup_steps) / (self.iterations - self.warmup_steps)  # 0 .. below 1
         if self.lr_schedule == "linear":
             return 1 - done
         if self.lr_schedule == "cosine":

@@ -23,9 +23,8 @@ from learn3d.figures.runs import Run, open_runs
 from learn3d.files import limits, writing
 from learn3d.files.reading import parse_json, read_text
 from learn3d.fitting.smoothing import smooth
-from learn3d.methods.method import grid_surface
 from learn3d.pictures.sheets import natural_colors
-from learn3d.pictures.surfaces import Surface, azimuths_deg, eyes
+from learn3d.pictures.surfaces import Surface, azimuths_deg, eyes, grid_surface
 from learn3d.presets import PRESETS
 from learn3d.terminal import note, plain
 

@@ -1,4 +1,4 @@
-"""Pictures of reconstructed shapes, and the cameras around them."""
+"""Surfaces of reconstructed shapes, their pictures, and the cameras around them."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from skimage.measure import marching_cubes
 from torch import Tensor
 
 import nmr
@@ -34,6 +35,22 @@ class Surface(NamedTuple):
     faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape
     colors: Tensor | None = None  # float32 [V, 3] in [0, 1], R, G, B of each vertex; None: clay
     texture: Texture | None = None  # it is shown instead of the colours
+
+
+def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surface:
+    """Marching cubes: the surface of a grid [s, s, s] with axes (x, y, z) over the cube [-box/2, box/2]^3.
+
+    The surface is empty if no cell is above `level`, and closed at the border of the grid. Normals point outwards by
+    the right-hand rule in these axes, as `nmr.icosphere`'s do.
+    """
+    size = grid.shape[-1]
+    padded = np.pad(grid.detach().cpu().float().numpy(), 1)
+    if not padded.max() > level:
+        return Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64))
+    vertices, faces, _, _ = marching_cubes(padded, level, gradient_direction="ascent")
+    centred = (vertices - 0.5) / size - 0.5  # cell i of the padded grid has its centre at (i - 1 + 1/2) / size
+    points = torch.from_numpy((centred * box).astype(np.float32))
+    return Surface(points, torch.from_numpy(faces.astype(np.int64)))
 
 
 def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> Cameras:

@@ -10,7 +10,7 @@ import torch
 import nmr
 from learn3d.methods import DatasetInfo, create_method, mesh_method
 from learn3d.methods.mesh_method import refine
-from learn3d.methods.method import grid_surface
+from learn3d.pictures.surfaces import grid_surface
 from learn3d.presets import PRESETS
 from learn3d.reconstruction import reconstruct_dataset
 
