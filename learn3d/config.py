@@ -12,7 +12,8 @@ from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import VIEWS_OF_OBJECT, Augmentation, Sampling
 from learn3d.files import limits
 from learn3d.files.reading import read_json
-from learn3d.methods import LRSchedule, MethodSettings, TrainingSchedule
+from learn3d.methods.method import MethodSettings
+from learn3d.methods.optimization import LRSchedule, TrainingSchedule
 from learn3d.presets import PRESETS, Preset, full_name
 from learn3d.settings import Count, FilePath, Items, Rare, Step, checked
 

@@ -12,7 +12,7 @@ from torch import Tensor
 import nmr
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.losses import mmd
-from learn3d.methods import Grids, Meshes, Method
+from learn3d.methods.method import Grids, Meshes, Method
 from learn3d.pictures.surfaces import Surface, grid_surface
 
 #: A function that aligns the predicted shapes of a batch with the true ones; see `evaluate`.

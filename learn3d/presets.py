@@ -5,8 +5,9 @@ from typing import Any
 
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import Augmentation, Sampling
-from learn3d.methods import LRSchedule, MethodSettings
+from learn3d.methods.method import MethodSettings
 from learn3d.methods.multi_view import ManyViewsSettings, MultiViewSettings
+from learn3d.methods.optimization import LRSchedule
 from learn3d.methods.plus import PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.methods.prgan import PrGANSettings

@@ -34,8 +34,8 @@ from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.fitting.fit import Progress, belief, fit, predict
 from learn3d.fitting.smoothing import divide, outer_surface
 from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
-from learn3d.methods import MeshMethod, Method
-from learn3d.methods.mesh_method import refine
+from learn3d.methods.mesh_method import MeshMethod, refine
+from learn3d.methods.method import Method
 from learn3d.networks.encoders import CENTRED_SIZE, centre
 from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
 from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable

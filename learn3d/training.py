@@ -10,7 +10,9 @@ from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.evaluation import NO_MMD, evaluate, spread_samples
 from learn3d.figures.grids import picture_grid
-from learn3d.methods import MeshMethod, Method, create_method
+from learn3d.methods import create_method
+from learn3d.methods.mesh_method import MeshMethod
+from learn3d.methods.method import Method
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.views import update_poses, update_steps
 from learn3d.runs import folder as run_folder

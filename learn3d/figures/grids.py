@@ -12,7 +12,7 @@ from learn3d.data.conventions import view_poses
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.evaluation import spread_samples
 from learn3d.figures.runs import Run
-from learn3d.methods import Method
+from learn3d.methods.method import Method
 from learn3d.pictures.sheets import TILE, magnify, natural_colors, save_png, tile
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, grid_surface, orbit
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
-from learn3d.methods import Method
+from learn3d.methods.method import Method
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.runs.checkpoint import Metadata

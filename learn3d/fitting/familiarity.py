@@ -10,7 +10,7 @@ from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 
 from learn3d.data.dataset import ViewDataset
-from learn3d.methods import MeshMethod
+from learn3d.methods.mesh_method import MeshMethod
 
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered

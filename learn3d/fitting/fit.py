@@ -16,7 +16,7 @@ from torch import Tensor
 import nmr
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.poses import wrap_deg
-from learn3d.methods import MeshMethod
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import CENTRED_SIZE
 
 HALF_FOV_DEG = 11.0  # half the field of view of a normal lens; the picture's own is unknown

@@ -17,7 +17,7 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import ViewDataset
 from learn3d.fitting.fit import Fit, Prediction, Progress, View, belief, minimize
-from learn3d.methods import MeshMethod
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.shapes import CATEGORIES, numbered_shape
 
 SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates

@@ -4,26 +4,14 @@ from typing import Literal
 
 import torch
 
-from learn3d.methods.mesh_method import MeshMethod
-from learn3d.methods.method import DatasetInfo, Grids, Meshes, Method, MethodSettings
+from learn3d.data.dataset import DatasetInfo
+from learn3d.methods.method import Method, MethodSettings
 from learn3d.methods.multi_view import ManyViews, ManyViewsSettings, MultiView, MultiViewSettings
-from learn3d.methods.optimization import LRSchedule, TrainingSchedule
+from learn3d.methods.optimization import TrainingSchedule
 from learn3d.methods.plus import Plus, PlusSettings
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.prgan import PrGAN, PrGANSettings
 from learn3d.methods.vpl import VPL, VPLSettings
-
-__all__ = [
-    "DatasetInfo",
-    "Grids",
-    "LRSchedule",
-    "MeshMethod",
-    "Meshes",
-    "Method",
-    "MethodSettings",
-    "TrainingSchedule",
-    "create_method",
-]
 
 _METHODS: dict[type[MethodSettings], type[Method]] = {
     PoseInvariantSettings: PoseInvariant,

@@ -21,12 +21,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from learn3d.config import TrainConfig, config_from_dict
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.device import resolve_precision
 from learn3d.files import writing
 from learn3d.files.reading import DamagedFile, parse_json
-from learn3d.methods import DatasetInfo, Method, create_method
+from learn3d.methods import create_method
+from learn3d.methods.method import Method
 from learn3d.settings import Count, NonNegative, Share, checked, split_names
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from learn3d.fitting.familiarity import KNOWN_CODES, known_codes
 from learn3d.fitting.templates import TEMPLATES, learn_templates
-from learn3d.methods import MeshMethod
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.multi_view import ManyViewsSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.poses import PoseCandidates
 from learn3d.files import writing
 from learn3d.files.reading import DamagedFile
-from learn3d.methods import DatasetInfo, Method
 from learn3d.methods.mesh_method import is_compact
+from learn3d.methods.method import Method
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder

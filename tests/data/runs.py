@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from learn3d.config import TrainConfig
-from learn3d.methods import DatasetInfo
+from learn3d.data.dataset import DatasetInfo
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from learn3d.methods import Method, vpl
+from learn3d.methods import vpl
+from learn3d.methods.method import Method
 from learn3d.networks.encoders import CODE_SIZE, ENCODERS, PreactResNet18, SmallConvEncoder
 from learn3d.networks.generators import GENERATORS, SmallSphereGenerator, Symmetry
 from learn3d.networks.layers import linear_layers

@@ -12,9 +12,9 @@ import torch
 import nmr
 from learn3d import training
 from learn3d.config import TrainConfig
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.sampling import shuffled_epochs
-from learn3d.methods import DatasetInfo, create_method
+from learn3d.methods import create_method
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint

@@ -11,11 +11,11 @@ import torch
 
 import nmr
 from learn3d.data.conventions import KATO
-from learn3d.data.dataset import ViewDataset, concatenate
+from learn3d.data.dataset import DatasetInfo, ViewDataset, concatenate
 from learn3d.data.poses import LookAtPoses, PoseCandidates, RotationPoses
 from learn3d.data.sampling import augment, batches, sample_indices
 from learn3d.data.view_bins import AngleBins
-from learn3d.methods import DatasetInfo, create_method
+from learn3d.methods import create_method
 from learn3d.presets import PRESETS
 
 

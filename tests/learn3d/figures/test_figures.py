@@ -19,7 +19,7 @@ from learn3d.figures import grids
 from learn3d.figures.grids import comparison_grid, interpolate, picture_grid
 from learn3d.figures.runs import Run, name_runs, open_runs
 from learn3d.files import limits
-from learn3d.methods import Grids, Meshes
+from learn3d.methods.method import Grids, Meshes
 from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_colors
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
 from learn3d.runs import checkpoint

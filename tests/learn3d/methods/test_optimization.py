@@ -12,8 +12,10 @@ import tiny_networks
 import torch
 from torch import nn
 
-from learn3d.methods import DatasetInfo, Method, TrainingSchedule, create_method
-from learn3d.methods.optimization import EMA, adam, backpropagate
+from learn3d.data.dataset import DatasetInfo
+from learn3d.methods import create_method
+from learn3d.methods.method import Method
+from learn3d.methods.optimization import EMA, TrainingSchedule, adam, backpropagate
 from learn3d.networks.encoders import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint

@@ -11,7 +11,8 @@ import torch
 import nmr
 from learn3d.config import differences
 from learn3d.data.conventions import KATO
-from learn3d.methods import DatasetInfo, create_method
+from learn3d.data.dataset import DatasetInfo
+from learn3d.methods import create_method
 from learn3d.methods.optimization import TrainingSchedule
 from learn3d.methods.plus import MaskBank, Plus, PlusSettings
 from learn3d.networks.generators import SmoothSphereGenerator, SphereGenerator

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.data.conventions import KATO
-from learn3d.data.dataset import Batch
+from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.methods.method import DatasetInfo
 from learn3d.methods.prgan import PrGAN, PrGANSettings, statistics_loss
 from learn3d.networks.voxel_gan import SHAPE_CODE, TAU, DoublingConvolution
 

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 import nmr
-from learn3d.data.dataset import DEPTH_REACH, Batch, ViewDataset, depth_levels, depth_of_levels
+from learn3d.data.dataset import DEPTH_REACH, Batch, DatasetInfo, ViewDataset, depth_levels, depth_of_levels
 from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices
@@ -19,7 +19,6 @@ from learn3d.evaluation import evaluate
 from learn3d.losses import depth_loss
 from learn3d.make_data.render import DatasetConfig, make_shards
 from learn3d.methods import create_method
-from learn3d.methods.method import DatasetInfo
 from learn3d.methods.multi_view import ManyViews, MultiView, MultiViewSettings, check_groups
 from learn3d.methods.optimization import SparseGradientAdam, TrainingSchedule
 from learn3d.networks.generators import deform_bounded_sphere

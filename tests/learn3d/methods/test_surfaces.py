@@ -8,7 +8,8 @@ import pytest
 import torch
 
 import nmr
-from learn3d.methods import DatasetInfo, create_method, mesh_method
+from learn3d.data.dataset import DatasetInfo
+from learn3d.methods import create_method, mesh_method
 from learn3d.methods.mesh_method import refine
 from learn3d.pictures.surfaces import grid_surface
 from learn3d.presets import PRESETS

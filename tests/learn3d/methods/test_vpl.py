@@ -13,11 +13,10 @@ import torch.nn.functional as F
 
 import nmr
 from learn3d.data.conventions import KATO
-from learn3d.data.dataset import Batch, ViewDataset
+from learn3d.data.dataset import Batch, DatasetInfo, ViewDataset
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods import create_method
-from learn3d.methods.method import DatasetInfo
 from learn3d.methods.vpl import VPL, VPLSettings, other_views
 from learn3d.networks.generators import GENERATORS, ConvCubeGenerator, LinearCubeGenerator
 from learn3d.presets import PRESETS

@@ -12,8 +12,10 @@ from torch import Tensor, nn
 from vectors import load_vector
 
 from learn3d import device as precision_module
+from learn3d.data.dataset import DatasetInfo
 from learn3d.device import resolve_precision
-from learn3d.methods import DatasetInfo, Method, create_method
+from learn3d.methods import create_method
+from learn3d.methods.method import Method
 from learn3d.networks.discriminators import (
     OneHotViewDiscriminator,
     PatchDiscriminator,

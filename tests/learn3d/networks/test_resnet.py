@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor
 
+from learn3d.data.dataset import DatasetInfo
 from learn3d.files import limits
-from learn3d.methods.method import DatasetInfo
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.methods.vpl import VPL, VPLSettings
 from learn3d.networks.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet18Encoder, load_pretrained

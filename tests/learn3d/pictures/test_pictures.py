@@ -12,7 +12,7 @@ from PIL import Image
 import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.methods import Grids
+from learn3d.methods.method import Grids
 from learn3d.pictures.sheets import (
     HEADER,
     MARGIN,
