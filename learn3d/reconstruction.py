@@ -16,20 +16,12 @@ import nmr
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.framing import (
-    MEAN_OBJECT_SIZE,
-    Crops,
-    check_mask,
-    largest_region,
-    mask_box,
-    read_photo,
-    threshold_mask,
-)
+from learn3d.data.framing import MEAN_OBJECT_SIZE, Crops, check_mask, mask_box, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.poses import Poses
 from learn3d.files import limits, writing
 from learn3d.fitting.coloring import color_mesh
-from learn3d.fitting.cutting import Box, cut_out
+from learn3d.fitting.cutting import Box, find_mask
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.fitting.fit import Progress, belief, fit, predict
 from learn3d.fitting.smoothing import divide, outer_surface
@@ -187,7 +179,7 @@ def _read(
     side = limits.IMAGE_SIDE if box else _PLAIN_SIDE  # a box is in pixels of the file
     colors, mask = read_photo(path, max_side=side) if searched else read_photo(path, mask_path)
     if searched and (box or mask is None):  # a box counts even if the file has transparency
-        mask, more = largest_region(cut_out(colors, box) if box else threshold_mask(colors))
+        mask, more = find_mask(colors, box, plain_background)
         if more:
             note(f"note: {path}: several parts were found, and only the largest is used")
     try:

@@ -16,15 +16,7 @@ from learn3d.make_data.debian.models import fetch_debian_models
 from learn3d.make_data.render import DatasetConfig, make_dataset, make_shards
 from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
-from learn3d.poses.views import (
-    LEGEND,
-    MIN_CONFIDENCE,
-    CameraOptions,
-    compare,
-    draw_sheet,
-    estimate_views,
-    load_views,
-)
+from learn3d.poses.views import MIN_CONFIDENCE, CameraOptions, compare, draw_sheet, estimate_views, load_views
 from learn3d.settings import Count, split_names
 from learn3d.terminal import is_watched, note, say
 
@@ -187,4 +179,5 @@ class EstimatePoses(Command):
         table.write(self.output)
         sheet = self.output.with_suffix(".png")
         save_png(sheet, draw_sheet(views, offset_deg))
-        say(f"written to {self.output}; sheet {sheet}: {LEGEND}")
+        rows = "first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
+        say(f"written to {self.output}; sheet {sheet}: columns: azimuths; {rows}")

@@ -19,10 +19,6 @@ from learn3d.files.reading import DamagedFile
 from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
 
 MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
-TOLERANCE = 0.12  # default of `threshold_mask`
-JPEG_NOISE = 6  # levels by which compression changes the background near an object
-PLAIN_HOLE = 0.5  # a hole of the mask shows the background if more than this share of it has the background's colour,
-HOLES = 0.001, 0.4  # and its size, as a share of the object, lies between these; larger ones are often white table tops
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
 SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop (the box) and of the largest
@@ -99,40 +95,6 @@ def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
     if border.mean() > (max(0.5, inside.mean()) if cropped else 0.5):
         question = "is the object black, or is the background part of the mask?"
         raise ValueError(f"its mask covers {border.mean():.0%} of the border; {question}")
-
-
-def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
-    """Mask an object on a plain background: uint8 [H, W], 0 or 255.
-
-    colors: uint8 [H, W, 3]. The background colour is the median of the border. A pixel belongs to the object if a
-    channel differs from it by more than `tolerance` (0 .. 1). Holes are filled, but for some with the colour of the
-    background, such as the gaps between the rungs of a chair.
-    """
-    from scipy import ndimage  # imported here, as the sandbox's workers import this module
-
-    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
-    background = np.median(border, axis=0)
-    difference, noise = (np.abs(pixels - background).max(axis=-1) for pixels in (colors, border))
-    found = difference > 255 * tolerance
-    inside = ndimage.binary_fill_holes(found)
-    holes, count = ndimage.label(inside & ~found)
-    numbers = np.arange(1, count + 1)
-    plain = ndimage.mean(difference <= max(JPEG_NOISE, np.percentile(noise, 90)), holes, numbers) > PLAIN_HOLE
-    share = ndimage.sum(holes > 0, holes, numbers) / max(1, inside.sum())
-    seen_through = plain & (share > HOLES[0]) & (share < HOLES[1])
-    return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
-
-
-def largest_region(mask: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The largest connected region of a mask uint8 [H, W], and whether another one has at least a tenth of its size."""
-    from scipy import ndimage
-
-    regions, count = ndimage.label(mask > 127)
-    if count < 2:
-        return mask, False
-    sizes = np.bincount(regions.ravel())[1:]
-    second, first = np.sort(sizes)[-2:]
-    return np.where(regions == 1 + sizes.argmax(), mask, np.uint8(0)), bool(10 * second >= first)
 
 
 def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:

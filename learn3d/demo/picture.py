@@ -10,8 +10,8 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.framing import check_mask, largest_region, mask_box
-from learn3d.fitting.cutting import Box, correct, cut_out, find_mask
+from learn3d.data.framing import check_mask, mask_box
+from learn3d.fitting.cutting import Box, correct, find_mask
 from learn3d.pictures.studio import PALETTES, natural_look, photograph
 from learn3d.reconstruction import Model, mesh_bytes, reconstruct_picture
 from learn3d.shapes import make_shape
@@ -51,11 +51,11 @@ def find_object(picture: Picture) -> tuple[np.ndarray, bool]:
 
     The mask is the given one, with its corrections; without one it is the largest region found in the box or picture.
     """
-    if picture.box is not None:
-        return largest_region(cut_out(picture.colors, picture.box))
-    if picture.strokes is not None:
+    if picture.box is None and picture.strokes is not None:
         return correct(picture.colors, picture.mask, picture.strokes), False
-    return largest_region(find_mask(picture.colors)) if picture.mask.min() == 255 else (picture.mask, False)
+    if picture.box is None and picture.mask.min() < 255:
+        return picture.mask, False
+    return find_mask(picture.colors, picture.box)
 
 
 def make_meshes(models: Mapping[str, Model], picture: Picture, send: Send) -> None:

@@ -123,26 +123,26 @@ def _nearest_clear(points: np.ndarray, clear: np.ndarray, neighbours: coo_array)
 
 def paint(surface: Surface, look_up: LookUp) -> Surface:
     """The surface with a texture image. It needs colours of its vertices, which texels of low reliability get."""
-    height, uv, row, column, face, order, shares = _lay_out(surface.vertices[surface.faces].numpy())
-    corners = surface.faces[face[:, None], order]
+    height, uv, place, corners, shares = _lay_out(surface.vertices[surface.faces].numpy())
+    corners = surface.faces.flatten()[corners]
     normals = nmr.vertex_normals(surface.vertices, surface.faces)
     values = (surface.vertices, normals, surface.colors)
     points, normals, plain = ((v[corners] * shares[..., None]).sum(1) for v in values)
     found, reliable = look_up(points, F.normalize(normals, dim=1))
     share = (reliable.square() / (reliable.square() + _SURE))[:, None]
     image = torch.ones(height, WIDTH, 3)
-    image[row, column] = (share * found + (1 - share) * plain).clamp(0, 1)
+    image.view(-1, 3)[place] = (share * found + (1 - share) * plain).clamp(0, 1)
     uv = uv / torch.tensor([WIDTH, -height]) + torch.tensor([0.0, 1.0])
     return surface._replace(texture=Texture(image, uv))
 
 
-def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor]:
     """Lay triangles [F, 3, 3] out in an image.
 
     Each rectangular cell of the image holds two triangles of the same size. Around a triangle one more texel continues
     its colours, so that interpolation at its sides does not read another triangle. Returns the image's height; places
-    of all corners in texels, x right and y down, float32 [F, 3, 2]; and for each of N used texels row, column and face,
-    int64 [N], the corners of the face in the order of the shares, int64 [N, 3], and barycentric shares float32 [N, 3].
+    of all corners in texels, x right and y down, float32 [F, 3, 2]; and for each of N used texels its index, int64 [N],
+    three of the 3 F corners, int64 [N, 3], and their barycentric shares, float32 [N, 3].
     """
     edges = np.linalg.norm(triangles - np.roll(triangles, 1, 1), axis=2)
     order = (edges.argmin(1)[:, None] + np.arange(3)) % 3  # the shortest edge goes down from the first corner
@@ -159,18 +159,15 @@ def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor
             own = own + np.stack([left, low], 1)[: len(faces[k::2]), None]
             corners[faces[k::2, None], order[faces[k::2]]] = own
         y, x = np.indices((height, width))
-        shares, others = _shares(x + 0.5, y + 0.5, sides), _shares(width - x - 0.5, height - y - 0.5, sides)
+        b, c = (x - 0.5) / sides[0], (y - 0.5) / sides[1]
+        shares = np.stack([1 - b - c, b, c], -1)
+        others = shares[::-1, ::-1]  # the second triangle is the first one, turned by 180 degrees
         is_second = shares[..., 0] < others[..., 0]
         shares = np.where(is_second[..., None], others, shares)
         pairs = np.resize(faces, (cells, 2))[:, :, None, None]
         face = np.where(is_second, pairs[:, 1], pairs[:, 0])
-        row, column, shares = low[:, None, None] + y, left[:, None, None] + x, np.broadcast_to(shares, (*face.shape, 3))
-        texels.append([each.reshape(row.size, -1) for each in (row, column, face, order[face], np.float32(shares))])
-    row, column, face, order, shares = (torch.from_numpy(np.concatenate(each)) for each in zip(*texels, strict=True))
-    return top, torch.from_numpy(corners), row[:, 0], column[:, 0], face[:, 0], order, shares
-
-
-def _shares(x: np.ndarray, y: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates [H, W, 3] of places in a cell, in its first triangle."""
-    b, c = (x - 1) / sides[0], (y - 1) / sides[1]
-    return np.stack([1 - b - c, b, c], -1)
+        place = (low[:, None, None] + y) * WIDTH + left[:, None, None] + x
+        of_cells = 3 * face[..., None] + order[face], np.broadcast_to(np.float32(shares), (*face.shape, 3))
+        texels.append((place.ravel(), *(each.reshape(-1, 3) for each in of_cells)))
+    place, corner, shares = (torch.from_numpy(np.concatenate(each)) for each in zip(*texels, strict=True))
+    return top, torch.from_numpy(corners), place, corner, shares

@@ -6,11 +6,13 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-from learn3d.data.framing import TOLERANCE, threshold_mask
-
 SIDE = 384  # longer side in pixels of the picture for GrabCut
 INSET = 0.03  # width of the background border without a box, as a share of the picture's sides
 PLAIN = 0.9  # least share of the border with one colour in pictures with a plain background
+TOLERANCE = 0.12  # largest difference from the background's colour, in 0 .. 1
+JPEG_NOISE = 6  # levels by which compression changes the background near an object
+PLAIN_HOLE = 0.5  # a hole of the mask shows the background if more than this share of it has the background's colour,
+HOLES = 0.001, 0.4  # and its size, as a share of the object, lies between these; larger ones are often white table tops
 KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
 _ROUNDS, _ROUNDS_IN_STROKES = 5, 2
 _AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
@@ -18,21 +20,56 @@ _AROUND = 16  # width in pixels of the region around the strokes that GrabCut se
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
 
 
-def find_mask(colors: np.ndarray) -> np.ndarray:
-    """Guess the mask uint8 [H, W], 0 or 255, of the object in a photograph uint8 [H, W, 3].
+def find_mask(colors: np.ndarray, box: Box | None = None, plain_background: bool = False) -> tuple[np.ndarray, bool]:
+    """Mask uint8 [H, W], 0 or 255, of the largest object in a photograph uint8 [H, W, 3]; whether there are others.
 
-    If the background is plain, or without OpenCV, the object is everything that differs from the border's colour.
-    Otherwise GrabCut separates it from the picture's border.
+    GrabCut finds the object in the box or, without one, in the middle. If there is no box, and the background is plain
+    or OpenCV is missing, the object is everything that differs from the border's colour.
     """
-    plain = is_plain(colors) or importlib.util.find_spec("cv2") is None
-    return threshold_mask(colors) if plain else cut_out(colors)
+    if box is None and (plain_background or is_plain(colors) or importlib.util.find_spec("cv2") is None):
+        return largest_region(threshold_mask(colors))
+    return largest_region(cut_out(colors, box))
 
 
 def is_plain(colors: np.ndarray) -> bool:
     """Whether the border of a picture uint8 [H, W, 3] has one colour, except for a tenth of its pixels."""
-    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]]).astype(np.float64)
-    difference = np.abs(border - np.median(border, axis=0)).max(axis=1)
-    return bool((difference < 255 * TOLERANCE).mean() > PLAIN)
+    _, of_border = _differences(colors)
+    return bool((of_border < 255 * TOLERANCE).mean() > PLAIN)
+
+
+def _differences(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Largest difference of a channel from the border's median, 0 .. 255: of all pixels [H, W], of the border [N]."""
+    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
+    background = np.median(border, axis=0)
+    return np.abs(colors - background).max(axis=-1), np.abs(border - background).max(axis=-1)
+
+
+def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+    """Mask an object on a plain background: uint8 [H, W], 0 or 255.
+
+    colors: uint8 [H, W, 3]. The background colour is the median of the border. A pixel belongs to the object if a
+    channel differs from it by more than `tolerance` (0 .. 1). Holes are filled, but for some with the colour of the
+    background, such as the gaps between the rungs of a chair.
+    """
+    difference, noise = _differences(colors)
+    found = difference > 255 * tolerance
+    inside = ndimage.binary_fill_holes(found)
+    holes, count = ndimage.label(inside & ~found)
+    numbers = np.arange(1, count + 1)
+    plain = ndimage.mean(difference <= max(JPEG_NOISE, np.percentile(noise, 90)), holes, numbers) > PLAIN_HOLE
+    share = ndimage.sum(holes > 0, holes, numbers) / max(1, inside.sum())
+    seen_through = plain & (share > HOLES[0]) & (share < HOLES[1])
+    return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
+
+
+def largest_region(mask: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The largest connected region of a mask uint8 [H, W], and whether another one has at least a tenth of its size."""
+    regions, count = ndimage.label(mask > 127)
+    if count < 2:
+        return mask, False
+    sizes = np.bincount(regions.ravel())[1:]
+    second, first = np.sort(sizes)[-2:]
+    return np.where(regions == 1 + sizes.argmax(), mask, np.uint8(0)), bool(10 * second >= first)
 
 
 def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:

@@ -47,7 +47,6 @@ MIN_CONFIDENCE = 0.5  # an image with less counts as doubtful
 COLUMNS = 12  # azimuths on the sheet, at most
 PROTOTYPES, ROWS = 6, 8  # rows of prototypes, and of images, at most
 TILE = 64  # side of a picture in pixels
-LEGEND = "columns: azimuths; first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
 _MIN_FRONT_VOTES = 0.8  # `Estimate.front_votes` of objects whose front and back differ
 _IMAGES = 128  # images whose poses are reweighted at a time
 _CELL_DEG = 15  # width of the cells of azimuth whose frequency is kept

@@ -14,8 +14,8 @@ from PIL import Image
 
 import nmr
 from learn3d import reconstruction
-from learn3d.data.framing import largest_region, threshold_mask
 from learn3d.demo import picture as pictures
+from learn3d.fitting.cutting import largest_region, threshold_mask
 from learn3d.pictures.surfaces import Surface
 from learn3d.reconstruction import input_azimuth_deg, load_model
 from learn3d.runs.export import export
