@@ -187,18 +187,14 @@ def _masks(datasets: Sequence[ViewDataset], factor: Tensor) -> Tensor:
 
     Each is magnified about its centre by its factor: an approximate change of the distance or of the field of view.
     """
-    reduced, start = [], 0
-    for dataset in datasets:
+    reduced = []
+    for dataset, of_dataset in zip(datasets, factor.split([len(d) for d in datasets]), strict=True):
         for rows in torch.arange(len(dataset)).split(1024):
-            masks = torch.from_numpy(dataset.read_masks(rows.numpy()))[:, None].float() / 255
-            factors = factor[start : start + len(rows)]
+            masks, factors = torch.from_numpy(dataset.read_masks(rows.numpy()))[:, None].float() / 255, of_dataset[rows]
             if bool((factors - 1).abs().max() >= 1e-3):
-                theta = torch.zeros(len(rows), 2, 3)
-                theta[:, 0, 0] = theta[:, 1, 1] = 1 / factors
-                grid = F.affine_grid(theta, masks.shape, align_corners=False)
+                grid = F.affine_grid(torch.eye(2, 3) / factors[:, None, None], masks.shape, align_corners=False)
                 masks = F.grid_sample(masks, grid, align_corners=False)
             reduced.append(F.avg_pool2d(masks, MASK_SIZE // SIZE).flatten(1))
-            start += len(rows)
     return torch.cat(reduced)
 
 

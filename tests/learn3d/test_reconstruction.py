@@ -18,7 +18,9 @@ from learn3d.reconstruction import (
     _read,
     export_mesh,
     input_azimuth_deg,
+    load_model,
     prepare_image,
+    reconstruct,
     reconstruct_dataset,
     reconstruct_files,
 )
@@ -163,6 +165,8 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
     files = reconstruct_files(finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, refined=False)
     meshes = [trimesh.load(path[0], force="mesh") for path in (files, paths)]
     assert np.array_equal(*(mesh.vertices for mesh in meshes)) and np.array_equal(*(mesh.faces for mesh in meshes))
+    (surface,) = reconstruct(load_model(finished_run).method, stored[None])
+    assert np.allclose((surface.vertices.numpy() @ mesh_to_object()).max(0), meshes[0].bounds[1], atol=1e-5)
     twins = [tmp_path / "photo.png", tmp_path / "in" / "photo.png"]
     files = reconstruct_files(finished_run, tmp_path / "c", twins, mesh_format="ply")
     assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
