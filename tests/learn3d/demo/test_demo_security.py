@@ -170,7 +170,7 @@ def test_words_of_a_visitor_reach_the_terminal_written_out(monkeypatch, capsys) 
 
     monkeypatch.setattr(serving, "make_meshes", fail)
     monkeypatch.setattr(serving.uvicorn, "Server", Server)
-    monkeypatch.setattr(serving, "load_model", lambda run: SimpleNamespace(config=SimpleNamespace(category="cup")))
+    monkeypatch.setattr(serving, "load_model", lambda run: SimpleNamespace(categories=["cup"]))
     serving.serve([], host="127.0.0.1", port=0, browser=False)
     said = capsys.readouterr().err
     assert "Traceback" in said and r"\x1b]0;title\x07" in said, "an unexpected error is not hidden"
