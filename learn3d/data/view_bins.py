@@ -114,7 +114,11 @@ def choose_bins(poses: LookAtPoses) -> AngleBins:
 
 
 def view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Class int64 [M] in 0 .. K-1 of each of M poses, and the K names. Classes are the cells of `training`."""
+    """Class int64 [M] in 0 .. K-1 of each of M poses, and the K names.
+
+    Classes are the cells (`choose_bins`) with training poses. Another pose gets the class of the training pose with the
+    nearest direction.
+    """
     bins = choose_bins(training)
     names = bins.names()
 

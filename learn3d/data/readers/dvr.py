@@ -60,7 +60,6 @@ def load(folder: Path | str, category: str, split: str, *, findings: Findings = 
     if objects is None:
         return None
     images, _, _, clouds = objects
-    images = images.reshape(len(ids), NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE)
     points = np.stack([cloud[: min(map(len, clouds))] for cloud in clouds])
     return dataclasses.replace(kato.from_arrays(images, None, category, split), object_names=tuple(ids), points=points)
 

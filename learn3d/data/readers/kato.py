@@ -64,12 +64,13 @@ def load(folder: Path | str, category: str, split: str, *, findings: Findings = 
 
 
 def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, split: str) -> ViewDataset:
-    """The data set of images uint8 [N, 24, 4, 64, 64] and voxels bool [N, 32, 32, 32], in the files' conventions."""
-    count = len(images)
+    """The data set of images uint8 [N, 24, 4, 64, 64] (or [N * 24, ...]) and voxels bool [N, 32, 32, 32]."""
+    images = images.reshape(-1, 4, IMAGE_SIZE, IMAGE_SIZE)
+    count = len(images) // NUM_VIEWS
     view_ids = np.tile(np.arange(NUM_VIEWS), count)
     return ViewDataset(
         **PROPERTIES.about(category, split),
-        images=images.reshape(count * NUM_VIEWS, 4, IMAGE_SIZE, IMAGE_SIZE),
+        images=images,
         poses=view_poses(torch.from_numpy(view_ids)),
         view_ids=view_ids,
         view_names=tuple(f"azimuth {AZIMUTH_STEP_DEG * view:g}°" for view in range(NUM_VIEWS)),

@@ -63,8 +63,7 @@ def load(
     """Read a split of the photographs in `folder/category`.
 
     image_size: side of the images in pixels. They have Kato's form (`framing.frame`), for which methods and presets are
-    made. View classes are the cells of azimuth and elevation (`view_bins.choose_bins`) with training photographs. Another
-    photograph gets the class of the training photograph with the nearest direction.
+    made. View classes are those of `view_bins.view_classes`, from the training photographs.
     """
     synset_of(category)  # raises ValueError for a path, which would lead to other folders
     table = Path(folder) / category / TABLE
