@@ -293,7 +293,7 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
         (("grid", "--runs", tmp_path / "nowhere"), "nowhere"),
         (("grid", "--runs", finished_run, "--labels", "a", "b"), "there are 1 runs but 2 labels"),
         (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),
-        (("tsne", "--runs", finished_run, "--category", "lamp"), "lamp"),
+        (("tsne", "--runs", finished_run, "--category", "lamp"), "03636649_test_images.npz: is missing"),
         (("grid", "--runs", finished_run, "--output", f"{__file__}/grid.png"), "give another --output"),
     ):
         code, out, err = call(arguments[0], *output, *arguments[1:])
