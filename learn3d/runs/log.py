@@ -25,6 +25,8 @@ from learn3d.terminal import is_watched, note
 
 SECONDS_BETWEEN_LINES = 30.0
 MEAN_OVER = 20  # steps over which shown losses are averaged
+#: Methods of a second log that writes nothing.
+_SILENT = dict.fromkeys(("add_scalar", "add_image", "flush", "close"), lambda *_, **__: None)
 
 
 class RunLog(contextlib.ExitStack):
@@ -40,14 +42,15 @@ class RunLog(contextlib.ExitStack):
         self._recent: dict[str, deque[float]] = {}
         _drop_after(config.output / METRICS, start)
         self._metrics = self.enter_context(open(config.output / METRICS, "ab"))
-        self._bar, self._writer = None, None
+        self._bar = None
         if is_watched():
             self._bar = self.enter_context(tqdm(total=self.total, initial=start, unit="step", dynamic_ncols=True))
         try:
             self._writer = _open_writer(config, start)
-            self.callback(self._writer.close)
         except (ImportError, TypeError, AttributeError) as error:  # missing, or in conflict with other packages
+            self._writer = types.SimpleNamespace(**_SILENT)
             self.say(f"warning: {config.log} does not work ({error}); metrics go to {METRICS} only")
+        self.callback(self._writer.close)
         self._started = self._last_line = time.monotonic()
 
     def step(self, step: int, losses: Mapping[str, float]) -> None:
@@ -74,15 +77,13 @@ class RunLog(contextlib.ExitStack):
         """Append one line to metrics.jsonl, and pass the numbers to the writer as <split>/<name>."""
         self._metrics.write(json.dumps({"step": step, "split": split, **values}).encode() + b"\n")
         self._metrics.flush()
-        if self._writer is not None:
-            for name, value in values.items():
-                if isinstance(value, (int, float)):
-                    self._writer.add_scalar(f"{split}/{name}", value, step)
+        for name, value in values.items():
+            if isinstance(value, (int, float)):
+                self._writer.add_scalar(f"{split}/{name}", value, step)
 
     def picture(self, step: int, name: str, rgb: np.ndarray) -> None:
         """Pass a picture uint8 [H,W,3] to the writer."""
-        if self._writer is not None:
-            self._writer.add_image(name, rgb, step, dataformats="HWC")
+        self._writer.add_image(name, rgb, step, dataformats="HWC")
 
     def say(self, text: str) -> None:
         """Print a line without breaking the progress bar."""
@@ -92,8 +93,7 @@ class RunLog(contextlib.ExitStack):
     def sync(self) -> None:
         """Flush all metrics to the disk, before a checkpoint is saved."""
         os.fsync(self._metrics.fileno())
-        if self._writer is not None:
-            self._writer.flush()
+        self._writer.flush()
 
 
 def check_log(config: TrainConfig) -> None:
@@ -105,8 +105,8 @@ def check_log(config: TrainConfig) -> None:
 def _open_writer(config: TrainConfig, start: int) -> Any:
     """The second log: TensorBoard's SummaryWriter, or an object with its methods."""
     if config.log == "csv":
-        write, ignore = functools.partial(_write_csv, config.output), lambda *_, **__: None
-        return types.SimpleNamespace(add_scalar=ignore, add_image=ignore, flush=write, close=write)
+        write = functools.partial(_write_csv, config.output)
+        return types.SimpleNamespace(**_SILENT | {"flush": write, "close": write})
     if config.log == "wandb":
         return _open_wandb(config)
     from torch.utils.tensorboard import SummaryWriter
