@@ -171,10 +171,8 @@ def _parse_value(text: str, is_list: bool = False) -> Any:
 
 def command_line(config: TrainConfig, **placeholders: str) -> str:
     """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of options' values."""
-    values, usual = (
-        all_options(config),
-        all_options(TrainConfig(config.data, config.category, config.output, config.preset)),
-    )
+    values = all_options(config)
+    usual = all_options(TrainConfig(config.data, config.category, config.output, config.preset))
     names = [n for n in values if n not in (*_FIRST, "device", "threads") and values[n] != usual[n]]
     words = ["learn3d", "train"]
     for name in (*_FIRST, *names):

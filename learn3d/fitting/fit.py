@@ -94,10 +94,11 @@ def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> 
 
 @torch.no_grad()
 def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None) -> tuple[View, float]:
-    """The view at which the silhouette of a shape [V, 3], [F, 3] fits a framed mask [64, 64] best, and their IoU.
+    """Find the view in which the silhouette of a shape [V, 3], [F, 3] is most like a framed mask [64, 64].
 
     The best of a grid of views, with azimuths more than 20 degrees apart, are optimised. probabilities: float32
-    [AZIMUTHS], the probability of each azimuth cell from -180 degrees on, if it is known.
+    [AZIMUTHS], the probability of each azimuth cell from -180 degrees on; None if unknown. Returns the view and the
+    soft IoU of silhouette and mask.
     """
     azimuths = -180 + (torch.arange(AZIMUTHS) + 0.5) * (360 / AZIMUTHS)
     grid = torch.cartesian_prod(azimuths, torch.tensor(ELEVATIONS_DEG))

@@ -1,4 +1,4 @@
-"""Makes a data set from meshes: scales, colours and renders them. `writers` has cameras and files by layout."""
+"""Makes a data set from meshes: scales, colours and renders them. Cameras and files of each layout: `writers`."""
 
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -99,7 +99,7 @@ def render_meshes(
 ) -> Iterator[RenderedObject]:
     """Render the objects of each mesh, and add its entry of `DatasetReport.meshes` to `made`.
 
-    The first objects of each split in `rows` become rows of the contact sheet.
+    rows: rows of the contact sheet by split; the first objects of these splits are added, up to `ROWS` of each.
     """
     for item in items:
         mesh, objects = {"name": item.file, "split": item.split}, []

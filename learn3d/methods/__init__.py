@@ -1,4 +1,4 @@
-"""Methods, one file each with its own training step; `create_method` builds the method of given settings."""
+"""Methods, each with its own training step; `create_method` builds the method of given settings."""
 
 from typing import Literal
 

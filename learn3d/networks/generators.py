@@ -15,7 +15,7 @@ from learn3d.networks.layers import initialize_he, linear_layers, norm_relu
 #: The mirror plane x = 0 or z = 0, or the vertical plane along which a camera of this azimuth in degrees looks
 #: (x = 0 is 0, z = 0 is 90).
 Symmetry = Literal["x", "z"] | Annotated[float, Field(ge=-360, le=360)]
-#: The setting; auto: the plane that the training masks show (`data.mirror_plane`). None: no symmetry.
+#: The setting; auto: the plane that the training masks show (`data.mirror_plane`). None for no symmetry.
 SymmetryOption = Symmetry | Literal["auto"] | None
 
 
@@ -28,8 +28,8 @@ class MeshGenerator(nn.Module):
 
     faces: Tensor  # int64 [F,3]
     edges: Tensor  # int64 [E,4]: the table of `nmr.edge_table`
-    mirror: Tensor | None  # int64 [V]: index of each vertex's mirror image; None: no symmetry
-    rotation: Tensor | None  # float32 [3,3]: turns the plane z = 0 to the plane `symmetry`; None: they are the same
+    mirror: Tensor | None  # int64 [V]: index of each vertex's mirror image; None without symmetry
+    rotation: Tensor | None  # float32 [3,3]: turns the plane z = 0 to the plane `symmetry`; None if they are the same
 
     def __init__(self, points: Tensor, faces: Tensor, symmetry: Symmetry | None) -> None:
         super().__init__()

@@ -7,7 +7,7 @@ import numpy as np
 from .draw import Draw, ellipse, points, rectangle
 from .parts import Part, bar, box, ellipsoid, join, loft, revolve, tube, wing
 
-# Shares of the half span at which a wing of each shape has a section, in addition to its middle and its tip.
+# Sections of a wing of each shape besides its middle and its tip, as shares of the half span.
 _STATIONS = {"straight": [], "kinked": [0.55, 0.95], "gull": [0.09, 0.18, 0.26, 0.35, 0.97]}
 _STATIONS["elliptic"] = np.sin(np.linspace(0, np.pi / 2, 8)).round(4).tolist()
 

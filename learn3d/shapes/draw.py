@@ -52,7 +52,7 @@ def ellipse(width: float, depth: float, count: int = 20, exponent: float = 2.0) 
 
 
 def rectangle(width: float, depth: float, radius: float | None = None, segments: int = 2) -> np.ndarray:
-    """A rectangle outline [4 (segments + 1), 2] with rounded corners; radius None: 12 % of the short side.
+    """A rectangle outline [4 (segments + 1), 2] with rounded corners (default radius: 12 % of the short side).
 
     With 0 segments the corners are sharp.
     """

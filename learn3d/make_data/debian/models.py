@@ -50,8 +50,8 @@ class Report:
 def fetch_debian_models(output: Path, packages_dir: Path | None = None, progress: bool = True) -> Report:
     """Write the meshes into the folder `output`, which appears when it is complete.
 
-    packages_dir: folder of the .deb files, into which missing ones are downloaded; None: a temporary folder. The report
-    lists unreadable models and duplicates. Raises ValueError if the output exists, or if a package is missing or
+    packages_dir: folder of the .deb files, into which missing ones are downloaded (default: a temporary folder). The
+    report lists unreadable models and duplicates. Raises ValueError if the output exists, or if a package is missing or
     damaged.
     """
     output, report = output.resolve(), Report()

@@ -60,7 +60,7 @@ class Writer:
     write: Callable[[Iterable[RenderedObject], str, Path, Path], None] | None = None
     #: Joins objects of a category and a split for a shard. None if the layout has no shards.
     join: Callable[[Sequence[RenderedObject], str, str], ViewDataset] | None = None
-    #: Chooses cameras for the placed vertices [V, 3]; their number is given. None: Kato's 24 views.
+    #: Chooses cameras for the placed vertices [V, 3]; their number is given. None for Kato's 24 views.
     views: Callable[[np.ndarray, int, np.random.Generator], Poses] | None = None
     image_size: int = IMAGE_SIZE
     default_views: int = NUM_VIEWS  # per object
@@ -72,7 +72,7 @@ class Writer:
     convention: VoxelConvention = KATO
     tight_grid: bool = False  # True if the side of the voxel grid is the longest side of the bounding box
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))  # frame of `mesh_to_object` to layout's object frame
-    diagonal: float | None = None  # diagonal of an object's bounding box; None: its longest side is 1
+    diagonal: float | None = None  # diagonal of an object's bounding box; None if its longest side is 1
     natural: bool = False  # True for everyday colours and lights; else objects are light grey
 
 
