@@ -41,7 +41,7 @@ NMR_INLINE void resolve_row(const int32_t* face_index, const T* pixels, const T*
   }
   for (int64_t x = 0; x < w; ++x, out += C) {
     const T *upper = pixels + 2 * x * C, *lower = upper + W * C;
-    const int32_t* corner = face_index + 2 * x;
+    const int32_t* corner = behind ? face_index + 2 * x : nullptr;
     if (!behind || (corner[0] | corner[1] | corner[W] | corner[W + 1]) >= 0) {
       for (int64_t c = 0; c < C; ++c) out[c] = (upper[c] + upper[C + c] + lower[c] + lower[C + c]) / 4;
     } else if ((corner[0] & corner[1] & corner[W] & corner[W + 1]) < 0) {
