@@ -78,7 +78,8 @@ class Work:
 
     def __str__(self) -> str:
         size = f"{self.size}x{self.size}" + " anti-aliased" * self.anti_aliasing
-        return f"{self.output}, {len(self.vertices)} meshes of {len(self.faces)} faces, {size}"
+        count = len(self.vertices)
+        return f"{self.output}, {count} mesh{'es' * (count > 1)} of {len(self.faces)} faces, {size}"
 
     def draw(self, vertices: Tensor, values: Tensor | None = None) -> Tensor:
         """The images that nmr draws of these vertices, in these colours."""
