@@ -10,6 +10,11 @@
 
 namespace nmr {
 
+// A part of both sets of lines: rows [row_first, row_last), and columns [column_first, column_last) over all rows.
+struct LineRange {
+  int64_t row_first, row_last, column_first, column_last;
+};
+
 // The pixels with a gradient, for the lines of one axis: N lines of M pixels, C channels. Others cannot pull.
 // Sweeps go up the line (direction 0) or down (direction 1).
 template <class T>

@@ -19,17 +19,18 @@ struct ScanlineGrads {
   // [N, pad + M + pad] background pixels with gradient < 0, ascending, and -gradient. Their neighbours in the padding
   // have positions before and after every pixel.
   Buffer<T> position, weight;
-  std::vector<int32_t> count;  // [N] their number
+  std::vector<int32_t> count;  // [N] their number; until they are joined, [parts, N]
   // [N + pad] by direction: a crossing before outer_end has a pulling pixel beyond it; one before inner_start has no
-  // pixel with gradient > 0 inside.
+  // pixel with gradient > 0 inside. Until they are joined, inner_start has [parts, N].
   std::vector<T> outer_end[2], inner_start[2];
   int64_t stride;  // pad + M + pad
 
-  void reserve_lines(int64_t N, int64_t M) {
+  void reserve_lines(int64_t N, int64_t M, int64_t parts) {
     stride = M + 2 * kPad;
     for (Buffer<T>* v : {&position, &weight}) reserve(*v, N * stride);
-    for (std::vector<T>* v : {&outer_end[0], &outer_end[1], &inner_start[0], &inner_start[1]}) reserve(*v, N + kPad);
-    reserve(count, N);
+    for (std::vector<T>* v : {&outer_end[0], &outer_end[1]}) reserve(*v, N + kPad);
+    for (std::vector<T>* v : {&inner_start[0], &inner_start[1]}) reserve(*v, parts * N + kPad);
+    reserve(count, parts * N);
   }
   const T* positions(int64_t n) const { return position.data() + n * stride + kPad; }
   const T* weights(int64_t n) const { return weight.data() + n * stride + kPad; }
@@ -58,9 +59,10 @@ struct SweepImage {
   }
 };
 
-// A part of both sets of lines: rows [row_first, row_last), and columns [column_first, column_last) over all rows.
-struct LineRange {
-  int64_t row_first, row_last, column_first, column_last;
+// Columns [number * width, (number + 1) * width) of an image, and the parts of its rows there. The width is a multiple
+// of kPad: no two parts write to one vector.
+struct ColumnPart {
+  int64_t number, width;
 };
 
 constexpr int64_t kSweptFaces = 128;  // faces that are swept together; a power of two

@@ -67,16 +67,29 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
                               args.eps > T(1e-15) ? T(1e15) : T(0)};
     T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
     std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
-    lines[0].reserve_lines(raster.width, raster.height);
-    lines[1].reserve_lines(raster.height, raster.width);
+    const int threads = share ? args.num_threads : 1;
+    const int64_t width = band_width(raster, threads), parts = (raster.width + width - 1) / width;
+    lines[0].reserve_lines(raster.width, raster.height, 1);
+    lines[1].reserve_lines(raster.height, raster.width, parts);
     sweep_image(
-        image, 1, share ? args.num_threads : 1,
+        image, threads,
         [&](int64_t first, int64_t last, uint8_t* seen) {
           NMR_AT_BEST_LEVEL(mark_visible, image.face_index + first, last - first, image.num_faces, seen);
         },
         [&](uint8_t* seen, int32_t* ids) { return NMR_AT_BEST_LEVEL(list_visible, image.num_faces, seen, ids); },
         [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_alpha, args.image.pixels()); },
-        [&](const LineRange& range, T* grad_row) { NMR_AT_BEST_LEVEL(collect_lines, image, range, grad_row); },
+        [&](int num_threads) {
+          parallel_for(parts, num_threads, [&](int64_t n) {
+            T* grad_row = reserve(thread_scratch<SweepTask<T>>().grad_row, raster.width + kPad);
+            const ColumnPart part{n, width};
+            NMR_AT_BEST_LEVEL(collect_lines, image, part, grad_row);
+          });
+          if (parts == 1) return;
+          parallel_for((raster.height + width - 1) / width, num_threads, [&](int64_t n) {
+            const int64_t first = n * width, last = std::min(first + width, raster.height);
+            NMR_AT_BEST_LEVEL(join_rows, image, width, first, last);
+          });
+        },
         [&](const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {
           NMR_AT_BEST_LEVEL(sweep_faces, image, ids, first, last, block, grad);
         },

@@ -26,23 +26,23 @@ void average_coverage(const int32_t* face_index, Size image, T* alpha) {
 
 // --- which pixels can pull
 
-// Gradients of one row of raster pixels (counted from the bottom), followed by lanes of zeros.
+// Gradients of raster pixels [first, last) of a row (counted from the bottom), followed by lanes of zeros.
 template <class T>
-NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, T* row) {
+NMR_INLINE void expand_row(const SweepImage<T>& image, int64_t j, int64_t first, int64_t last, T* row) {
   const int64_t w = image.size.width;
   if (image.anti_aliasing) {
     const T* grad = image.grad_alpha + (image.size.height - 1 - j / 2) * w;
-    for (int64_t x = 0; x < w; ++x) row[2 * x] = row[2 * x + 1] = grad[x] / 4;
+    for (int64_t x = first / 2; x < last / 2; ++x) row[2 * x] = row[2 * x + 1] = grad[x] / 4;
   } else {
-    std::copy_n(image.grad_alpha + (image.size.height - 1 - j) * w, w, row);
+    std::copy_n(image.grad_alpha + (image.size.height - 1 - j) * w + first, last - first, row + first);
   }
-  std::fill_n(row + image.raster.width, kLanes, T(0));
+  std::fill_n(row + last, kLanes, T(0));
 }
 
-// Adds pixel m to the list of line n.
+// Adds pixel m to the list at `start`, which has `count` pixels.
 template <class T>
-NMR_INLINE void append_pull(ScanlineGrads<T>& lines, int64_t n, int64_t m, T weight) {
-  const int64_t at = n * lines.stride + kPad + lines.count[n]++;
+NMR_INLINE void append_pull(ScanlineGrads<T>& lines, int64_t start, int32_t& count, int64_t m, T weight) {
+  const int64_t at = start + kPad + count++;
   lines.position[at] = static_cast<T>(m);
   lines.weight[at] = weight;
 }
@@ -62,21 +62,22 @@ NMR_INLINE void finish_lines(ScanlineGrads<T>& lines, int64_t first, int64_t las
   }
 }
 
-// Fills the lines of a range. grad_row: [W + lanes] of scratch.
+// Fills the columns of a part of the image, and its parts of the rows, which join_rows joins. Rows of the only part are
+// finished. grad_row: [W + lanes] of scratch.
 template <class T>
-void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_row) {
+void collect_lines(const SweepImage<T>& image, const ColumnPart& part, T* grad_row) {
   const int64_t H = image.raster.height, W = image.raster.width;
-  const bool any_column = range.column_first < range.column_last;
+  const int64_t first = part.number * part.width, last = std::min(first + part.width, W);
   ScanlineGrads<T>&columns = image.lines[0], &rows = image.lines[1];
-  start_lines(columns, range.column_first, range.column_last);
-  start_lines(rows, range.row_first, range.row_last);
-  const int64_t j_first = any_column ? 0 : range.row_first, j_last = any_column ? H : range.row_last;
-  for (int64_t j = j_first; j < j_last; ++j) {
-    const bool in_rows = j >= range.row_first && j < range.row_last;
+  start_lines(columns, first, last);
+  start_lines(rows, part.number * H, (part.number + 1) * H);
+  int32_t* row_count = rows.count.data() + part.number * H;
+  T* row_gain_first = rows.inner_start[0].data() + part.number * H;
+  T* row_gain_last = rows.inner_start[1].data() + part.number * H;
+  for (int64_t j = 0; j < H; ++j) {
     const int32_t* face_index = image.face_index + (H - 1 - j) * W;
-    if (j == j_first || !image.anti_aliasing || j % 2 == 0) expand_row(image, j, grad_row);
-    const int64_t i_last = in_rows ? W : range.column_last;
-    for (int64_t start = in_rows ? 0 : range.column_first; start < i_last; start += kLanes) {
+    if (!image.anti_aliasing || j % 2 == 0) expand_row(image, j, first, last, grad_row);
+    for (int64_t start = first; start < last; start += kLanes) {
       const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + start);
       Lanes32 id = splat(int32_t(-1));
       if (start + kLanes <= W)
@@ -88,25 +89,40 @@ void collect_lines(const SweepImage<T>& image, const LineRange& range, T* grad_r
       const uint32_t gain_bits = lane_bits(g > splat(T(0))) & ~lane_bits(background);
       for (; bits; bits &= bits - 1) {
         const int64_t i = start + lowest_bit(bits);
-        if (in_rows) append_pull(rows, j, i, -grad_row[i]);
-        if (i >= range.column_first && i < range.column_last) append_pull(columns, i, j, -grad_row[i]);
+        append_pull(rows, j * rows.stride + first, row_count[j], i, -grad_row[i]);
+        append_pull(columns, i * columns.stride, columns.count[i], j, -grad_row[i]);
       }
       if (!gain_bits) continue;
-      if (in_rows) {
-        rows.inner_start[0][j] = std::min(rows.inner_start[0][j], static_cast<T>(start));  // at least that
-        rows.inner_start[1][j] = static_cast<T>(start + kLanes - 1);                       // at most that
-      }
-      if (any_column) {
-        const LaneMask<T> here = (g > splat(T(0))) & widen_mask<T>(id >= splat(int32_t(0)));
-        T *gain_first = columns.inner_start[0].data() + start, *gain_last = columns.inner_start[1].data() + start;
-        const Lanes<T> line_first = load_lanes<Lanes<T>>(gain_first), at = splat(static_cast<T>(j));
-        store_lanes(gain_first, select(here & (line_first > at), at, line_first));
-        store_lanes(gain_last, select(here, at, load_lanes<Lanes<T>>(gain_last)));
-      }
+      row_gain_first[j] = std::min(row_gain_first[j], static_cast<T>(start));  // at least that
+      row_gain_last[j] = static_cast<T>(start + kLanes - 1);                   // at most that
+      const LaneMask<T> here = (g > splat(T(0))) & widen_mask<T>(id >= splat(int32_t(0)));
+      T *gain_first = columns.inner_start[0].data() + start, *gain_last = columns.inner_start[1].data() + start;
+      const Lanes<T> line_first = load_lanes<Lanes<T>>(gain_first), at = splat(static_cast<T>(j));
+      store_lanes(gain_first, select(here & (line_first > at), at, line_first));
+      store_lanes(gain_last, select(here, at, load_lanes<Lanes<T>>(gain_last)));
     }
   }
-  finish_lines(columns, range.column_first, range.column_last);
-  finish_lines(rows, range.row_first, range.row_last);
+  finish_lines(columns, first, last);
+  if (part.width >= W) finish_lines(rows, 0, H);
+}
+
+// Joins the parts of rows [first, last).
+template <class T>
+void join_rows(const SweepImage<T>& image, int64_t width, int64_t first, int64_t last) {
+  const int64_t H = image.raster.height, W = image.raster.width;
+  ScanlineGrads<T>& rows = image.lines[1];
+  for (int64_t j = first; j < last; ++j) {
+    T *position = rows.position.data() + j * rows.stride + kPad, *weight = rows.weight.data() + j * rows.stride + kPad;
+    for (int64_t part = 1; part * width < W; ++part) {
+      const int64_t n = part * H + j, count = rows.count[n], from = part * width, to = rows.count[j];
+      std::memmove(position + to, position + from, count * sizeof(T));
+      std::memmove(weight + to, weight + from, count * sizeof(T));
+      rows.count[j] += static_cast<int32_t>(count);
+      rows.inner_start[0][j] = std::min(rows.inner_start[0][j], rows.inner_start[0][n]);
+      rows.inner_start[1][j] = std::max(rows.inner_start[1][j], rows.inner_start[1][n]);
+    }
+  }
+  finish_lines(rows, first, last);
 }
 
 // --- the pulls

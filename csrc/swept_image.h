@@ -28,17 +28,23 @@ struct SweepTask {
   std::vector<SweepScratch<T>> blocks;  // [1]
 };
 
-// Adds the gradients of an image (SweepImage or ColorImage) of C channels to its vertices. If a gradient of the image
+// The width of the bands of columns or rows that several threads work on: a multiple of kPad.
+inline int64_t band_width(Size raster, int num_threads) {
+  const int64_t longer = std::max(raster.width, raster.height), threads = std::max(num_threads, 1);
+  return std::max<int64_t>((longer / threads + kPad - 1) / kPad * kPad, num_threads > 1 ? 64 : longer + kPad);
+}
+
+// Adds the gradients of an image (SweepImage or ColorImage) to its vertices. If a gradient of the image
 // is not finite, x and y of every vertex of a visible face get NaN.
 //
 //   mark(first, last, seen)           marks the faces that own one of these pixels
 //   list(seen, ids)                   writes the face indices of marked faces, and returns their number
 //   finite()                          whether all gradients of the image are finite
-//   collect(range, grad_row)          lists the pixels of some lines that can pull
+//   collect(num_threads)              lists the pixels of all lines that can pull
 //   sweep(ids, first, last, block, grad)   writes the gradients of some of these faces
 template <class T, class Image, class Mark, class List, class Finite, class Collect, class Sweep>
-void sweep_image(const Image& image, int64_t channels, int num_threads, const Mark& mark, const List& list,
-                 const Finite& finite, const Collect& collect, const Sweep& sweep, T* grad_vertices) {
+void sweep_image(const Image& image, int num_threads, const Mark& mark, const List& list, const Finite& finite,
+                 const Collect& collect, const Sweep& sweep, T* grad_vertices) {
   const int64_t H = image.raster.height, W = image.raster.width;
   SweptFaces<T>& faces = thread_scratch<SweptFaces<T>>();
   // Several threads mark the faces of a part of the pixels each, unless there are almost as many faces as pixels.
@@ -58,19 +64,7 @@ void sweep_image(const Image& image, int64_t channels, int num_threads, const Ma
     scatter_corners(image, ids, count, grad, grad_vertices);
     return;
   }
-  // Several threads: bands of columns, then bands of rows, of whole vectors: no two threads write to one vector.
-  const int64_t longer = std::max(H, W), share = (longer / std::max(num_threads, 1) + kPad - 1) / kPad * kPad;
-  const int64_t band = num_threads > 1 ? std::max<int64_t>(share, 64) : longer;
-  const int64_t column_bands = (W + band - 1) / band, row_bands = (H + band - 1) / band;
-  parallel_for(num_threads > 1 ? column_bands + row_bands : 1, num_threads, [&](int64_t n) {
-    T* grad_row = reserve(thread_scratch<SweepTask<T>>().grad_row, channels * (W + kPad));
-    const auto part = [band](int64_t k, int64_t lines) { return std::min(k * band, lines); };
-    const int64_t k = n - column_bands;  // number of a band of rows
-    collect(num_threads <= 1 ? LineRange{0, H, 0, W}
-            : k < 0          ? LineRange{0, 0, part(n, W), part(n + 1, W)}
-                             : LineRange{part(k, H), part(k + 1, H), 0, 0},
-            grad_row);
-  });
+  collect(num_threads);
   const int64_t chunk = num_threads > 1 ? 2 * kSweptFaces : count;
   parallel_for((count + chunk - 1) / chunk, num_threads, [&](int64_t n) {
     SweepScratch<T>& block = *reserve(thread_scratch<SweepTask<T>>().blocks, 1);
