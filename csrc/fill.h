@@ -431,6 +431,7 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
     const bool reversed = (pass == 0) == back_first;
     if (pass == 1) bound_blocks(band, window, blocks, block_least);
     for (int64_t c = 0; c < chunks; ++c) {
+      if (table.boxes[c].row_last < band.row_first || table.boxes[c].row_first > band.row_last) continue;
       const int32_t* list = (reversed ? table.back : table.front).data() + c * kChunk;
       const int32_t count = (reversed ? table.num_back : table.num_front)[c];
       for (int32_t n = 0; n < count; ++n)
