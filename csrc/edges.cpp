@@ -158,15 +158,15 @@ void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threa
       },
       [&](uint8_t* seen, int32_t* ids) { return NMR_AT_BEST_LEVEL(list_visible, image.num_faces, seen, ids); },
       [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_resolved, args.image.pixels() * C); },
-      [&](int threads) {  // several: bands of columns, then bands of rows
-        const int64_t band = band_width(raster, threads), column_bands = (W + band - 1) / band;
+      [&] {  // on several threads: bands of columns, then bands of rows
+        const int64_t band = band_width(std::max(H, W), num_threads), column_bands = (W + band - 1) / band;
         const auto part = [band](int64_t k, int64_t lines) { return std::min(k * band, lines); };
-        parallel_for(threads > 1 ? column_bands + (H + band - 1) / band : 1, threads, [&](int64_t n) {
+        parallel_for(num_threads > 1 ? column_bands + (H + band - 1) / band : 1, num_threads, [&](int64_t n) {
           T* grad_row = reserve(thread_scratch<SweepTask<T>>().grad_row, C * (W + kPad));
           const int64_t k = n - column_bands;  // number of a band of rows
-          const LineRange range = threads <= 1 ? LineRange{0, H, 0, W}
-                                  : k < 0      ? LineRange{0, 0, part(n, W), part(n + 1, W)}
-                                               : LineRange{part(k, H), part(k + 1, H), 0, 0};
+          const LineRange range = num_threads <= 1 ? LineRange{0, H, 0, W}
+                                  : k < 0          ? LineRange{0, 0, part(n, W), part(n + 1, W)}
+                                                   : LineRange{part(k, H), part(k + 1, H), 0, 0};
           NMR_AT_BEST_LEVEL(collect_colors, image, range, grad_row);
         });
       },

@@ -10,7 +10,7 @@
 
 namespace nmr {
 
-// A part of both sets of lines: rows [row_first, row_last), and columns [column_first, column_last) over all rows.
+// The lines of one task: whole rows [row_first, row_last) and whole columns [column_first, column_last).
 struct LineRange {
   int64_t row_first, row_last, column_first, column_last;
 };

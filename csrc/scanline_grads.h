@@ -19,9 +19,9 @@ struct ScanlineGrads {
   // [N, pad + M + pad] background pixels with gradient < 0, ascending, and -gradient. Their neighbours in the padding
   // have positions before and after every pixel.
   Buffer<T> position, weight;
-  std::vector<int32_t> count;  // [N] their number; until they are joined, [parts, N]
+  std::vector<int32_t> count;  // [N] their number; [parts, N] for rows whose parts are not joined yet (join_rows)
   // [N + pad] by direction: a crossing before outer_end has a pulling pixel beyond it; one before inner_start has no
-  // pixel with gradient > 0 inside. Until they are joined, inner_start has [parts, N].
+  // pixel with gradient > 0 inside. Rows whose parts are not joined yet have inner_start [parts, N].
   std::vector<T> outer_end[2], inner_start[2];
   int64_t stride;  // pad + M + pad
 
@@ -59,8 +59,7 @@ struct SweepImage {
   }
 };
 
-// Columns [number * width, (number + 1) * width) of an image, and the parts of its rows there. The width is a multiple
-// of kPad: no two parts write to one vector.
+// Part `number` of an image: columns [number * width, (number + 1) * width), and the pieces of all rows in them.
 struct ColumnPart {
   int64_t number, width;
 };

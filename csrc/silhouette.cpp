@@ -68,7 +68,7 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
     T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
     std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
     const int threads = share ? args.num_threads : 1;
-    const int64_t width = band_width(raster, threads), parts = (raster.width + width - 1) / width;
+    const int64_t width = band_width(raster.width, threads), parts = (raster.width + width - 1) / width;
     lines[0].reserve_lines(raster.width, raster.height, 1);
     lines[1].reserve_lines(raster.height, raster.width, parts);
     sweep_image(
@@ -78,15 +78,16 @@ void silhouette_backward(const SilhouetteBackward<T>& args) {
         },
         [&](uint8_t* seen, int32_t* ids) { return NMR_AT_BEST_LEVEL(list_visible, image.num_faces, seen, ids); },
         [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_alpha, args.image.pixels()); },
-        [&](int num_threads) {
-          parallel_for(parts, num_threads, [&](int64_t n) {
+        [&] {
+          parallel_for(parts, threads, [&](int64_t n) {
             T* grad_row = reserve(thread_scratch<SweepTask<T>>().grad_row, raster.width + kPad);
             const ColumnPart part{n, width};
             NMR_AT_BEST_LEVEL(collect_lines, image, part, grad_row);
           });
           if (parts == 1) return;
-          parallel_for((raster.height + width - 1) / width, num_threads, [&](int64_t n) {
-            const int64_t first = n * width, last = std::min(first + width, raster.height);
+          const int64_t height = band_width(raster.height, threads);
+          parallel_for((raster.height + height - 1) / height, threads, [&](int64_t n) {
+            const int64_t first = n * height, last = std::min(first + height, raster.height);
             NMR_AT_BEST_LEVEL(join_rows, image, width, first, last);
           });
         },

@@ -62,8 +62,8 @@ NMR_INLINE void finish_lines(ScanlineGrads<T>& lines, int64_t first, int64_t las
   }
 }
 
-// Fills the columns of a part of the image, and its parts of the rows, which join_rows joins. Rows of the only part are
-// finished. grad_row: [W + lanes] of scratch.
+// Fills the columns of a part of the image, and the pieces of rows in it. join_rows joins and finishes the rows, unless
+// the part is the whole image. grad_row: [W + lanes] of scratch.
 template <class T>
 void collect_lines(const SweepImage<T>& image, const ColumnPart& part, T* grad_row) {
   const int64_t H = image.raster.height, W = image.raster.width;
@@ -106,7 +106,7 @@ void collect_lines(const SweepImage<T>& image, const ColumnPart& part, T* grad_r
   if (part.width >= W) finish_lines(rows, 0, H);
 }
 
-// Joins the parts of rows [first, last).
+// Joins the pieces of rows [first, last), and finishes them. width: that of the parts.
 template <class T>
 void join_rows(const SweepImage<T>& image, int64_t width, int64_t first, int64_t last) {
   const int64_t H = image.raster.height, W = image.raster.width;

@@ -28,19 +28,20 @@ struct SweepTask {
   std::vector<SweepScratch<T>> blocks;  // [1]
 };
 
-// The width of the bands of columns or rows that several threads work on: a multiple of kPad.
-inline int64_t band_width(Size raster, int num_threads) {
-  const int64_t longer = std::max(raster.width, raster.height), threads = std::max(num_threads, 1);
-  return std::max<int64_t>((longer / threads + kPad - 1) / kPad * kPad, num_threads > 1 ? 64 : longer + kPad);
+// The width of the bands of `lines` columns or rows that several threads work on: a multiple of kPad, so that no two
+// threads write to one vector. One thread has one band.
+inline int64_t band_width(int64_t lines, int num_threads) {
+  const int64_t share = lines / std::max(num_threads, 1);
+  return std::max<int64_t>((share + kPad - 1) / kPad * kPad, 64);
 }
 
-// Adds the gradients of an image (SweepImage or ColorImage) to its vertices. If a gradient of the image
-// is not finite, x and y of every vertex of a visible face get NaN.
+// Adds the gradients of an image (SweepImage or ColorImage) to its vertices. If a gradient of the image is not finite,
+// x and y of every vertex of a visible face get NaN.
 //
 //   mark(first, last, seen)           marks the faces that own one of these pixels
 //   list(seen, ids)                   writes the face indices of marked faces, and returns their number
 //   finite()                          whether all gradients of the image are finite
-//   collect(num_threads)              lists the pixels of all lines that can pull
+//   collect()                         lists the pixels of all lines that can pull
 //   sweep(ids, first, last, block, grad)   writes the gradients of some of these faces
 template <class T, class Image, class Mark, class List, class Finite, class Collect, class Sweep>
 void sweep_image(const Image& image, int num_threads, const Mark& mark, const List& list, const Finite& finite,
@@ -64,7 +65,7 @@ void sweep_image(const Image& image, int num_threads, const Mark& mark, const Li
     scatter_corners(image, ids, count, grad, grad_vertices);
     return;
   }
-  collect(num_threads);
+  collect();
   const int64_t chunk = num_threads > 1 ? 2 * kSweptFaces : count;
   parallel_for((count + chunk - 1) / chunk, num_threads, [&](int64_t n) {
     SweepScratch<T>& block = *reserve(thread_scratch<SweepTask<T>>().blocks, 1);

@@ -1,4 +1,4 @@
-"""Makes a data set from meshes: scales, colours and renders them. Cameras and files of each layout: `writers`."""
+"""Makes a data set from meshes: scales, colours and renders them. `writers` has cameras and files of each layout."""
 
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence

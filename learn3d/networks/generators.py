@@ -15,7 +15,7 @@ from learn3d.networks.layers import initialize_he, linear_layers, norm_relu
 #: The mirror plane x = 0 or z = 0, or the vertical plane along which a camera of this azimuth in degrees looks
 #: (x = 0 is 0, z = 0 is 90).
 Symmetry = Literal["x", "z"] | Annotated[float, Field(ge=-360, le=360)]
-#: The setting; auto: the plane that the training masks show (`data.mirror_plane`). None for no symmetry.
+#: Values of the setting: a plane; "auto" for the plane that `data.mirror_plane` finds; None without symmetry.
 SymmetryOption = Symmetry | Literal["auto"] | None
 
 

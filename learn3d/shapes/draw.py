@@ -52,9 +52,9 @@ def ellipse(width: float, depth: float, count: int = 20, exponent: float = 2.0) 
 
 
 def rectangle(width: float, depth: float, radius: float | None = None, segments: int = 2) -> np.ndarray:
-    """A rectangle outline [4 (segments + 1), 2] with rounded corners (default radius: 12 % of the short side).
+    """The outline [4 (segments + 1), 2] of a rectangle with rounded corners.
 
-    With 0 segments the corners are sharp.
+    The default radius is 12 % of the short side. With 0 segments the corners are sharp.
     """
     corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
     if segments == 0:

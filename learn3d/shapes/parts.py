@@ -88,7 +88,7 @@ def slab(outline: np.ndarray, thickness: float, bevel: float | None = None) -> P
 
 
 def box(size: Point, center: Point = (0.0, 0.0, 0.0), radius: float | None = None) -> Part:
-    """A box of the given size [3] about `center`, its edges rounded (default radius: 12 % of the shortest side)."""
+    """A box of this size [3] about `center` with rounded edges. Their default radius is 12 % of the shortest side."""
     shortest, axis = np.min(size), int(np.argmax(size))  # lofted along its longest side
     radius = 0.12 * shortest if radius is None else min(radius, 0.45 * shortest)
     outline = rectangle(size[axis - 2], size[axis - 1], radius, 1 if radius < 0.2 * shortest else 3)

@@ -120,7 +120,7 @@ DETACHED = 2e-3  # distance, over the longest side, at which a quadrilateral is 
 
 
 def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:
-    """Drop propeller discs and detached quadrilaterals, which carry pictures of motion, light or vapour.
+    """Leave out propeller discs and detached quadrilaterals, whose textures are pictures of motion, light or vapour.
 
     A disc, or the square with its texture, is a part with a round or square outline that is wider than MIN_DISC. Its
     depth along the flight direction x is below 3 % of its diameter. A detached quadrilateral is a part of one or two

@@ -60,7 +60,7 @@ class Writer:
     write: Callable[[Iterable[RenderedObject], str, Path, Path], None] | None = None
     #: Joins objects of a category and a split for a shard. None if the layout has no shards.
     join: Callable[[Sequence[RenderedObject], str, str], ViewDataset] | None = None
-    #: Chooses cameras for the placed vertices [V, 3]; their number is given. None for Kato's 24 views.
+    #: Draws the given number of cameras for the placed vertices [V, 3]. None if all objects have Kato's 24 views.
     views: Callable[[np.ndarray, int, np.random.Generator], Poses] | None = None
     image_size: int = IMAGE_SIZE
     default_views: int = NUM_VIEWS  # per object
