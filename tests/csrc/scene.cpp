@@ -495,12 +495,13 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     }
     check(below[0] && below[1] && above[0] && above[1], "a face covers no centre outside its bounding box");
   }
+  const std::vector<T>& alpha = r.get("alpha");
   for (int64_t n = 0; n < scene.batch * image.pixels(); ++n) {
     const int64_t step = scene.anti_aliasing ? 2 : 1, b = n / image.pixels(), y = n / image.width % image.height, x = n % image.width;
     int covered = 0;
     for (int64_t k = 0; k < step * step; ++k)
       covered += face_index[b * raster.pixels() + (step * y + k / step) * W + step * x + k % step] >= 0;
-    check(r.get("alpha")[n] == T(covered) / T(step * step), "alpha is the covered share of a pixel");
+    check(alpha[n] == T(covered) / T(step * step), "alpha is the covered share of a pixel");
   }
   const size_t count = face_index.empty() ? 0 : layers.size() / face_index.size();
   const std::vector<int32_t>& around = r.template get<int32_t>("soft_layers");
@@ -516,20 +517,22 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     if (n % count == 0 && !foreign) check(id == face_index[n / count], "the first layer is the face index map");
   }
 
-  const std::vector<int64_t>&starts = r.template get<int64_t>("clip_starts"), &corners = r.template get<int64_t>("clip_corners");
+  const std::vector<int64_t>&starts = r.template get<int64_t>("clip_starts"), &corners = r.template get<int64_t>("clip_corners"),
+                            &clip_faces = r.template get<int64_t>("clip_faces"), &ends = r.template get<int64_t>("clip_ends");
+  const std::vector<int32_t>& sources = r.template get<int32_t>("clip_source");
   for (int64_t b = 0; b < scene.batch; ++b) {
     const int64_t V = mesh.vertex_count(b), F = mesh.face_count(b), first = mesh.vertex_start(b), P = starts[2 * b + 2] - starts[2 * b];
     for (int64_t f = starts[2 * b + 1]; f < starts[2 * b + 3]; ++f) {
-      const int64_t source = r.template get<int32_t>("clip_source")[f];
+      const int64_t source = sources[f];
       check(source >= 0 && source < std::max<int64_t>(F, 1), "a drawn face is part of a face");
       for (int64_t n = 3 * f; n < 3 * f + 3; ++n) {
-        const int64_t v = r.template get<int64_t>("clip_faces")[n];
+        const int64_t v = clip_faces[n];
         check(V == 0 || (v >= 0 && v < V + P), "a corner of a drawn face is a vertex or a new vertex");
         check(corners[n] >= 0 && corners[n] < 3 + std::max<int64_t>(P, 1), "a corner of a drawn face lies on its face");
       }
     }
     for (int64_t n = 4 * starts[2 * b]; n < 4 * starts[2 * b + 2] && F > 0; ++n) {
-      const int64_t end = r.template get<int64_t>("clip_ends")[n];
+      const int64_t end = ends[n];
       check(n % 4 < 2 ? end >= first && end < first + V : end >= 0 && end <= 2, "a new vertex lies between two corners");
     }
   }
@@ -544,17 +547,20 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     check(n % 3 == 2 ? std::isfinite(points[n]) : !std::isnan(points[n]), "a projected vertex has a depth and a place, or is at infinity");
   for (size_t n = 0; n < pose.size(); ++n)
     check(std::isfinite(pose[n]) == std::isfinite(pose[n - n % 12]) && !std::isinf(pose[n]), "a pose is finite or all NaN");
-  for (const char* name : {"grad_silhouette", "grad_local", "grad_edges", "grad_local_edges", "grad_soft"})
-    for (size_t n = 2; n < r.get(name).size(); n += 3) check(r.get(name)[n] == 0, "the gradients of silhouettes and edges have no z");
-  const auto background_is_0 = [&](const char* name, size_t n) {
-    const size_t channels = r.get(name).size() / depth.size();
-    for (size_t c = 0; c < channels; ++c) check(r.get(name)[channels * n + c] == 0, "the background's weights and colours are 0");
-  };
+  for (const char* name : {"grad_silhouette", "grad_local", "grad_edges", "grad_local_edges", "grad_soft"}) {
+    const std::vector<T>& grad = r.get(name);
+    for (size_t n = 2; n < grad.size(); n += 3) check(grad[n] == 0, "the gradients of silhouettes and edges have no z");
+  }
+  for (const char* name : {"weights", "values", "colors", "sampled", "lit", "rast", "slopes"}) {
+    const std::vector<T>& values = r.get(name);
+    const size_t channels = depth.empty() ? 1 : values.size() / depth.size();
+    for (size_t n = 0; n < values.size(); ++n)
+      check(face_index[n / channels] >= 0 || values[n] == 0, "the background's weights and colours are 0");
+  }
   const bool tame = !foreign && is_tame(scene);
   for (size_t n = 0; n < depth.size(); ++n) {
     if (face_index[n] < 0) {
       check(depth[n] == scene.far, "the background's depth is far");
-      for (const char* name : {"weights", "values", "colors", "sampled", "lit", "rast", "slopes"}) background_is_0(name, n);
     } else if (tame) {
       const T* w = weights.data() + 3 * n;
       check(std::abs(w[0] + w[1] + w[2] - 1) <= T(1e-4), "the weights of a covered pixel sum to 1");
