@@ -33,7 +33,7 @@ class Preset:
 
 
 #: Short names of the methods, accepted wherever a preset is: the preset for Kato's data, and a line for `train --help`.
-METHODS = {
+SHORT_NAMES = {
     "plus": ("plus-kato", "the default: proposed, with mirror symmetry and a loss at novel views"),
     "proposed": ("peng2020-kato", "pose-invariant codes from single views (Peng et al. 2020)"),
     "vanilla": ("peng2020-kato-vanilla", "encoder and mesh generator alone, on single views"),
@@ -46,9 +46,9 @@ METHODS = {
 
 def full_name(name: str) -> str:
     """The name of a preset, given that name or the short name of a method. Raises ValueError for other names."""
-    preset = METHODS[name][0] if name in METHODS else name
+    preset = SHORT_NAMES[name][0] if name in SHORT_NAMES else name
     if preset not in PRESETS:
-        raise ValueError(unknown_name("preset", name, [*METHODS, *PRESETS]))
+        raise ValueError(unknown_name("preset", name, [*SHORT_NAMES, *PRESETS]))
     return preset
 
 
@@ -138,8 +138,8 @@ _PASCAL_VPL = VPLSettings(
 
 def _vanilla(preset: Preset) -> Preset:
     """The baseline Vanilla-AE: a preset without its losses on codes."""
-    none = dict.fromkeys(("lambda_classification", "lambda_adversarial", "lambda_prior"), 0.0)
-    settings = replace(preset.settings, **none)
+    zeros = dict.fromkeys(("lambda_classification", "lambda_adversarial", "lambda_prior"), 0.0)
+    settings = replace(preset.settings, **zeros)
     return replace(preset, label="Vanilla-AE", settings=settings, source=f"baseline; otherwise {preset.source}")
 
 

@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import imageio.v3 as imageio
 import pytest
@@ -17,7 +18,10 @@ import trimesh
 import tyro
 
 from learn3d.commands import main
+from learn3d.data.readers import READERS
 from learn3d.experiments.tables import TABLES
+from learn3d.methods.optimization import LRSchedule
+from learn3d.presets import PRESETS
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -110,6 +114,14 @@ def test_pages_run_and_what_they_name_exists(page, tmp_path, monkeypatch):
     missing += [link for link in {*links} if "://" not in link and not (page.parent / link).exists()]
     assert missing == []
     assert page != README or len(named) > 5
+
+
+def test_presets_schedules_and_layouts_are_on_their_pages():
+    methods, data_sets = ((ROOT / "docs" / page).read_text() for page in ("methods/README.md", "data-sets.md"))
+    names = {name if not name.startswith("kato2019") else "kato2019-..." for name in PRESETS}
+    assert not [name for name in names if f"`{name}`" not in methods]
+    assert "|".join(sorted(get_args(LRSchedule))) in methods.replace("\\", "")
+    assert not [name for name in READERS if f"`{name}`" not in data_sets]
 
 
 def commands():

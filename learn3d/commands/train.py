@@ -12,7 +12,7 @@ from learn3d.config import DEFAULT_PRESET, FROM_PRESET, TrainConfig, load_config
 from learn3d.experiments.experiment import describe_tables, run_experiment
 from learn3d.experiments.plan import Request
 from learn3d.experiments.tables import TABLES
-from learn3d.presets import METHODS, PRESETS, full_name
+from learn3d.presets import PRESETS, SHORT_NAMES, full_name
 from learn3d.terminal import INTERRUPTED, say
 from learn3d.training import train
 
@@ -33,7 +33,7 @@ class Train(Command):
 
     @classmethod
     def about(cls, everything: bool) -> str:
-        lines = ["Methods (--preset NAME):", *(f"  {name:10}  {summary}" for name, (_, summary) in METHODS.items())]
+        lines = ["Methods (--preset NAME):", *(f"  {name:10}  {summary}" for name, (_, summary) in SHORT_NAMES.items())]
         if everything:
             lines += ["", "Presets (--preset NAME --help-all shows the settings of one):"]
             lines += [f"  {name:23}  {preset.label}; {preset.source}" for name, preset in PRESETS.items()]

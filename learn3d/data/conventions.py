@@ -76,8 +76,8 @@ class LayoutProperties:
     """Properties of all data sets of a layout."""
 
     voxels: bool  # True if there is ground truth for the voxel IoU
-    convention: VoxelConvention  # axes of the voxels
     inverted: bool  # True if colours are stored as 255 - colour, see `ViewDataset.inverted`
+    convention: VoxelConvention = KATO  # axes of the voxels
     validation: bool = True  # True if there is a split "val"; otherwise networks are validated on "test"
     angles: bool = True  # True if poses have azimuth and elevation, as cells of view classes need
     stretched: bool = False  # True if images are boxes of photographs with background, stretched to squares

@@ -40,6 +40,8 @@ def create_method(
         raise ValueError("device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'")
     if type(settings) not in _METHODS:
         raise ValueError(f"no method learns with {type(settings).__name__}; add the pair to learn3d.methods._METHODS")
+    if "__dataclass_fields__" not in vars(type(settings)):
+        raise ValueError(f"{type(settings).__name__} lacks the decorator @checked, so its fields are no options")
     kind = _METHODS[type(settings)]
     if kind.needs_poses and info.pose_features == 0:
         raise ValueError(

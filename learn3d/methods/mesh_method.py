@@ -176,14 +176,13 @@ class MeshMethod(Method):
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
     def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
-        """The losses smoothness, inflation and area, each only if its weight is above 0."""
+        """The losses on vertices [B, V, 3] whose weight is above 0."""
         losses = {
-            "smoothness": (nmr.losses.smoothness_loss, self.edges),
-            "inflation": (nmr.losses.inflation_loss, self.faces),
-            "area": (nmr.losses.area_loss, self.faces),
+            "smoothness": lambda: nmr.losses.smoothness_loss(vertices, self.edges),
+            "inflation": lambda: nmr.losses.inflation_loss(vertices, self.faces),
+            "area": lambda: nmr.losses.area_loss(vertices, self.faces),
         }
-        wanted = {name: parts for name, parts in losses.items() if self.weights.get(name, 0.0) > 0}
-        return {name: loss(vertices, table) for name, (loss, table) in wanted.items()}
+        return {name: loss() for name, loss in losses.items() if self.weights.get(name, 0.0) > 0}
 
 
 CODE_STEPS, VERTEX_STEPS = 40, 40  # steps of `refine`

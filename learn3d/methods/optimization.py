@@ -43,7 +43,7 @@ class TrainingSchedule:
             return 0.1 if 20 * step > 19 * self.iterations else 1.0
         if self.lr_schedule == "constant":
             return 1.0
-        raise ValueError(f"the schedule {self.lr_schedule!r} has no line in TrainingSchedule.lr_factor")
+        raise ValueError(f"the schedule {self.lr_schedule!r} has no branch in TrainingSchedule.lr_factor")
 
 
 class EMA:

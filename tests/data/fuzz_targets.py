@@ -42,16 +42,16 @@ class Target:
     read: Callable[[Path], None]
 
 
-SETTINGS = {
+SETTINGS = {  # of data sets whose meshes are written by `write_meshes`; 24 views unless said
     "kato": {"test": 1, "val": 0},
     "dvr": {"test": 1, "val": 0},
-    "kar": {"test": 1, "val": 0, "views": 2},
+    "kar": {"test": 1, "val": 0, "views": 4},
     "r2n2": {},
-    "pascal3d": {"val": 1, "views": 2},
-    "photos": {"test": 1, "val": 0, "views": 2},
+    "pascal3d": {"val": 1, "views": 4},
+    "photos": {"test": 1, "val": 0, "views": 4},
 }
 NPZ = m.damage_zip(m.damage_npy)
-FILES: dict[str, dict[str, m.Mutation]] = {  # of each layout, one of each kind; ID is an object of the split
+FILES: dict[str, dict[str, m.Mutation]] = {  # one of each kind; ID: an object or image, see `first`
     "kato": {"03001627_test_images.npz": NPZ, "03001627_test_voxels.npz": NPZ},
     "dvr": {
         "03001627/ID/cameras.npz": NPZ,

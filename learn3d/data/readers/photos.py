@@ -21,7 +21,7 @@ from pydantic import Field
 from tqdm import tqdm
 
 from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import KATO, LayoutProperties
+from learn3d.data.conventions import LayoutProperties
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
@@ -32,7 +32,7 @@ from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
 from learn3d.terminal import is_watched
 
-PROPERTIES = LayoutProperties(voxels=False, convention=KATO, inverted=True, options=("image_size",))
+PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("image_size",))
 _SCALE_ODD = 1.7  # factor between sizes in images and table that gives a warning; half angles for whole ones give 2
 _SCALE_OFF = 5.0  # factor that is an error: distances are in another unit
 TABLE = "poses.csv"
@@ -67,7 +67,7 @@ def load(
     """
     synset_of(category)  # raises ValueError for a path, which would lead to other folders
     table = Path(folder) / category / TABLE
-    photos = read_table(table, findings)
+    photos = read_photo_table(table, findings)
     splits = split_objects(table, photos)
     chosen, training = ([photo for photo in photos if splits[photo.object] == s] for s in (split, "train"))
     names, object_ids = np.unique([photo.object for photo in chosen], return_inverse=True)
@@ -111,7 +111,7 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     for table in sorted({path.parent / TABLE for name in (TABLE, "images") for path in Path(folder).glob(f"*/{name}")}):
         splits = {"train"}
         with contextlib.suppress(ValueError, OSError):  # `load` raises the same fault
-            splits = set(split_objects(table, read_table(table, Findings())).values()) or splits
+            splits = set(split_objects(table, read_photo_table(table, Findings())).values()) or splits
         found[table.parent.name] = tuple(name for name in SPLITS if name in splits)
     return found
 
@@ -137,7 +137,7 @@ def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Find
             findings.warn(photo.file, f"{message}; is the distance in line {photo.line} right?")
 
 
-def read_table(table: Path, findings: Findings) -> list[Photo]:
+def read_photo_table(table: Path, findings: Findings) -> list[Photo]:
     """The valid rows of a table; faults of the others go to the findings. Without a table, all images without poses.
 
     Raises MissingFile, and DamagedFile if the file is not a table of photographs.

@@ -32,9 +32,10 @@ def read_objects(
 
     The masks are None if they are the images' fourth channel. Returns None if the findings are not strict.
 
-    files: the calls for an object: its cameras, whose folder must exist; its shape (voxels or points); its views, each
-    an image, a mask and the mask's largest value. build: the poses and the shape of an object, from the paths and the
-    content of the first two files; it may raise DamagedFile. title: of the progress bar.
+    files: the calls for an object, in this order: its cameras, whose folder must exist; its shape (voxels or points);
+    then one for each view, which returns an image, a mask and the mask's largest value. build: the poses and the shape
+    of an object, from the paths and the content of the first two files; it may raise DamagedFile. title: of the
+    progress bar.
     """
     findings.objects = len(names)
     whole = (calls for calls in map(files, names) if findings.attempt(_require_folder, calls[0].path.parent))

@@ -55,8 +55,8 @@ class Writer:
 
     #: Files and folders of a category alone, relative to the data set's folder.
     paths: Callable[[str], tuple[str, ...]] = lambda category: ()
-    #: Writes the objects (train, val, test) of a category into a folder, from which `paths` and `shared` are moved to
-    #: the data set's folder, the last argument. None if the layout exists as shards only.
+    #: write(objects, category, temporary, folder) writes train, val and test of a category into `temporary`; then
+    #: `paths` and `shared` are moved to `folder`, that of the data set. None if the layout exists as shards only.
     write: Callable[[Iterable[RenderedObject], str, Path, Path], None] | None = None
     #: Joins objects of a category and a split for a shard. None if the layout has no shards.
     join: Callable[[Sequence[RenderedObject], str, str], ViewDataset] | None = None

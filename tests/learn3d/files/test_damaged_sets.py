@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fuzz_targets import ERRORS, SETTINGS, TARGETS, Target, layout_target
+from fuzz_targets import ERRORS, FILES, SETTINGS, TARGETS, Target, layout_target
 from reader_checks import at_most
 
 from learn3d.config import TrainConfig
 from learn3d.data.layouts import check_folder
-from learn3d.data.readers import READERS
+from learn3d.make_data.writers import WRITERS
 from learn3d.training import train
 
 DAMAGED = {  # what is cut short, and a preset of the layout
@@ -30,7 +30,9 @@ DAMAGED = {  # what is cut short, and a preset of the layout
 
 
 def test_every_layout_is_tried():
-    assert set(DAMAGED) == set(SETTINGS) == set(READERS) - {"around"}
+    written = {name for name, writer in WRITERS.items() if writer.write}
+    message = "add the layout to DAMAGED here, and to SETTINGS and FILES of tests/data/fuzz_targets.py"
+    assert set(DAMAGED) == set(SETTINGS) == set(FILES) == written, message
 
 
 @pytest.mark.parametrize("layout", DAMAGED)

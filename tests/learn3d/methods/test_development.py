@@ -30,7 +30,7 @@ def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, m
 
     settings = page.MirrorSettings(encoder="conv-small", generator="sphere-small", learning_rate=1e-3)
     where = {"data": tiny_folder, "category": "airplane", "output": tmp_path / "run"}
-    options = {"preset": "mirror", "settings": settings, "batch_size": 4, "max_val_images": 4, "log_every": 1}
+    options = {"preset": "mirror-kato", "settings": settings, "batch_size": 4, "max_val_images": 4, "log_every": 1}
     train(TrainConfig(**where, **options, iterations=2))
     summary = train(TrainConfig(**where, **options, iterations=4), resume=True)
     assert summary.finished

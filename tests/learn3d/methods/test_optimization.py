@@ -6,6 +6,7 @@ import dataclasses
 import math
 import signal
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import tiny_networks
@@ -13,9 +14,9 @@ import torch
 from torch import nn
 
 from learn3d.data.dataset import DatasetInfo
-from learn3d.methods import create_method
+from learn3d.methods import _METHODS, create_method
 from learn3d.methods.method import Method
-from learn3d.methods.optimization import EMA, TrainingSchedule, adam, backpropagate
+from learn3d.methods.optimization import EMA, LRSchedule, TrainingSchedule, adam, backpropagate
 from learn3d.networks.encoders import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -23,7 +24,7 @@ from learn3d.training import train
 
 TINY = {"encoder": "conv-small", "generator": "sphere-small"}
 #: A run of each method with tiny networks.
-METHODS = {
+TINY_RUNS = {
     "proposed": TINY,
     "plus": TINY | {"preset": "plus-kato", "bank_size": 8},
     "multi-view": TINY | {"preset": "kato2018-kato"},
@@ -86,9 +87,11 @@ def test_schedules() -> None:
     assert factors(lr_schedule="cosine") == pytest.approx([(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)])
     assert factors(warmup_steps=2) == [0.5, 1, 1, 1]
     assert factors(warmup_steps=2, lr_schedule="linear") == [0.5, 1, 1, 0.5]
+    for name in get_args(LRSchedule):
+        TrainingSchedule(4, name)
     published = TrainingSchedule(200_000, "step")
     assert [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)] == [1, 1, 0.1, 0.1]
-    with pytest.raises(ValueError, match="the schedule 'cubic' has no line"):
+    with pytest.raises(ValueError, match="the schedule 'cubic' has no branch"):
         factors(lr_schedule="cubic")
     with pytest.raises(ValueError, match="warmup_steps"):
         TrainingSchedule(10, warmup_steps=10)
@@ -151,12 +154,17 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     monkeypatch.setattr(Method, "take_step", step_and_signal)
 
 
-@pytest.mark.parametrize("name", METHODS)
+def test_every_method_has_a_tiny_run() -> None:
+    presets = {run.get("preset", "peng2020-kato") for run in TINY_RUNS.values()}
+    assert {type(PRESETS[name].settings) for name in presets} == set(_METHODS), "add a run to TINY_RUNS"
+
+
+@pytest.mark.parametrize("name", TINY_RUNS)
 def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
     name: str, tiny_names, tiny_config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(ENCODERS, "conv", tiny_networks.TinyEncoder)
-    options = METHODS[name] | {"lr_schedule": "cosine", "warmup_steps": 1, "ema_decay": 0.8, "validate_every": 2}
+    options = TINY_RUNS[name] | {"lr_schedule": "cosine", "warmup_steps": 1, "ema_decay": 0.8, "validate_every": 2}
     train(tiny_config(tmp_path / "straight", **options))
     with monkeypatch.context() as patch:
         stop_after(patch, 2)
