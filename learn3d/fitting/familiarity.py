@@ -16,6 +16,7 @@ CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
 MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
 OTHER = 2.0  # logit of the network above which a picture is unknown
+NEAR = 0.55  # distance to a category below which a picture is of it, whatever the network says
 KNOWN_CODES = "known_codes", "hidden_layer", "output_layer"  # names of the tensors of `KnownCodes` in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
 _HIDDEN, _MEMBERS, _DROPOUT, _STEPS = 64, 2, 0.3, 300  # sizes of the classifiers, whose logits are averaged
@@ -31,16 +32,21 @@ class KnownCodes(NamedTuple):
 
     def nearest_kind(self, code: Tensor) -> int:
         """The category whose codes are nearest to a code [C]."""
-        return int(torch.stack([_distance(code, centres) for centres in self.kinds]).argmin())
+        return int(self._distances(code).argmin())
 
     def is_strange(self, code: Tensor) -> bool:
-        """Whether a code [C] is out of distribution: by the network if it was learnt, else by its distance to the
-        centres."""
+        """Whether a code [C] is of no category: by its distance to the centres, and by the network if it was learnt."""
         if self.hidden is None:
             return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
+        if float(self._distances(code).min()) < NEAR:
+            return False
         hidden, output = self.hidden.float(), self.output.float()
         units = F.relu(hidden[:, :-1] @ (_SCALE * F.normalize(code, dim=0)) + hidden[:, -1])
         return float(output[:-1] @ units + output[-1]) > OTHER
+
+    def _distances(self, code: Tensor) -> Tensor:
+        """The distance of a code [C] to each category, [N]."""
+        return torch.stack([_distance(code, centres) for centres in self.kinds])
 
 
 def _distance(code: Tensor, centres: Tensor) -> Tensor:

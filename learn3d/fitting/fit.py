@@ -65,10 +65,13 @@ class View(NamedTuple):
             return vertices + moves[:, None]
         return [shape + move for shape, move in zip(vertices, moves, strict=True)]
 
+    def silhouettes(self, vertices: Meshes, faces: Meshes) -> Tensor:
+        """Silhouettes float32 [N, 64, 64] of shapes [N, V, 3], [1, V, 3] or N tensors [V_n, 3]."""
+        return nmr.render_silhouette(self.place(vertices), faces, self.cameras(), image_size=MASK_SIZE)
+
     def ious(self, vertices: Meshes, faces: Meshes, mask: Tensor) -> Tensor:
-        """Soft IoU [N] of a mask [64, 64] and the silhouettes of shapes [N, V, 3], [1, V, 3] or N tensors [V_n, 3]."""
-        placed = self.place(vertices)
-        silhouettes = nmr.render_silhouette(placed, faces, self.cameras(), image_size=MASK_SIZE)
+        """Soft IoU [N] of a mask [64, 64] and the `silhouettes` of shapes."""
+        silhouettes = self.silhouettes(vertices, faces)
         both = (silhouettes * mask).sum((1, 2))
         return both / (silhouettes + mask - silhouettes * mask).sum((1, 2)).clamp(min=1e-6)
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import binary_erosion, distance_transform_edt
 from torch import Tensor
 
 import nmr
@@ -26,6 +27,7 @@ AXES = 24  # principal axes of the codes that are kept
 CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
 KEPT = 16  # best of them, which are stretched
 VOXELS, NEARNESS = 0.5, 0.5  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
+EDGES, FARTHEST = 0.15, 6.0  # weight of the distance of two outlines in pixels, and the largest that counts
 STRETCHING, STRETCH_STEPS = 1.0, 30  # weight of unequal factors along the axes, steps
 LATTICE, BENDING, BENDING_STEPS = 4, 1.5, 40  # points of the lattice along each axis, weight of their moves, steps
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))  # maps most generated shapes to themselves, in the object frame
@@ -97,7 +99,7 @@ def fit_template(
 ) -> tuple[Fit, str]:
     """Fit a template to a framed mask float32 [64, 64]; also returns its category.
 
-    Three numbers rank a candidate: the IoU of its outline in the predicted view, its voxel IoU with the predicted
+    Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel IoU with the predicted
     shape, and the cosine of the two codes. The best are stretched along the axes, and the best of these is bent.
     """
     progress("shape", 0.3)
@@ -107,11 +109,11 @@ def fit_template(
     alike = nmr.metrics.voxel_iou(voxels, _voxels(*predicted.shape[:2]).expand_as(voxels))
     prior = VOXELS * alike.float() + NEARNESS * nearness
     views = predicted.shape.view.select(torch.zeros(len(shapes), dtype=torch.int64))
-    best = (views.ious(shapes, faces, mask) + prior).topk(min(KEPT, len(shapes))).indices
+    best = (_likeness(views, shapes, faces, mask) + prior).topk(min(KEPT, len(shapes))).indices
     shapes, faces, prior = [shapes[i] for i in best], [faces[i] for i in best], prior[best]
     progress("stretch", 0.5)
     views, shapes, cost = _stretch(views.select(best), shapes, faces, mask)
-    scores = views.ious(shapes, faces, mask) + belief(views.azimuth_deg, predicted.azimuths) + prior - cost
+    scores = _likeness(views, shapes, faces, mask) + belief(views.azimuth_deg, predicted.azimuths) + prior - cost
     one = int(scores.argmax())
     progress("surface", 0.8)
     view, vertices = _bend(views.select(torch.tensor([one])), shapes[one], faces[one], mask)
@@ -124,6 +126,24 @@ def fit_template(
 
 def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
     return nmr.voxelize(0.998 * vertices[None].clamp(-0.5, 0.5) + 0.5, faces)
+
+
+def _likeness(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> Tensor:
+    """How alike the outlines of N shapes and of a mask [64, 64] are: their IoU less the distance of their edges, [N].
+
+    By the IoU alone a solid back is better than slats beside the true ones.
+    """
+    (wanted, near_wanted), *drawn = map(_edges, (mask, *views.silhouettes(shapes, faces)))
+    apart = [(near_wanted[edge].mean() + near[wanted].mean()) / 2 for edge, near in drawn]
+    return views.ious(shapes, faces, mask) - EDGES * torch.tensor(apart).float()
+
+
+def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels on the edge of a silhouette [64, 64], and the distance of each pixel to them, at most `FARTHEST`."""
+    inside = np.pad(silhouette.numpy() > 0.35, 1)
+    inside[0, 0] = True  # in the margin: there is always an edge
+    edge = inside & ~binary_erosion(inside)
+    return edge, np.minimum(distance_transform_edt(~edge), FARTHEST)
 
 
 def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> tuple[View, list[Tensor], Tensor]:

@@ -39,6 +39,7 @@ async function take(source, title) {
     colors = context.getImageData(0, 0, width, height);
     given = alpha.some((value) => value < 250) ? alpha : new Uint8ClampedArray(alpha.length).fill(255);
   } catch {
+    current?.abort();
     return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
   }
   name = title.replace(/\.[^.]*$/, "").replace(/[^\p{L}\p{N} _-]/gu, "") || "picture";
@@ -172,7 +173,10 @@ function say(text, wrong = false) {
   const empty = document.querySelector(".view.empty p");
   if (empty && !wrong) empty.textContent = text;
   $("status").classList.toggle("error", wrong);
-  if (wrong) busy(false);
+  if (!wrong) return;
+  busy(false);
+  $("warning").hidden = true;
+  $("status").scrollIntoView({ block: "nearest" });
 }
 
 function busy(part) {

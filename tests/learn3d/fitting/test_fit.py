@@ -168,6 +168,9 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     known = KnownCodes(known[None], *learn_others(known, other[:20]))
     assert all(known.is_strange(7 * code) for code in other[20:])
     assert not any(known.is_strange(7 * code) for code in (*first[20:], *second[20:]))
+    wrong = known._replace(output=torch.tensor([0.0] * len(known.hidden) + [9.0]))  # calls everything another thing
+    assert not any(wrong.is_strange(7 * code) for code in first[20:]), "it is too near to a category for that"
+    assert all(wrong.is_strange(7 * code) for code in other[20:])
     model = load_model(finished_run)
     with pytest.raises(ValueError, match="no PNG file in"):
         cut_out_pictures(model, tmp_path)
