@@ -28,8 +28,8 @@ def alias_package(here: str, name: object, replace: bool, example: str, remedy: 
 
 
 def _find(name: str) -> str | None:
-    """Place of the module of that name, None if it is missing."""
+    """Place of the module of that name. None if it is missing, or a folder without code, such as a checkout."""
     if name in sys.modules:
         return f"already imported from {getattr(sys.modules[name], '__file__', None) or 'an unknown place'}"
     spec = importlib.util.find_spec(name)
-    return None if spec is None else spec.origin or ", ".join(spec.submodule_search_locations)
+    return None if spec is None else spec.origin

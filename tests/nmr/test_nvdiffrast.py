@@ -316,7 +316,9 @@ def test_threads_and_second_derivatives():
         torch.autograd.grad(pipeline(*inputs, tri).sum(), pos, create_graph=True)[0].sum().backward()
 
 
-def test_install_as(monkeypatch):
+def test_install_as(monkeypatch, tmp_path):
+    (tmp_path / "nvdiffrast").mkdir()  # a checkout beside the script is no package
+    monkeypatch.syspath_prepend(tmp_path)
     for key in [key for key in sys.modules if key.partition(".")[0] == "nvdiffrast"]:
         monkeypatch.delitem(sys.modules, key)
     nmr.nvdiffrast.install_as()
