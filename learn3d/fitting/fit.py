@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE
@@ -31,6 +32,8 @@ SMOOTHNESS = 3e-4  # weight of the smoothness loss
 STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
 # Units of azimuth, elevation, distance and shift as variables: a step moves the outline about equally far for each.
 _SCALES = (60.0, 60.0, 1.0, 1.0)
+#: Options of Adam as a function: the class would first import torch._dynamo, which takes a second.
+_ADAM = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0, "amsgrad": False, "maximize": False}
 
 Meshes = Tensor | Sequence[Tensor]
 Progress = Callable[[str, float], object]  # called with the name of each stage and the share (0 .. 1) that is done
@@ -128,6 +131,7 @@ def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
     return BELIEF * (log[low] * (1 - part) + log[(low + 1) % AZIMUTHS] * part)
 
 
+@torch.no_grad()
 def minimize(
     loss: Callable[[View], Tensor], view: View, steps: int, rates: Sequence[float], *variables: Tensor
 ) -> View:
@@ -141,15 +145,14 @@ def minimize(
         found = View(*(scale * part for part, scale in zip(parts, _SCALES, strict=True)))
         return found._replace(elevation_deg=found.elevation_deg.clamp(-30, 85))
 
-    groups = [{"params": group, "lr": lr} for group, lr in zip((parts, *variables), rates, strict=True)]
-    optimizer = torch.optim.Adam(groups)
+    values, rates = [*parts, *variables], [*[rates[0]] * len(parts), *rates[1:]]
+    moments = [(torch.zeros_like(value), torch.zeros_like(value)) for value in values]
     for step in range(steps):
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * (1 - 0.9 * step / steps)
-        optimizer.zero_grad()
         with torch.enable_grad():
-            loss(current()).backward()
-        optimizer.step()
+            gradients = torch.autograd.grad(loss(current()), values)
+        for value, gradient, (mean, square), rate in zip(values, gradients, moments, rates, strict=True):
+            now = {"state_steps": [torch.tensor(float(step))], "lr": rate * (1 - 0.9 * step / steps)}
+            adam([value], [gradient], [mean], [square], [], **now, **_ADAM)
     return current()
 
 

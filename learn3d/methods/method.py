@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -78,7 +79,6 @@ class Method(abc.ABC):
 
     needs_poses: ClassVar[bool] = True  # whether every training image must have a known pose
     networks: nn.ModuleDict  # networks["encoder"] is self.encoder, and so on
-    optimizers: dict[str, torch.optim.Optimizer]
     ema: EMA | None = None  # None if the run keeps no average of the weights
     image_size: int  # side of the stored images that `encode` takes
 
@@ -95,9 +95,13 @@ class Method(abc.ABC):
         self.device, self.precision = torch.device(device), precision
         self.networks = nn.ModuleDict(self.create_networks()).to(device)
         vars(self).update(self.networks)
-        self.optimizers = self.create_optimizers()
         if schedule.ema_decay > 0:
             self.ema = EMA(self.networks, schedule.ema_decay)
+
+    @functools.cached_property
+    def optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        """Optimizers by name, made when they are first needed: pictures need none."""
+        return self.create_optimizers()
 
     @abc.abstractmethod
     def create_networks(self) -> dict[str, nn.Module]:
