@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, open_file, read_text
+from learn3d.files.reading import DamagedFile, MissingFile, faults_of, open_file, read_text
 
 # TIFF is not supported: a small file can list millions of strips, for which Pillow makes objects before it decodes.
 RENDERINGS = ("PNG", "JPEG")
@@ -24,21 +24,16 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
     Raises MissingFile, and DamagedFile for another format, a file above 256 MiB, a side above `max_side` pixels, and
     more than 64 million pixels.
     """
-    with open_file(path, limits.IMAGE_FILE_BYTES, "an image") as file:
-        try:
-            image = Image.open(file, formats=formats)
-            pixels, most = image.width * image.height, limits.IMAGE_PIXELS
-            if max(image.size) > max_side or pixels > most:
-                size = f"{image.width}x{image.height} pixels"
-                raise DamagedFile(path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller")
-            sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
-            image.load()
-            return image
-        except (DamagedFile, MemoryError):
-            raise
-        except Exception as error:  # Pillow raises various errors for damaged files
-            kinds = f"an image in the format {', '.join(formats)}"
-            raise DamagedFile(path, f"cannot be decoded as {kinds} ({sandbox.reason(error)}). {FETCH_AGAIN}") from error
+    wanted = f"an image in the format {', '.join(formats)}"
+    with faults_of(path, wanted), open_file(path, limits.IMAGE_FILE_BYTES, wanted) as file:
+        image = Image.open(file, formats=formats)
+        pixels, most = image.width * image.height, limits.IMAGE_PIXELS
+        if max(image.size) > max_side or pixels > most:
+            size = f"{image.width}x{image.height} pixels"
+            raise DamagedFile(path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller")
+        sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
+        image.load()
+        return image
 
 
 MASK_SIZE = 64

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile
+from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, faults_of
 
 MEMORY = 256 * 2**20  # bytes that a call may allocate; large arrays made by `empty` do not count
 SECONDS = 5.0  # processor time of a call
@@ -185,7 +185,6 @@ def _serve(end: int) -> None:
             folder, calls = connection.recv()
             os.chdir(folder)
             results, sent = [_attempt(call) for call in calls], []
-            _limit(math.inf, math.inf)
             signal.setitimer(signal.ITIMER_REAL, 0)
 
             def in_band(buffer: pickle.PickleBuffer, sent: list[tuple[int, int]] = sent) -> bool:
@@ -209,22 +208,13 @@ def _attempt(call: Call) -> Any:
     _limit(_memory() + call.memory, time.process_time() + call.seconds)
     signal.setitimer(signal.ITIMER_REAL, call.timeout)  # SIGALRM ends the process
     try:
-        return call.function(call.path, *call.arguments)
+        with faults_of(call.path, call.wanted):
+            try:
+                return call.function(call.path, *call.arguments)
+            finally:  # an error message takes memory, too
+                _limit(math.inf, math.inf)
     except (DamagedFile, MissingFile) as error:
         return error
-    except FileNotFoundError:
-        return MissingFile(call.path, f"is missing; expected {call.wanted}")
-    except MemoryError:
-        _limit(math.inf, math.inf)
-        return DamagedFile(call.path, f"reading it would take too much memory; expected {call.wanted}")
-    except Exception as error:  # libraries raise various errors for damaged files
-        return DamagedFile(call.path, f"cannot be read ({reason(error)}); expected {call.wanted}. {FETCH_AGAIN}")
-
-
-def reason(error: Exception) -> str:
-    """The first line of an error's text, with its class unless that is ValueError."""
-    text = (str(error).strip().splitlines() or [""])[0][:300]
-    return text if text and type(error) is ValueError else f"{type(error).__name__}: {text}"
 
 
 def _limit(memory: float, seconds: float) -> None:
