@@ -19,7 +19,6 @@ from learn3d.data.poses import LookAtPoses, PoseCandidates, wrap_deg
 from learn3d.data.view_bins import view_classes
 from learn3d.files import npz
 from learn3d.files.reading import faults_of
-from learn3d.files.sandbox import read
 from learn3d.files.writing import replacing
 
 _WANTED = "a table that learn3d estimate-poses wrote"
@@ -77,7 +76,7 @@ class PoseTable:
         """Read an untrusted table. Raises DamagedFile and MissingFile."""
         names = [field.name for field in dataclasses.fields(cls)]
         with faults_of(path, _WANTED):
-            return cls(*read(npz.read_several, Path(path), names, wanted=_WANTED))
+            return cls(*npz.read_several(Path(path), names, _WANTED))
 
     def apply(self, dataset: ViewDataset, source: str) -> ViewDataset:
         """The data set with the poses of this table and view classes from them. `source` names the table in messages.

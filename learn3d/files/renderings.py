@@ -14,8 +14,6 @@ from learn3d.files.reading import DamagedFile, MissingFile, faults_of, open_file
 # TIFF is not supported: a small file can list millions of strips, for which Pillow makes objects before it decodes.
 RENDERINGS = ("PNG", "JPEG")
 PHOTOGRAPHS = ("PNG", "JPEG", "WEBP", "BMP")
-_MEMORY_PER_PIXEL = 16  # bytes; three copies of four channels, and some room
-_PIXELS_PER_SECOND = 2e7
 
 
 def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image:
@@ -31,7 +29,7 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
         if max(image.size) > max_side or pixels > most:
             size = f"{image.width}x{image.height} pixels"
             raise DamagedFile(path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller")
-        sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
+        sandbox.allow(56 * pixels, pixels / 1e7)  # for decoding, masking and framing
         image.load()
         return image
 

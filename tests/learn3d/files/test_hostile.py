@@ -69,11 +69,11 @@ def read_image(path: Path, seconds: float = sandbox.SECONDS) -> object:
 
 
 def read_npz(path: Path) -> object:
-    return sandbox.read(npz.read, path, "a")
+    return npz.read(path, "a", "an array")
 
 
 def read_ragged(path: Path) -> object:
-    return sandbox.read(npz.read_ragged, path, "images", {})
+    return sandbox.read(npz.read_ragged, path, "images")
 
 
 def mat(path: Path) -> bytes:

@@ -31,7 +31,7 @@ def test_only_regular_files_below_a_limit_are_read(tmp_path):
 
 
 READERS = {
-    "npz": lambda path: sandbox.read(npz.read, path, "a"),
+    "npz": lambda path: npz.read(path, "a", "an array"),
     "image": lambda path: open_image(path, PHOTOGRAPHS, 100),
     "mesh": read_mesh,
     "MATLAB": lambda path: sandbox.read(read_matlab, path, "Volume", 32),
