@@ -46,8 +46,6 @@ class PoseTable:
             wanted = (count, shape[1]) if name in ("azimuth_deg", "elevation_deg", "weights") else (count,)
             if (values.dtype, values.shape) != (dtype, wanted):
                 raise ValueError(f"{name} must be {dtype} {list(wanted)}, got {values.dtype} {values.shape}")
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name} has values that are not finite")
             if name in ("weights", "confidence") and not 0 <= values.min() <= values.max() <= 1.001:
                 raise ValueError(f"{name} must lie in 0 .. 1")
         if not self.poses(np.arange(count)).in_range().all():

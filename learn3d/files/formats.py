@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import DamagedFile, MissingFile, open_file, read_bytes
+from learn3d.files.reading import DamagedFile, open_file, read_bytes
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # trimesh reads these without further packages
 
@@ -24,13 +24,10 @@ class RawMesh:
 def read_mesh(path: Path) -> RawMesh:
     """Read all triangles of a mesh file; the meshes of a scene are transformed and concatenated.
 
-    Other files that it refers to must be in its folder or below. Raises ValueError with the reason if it cannot be
+    Other files that it refers to must be in its folder or below. Raises MissingFile, and DamagedFile if it cannot be
     read, has no triangle, or has over 256 MiB.
     """
-    try:
-        return sandbox.read(_read, path, wanted="a mesh file")
-    except (DamagedFile, MissingFile) as error:
-        raise ValueError(error.message) from error
+    return sandbox.read(_read, path, wanted="a mesh file")
 
 
 def _read(path: Path) -> RawMesh:

@@ -91,9 +91,7 @@ def _view(color: np.ndarray, mask: np.ndarray, size: int) -> View:
 
 def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None if the image has none."""
-    if image.mode == "P":
-        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-    if image.mode not in ("RGBA", "LA", "PA"):
+    if not image.has_transparency_data:
         return np.asarray(image.convert("RGB")), None
     image = image.convert("RGBA")
     alpha = image.getchannel("A")
@@ -130,7 +128,7 @@ def _area_weights(source: int, size: int) -> np.ndarray:
 
 def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     """The first rows and columns of a table of numbers in a text file: float64 [rows, columns], all finite."""
-    text = io.StringIO(read_text(path, limits.TABLE_BYTES, wanted))
+    text = io.StringIO(read_text(path, limits.TEXT_BYTES, wanted))
     table = np.loadtxt(text, comments=None, usecols=range(columns), max_rows=rows, ndmin=2)
     if (found := np.isfinite(table).all(axis=1).sum()) < rows:
         raise ValueError(f"{found} rows of finite numbers, {rows} are needed")

@@ -108,7 +108,7 @@ class Item:
     name: str  # name of the object, valid as a file name
     split: str
     file: str  # name of the mesh in its source
-    read: Callable[[], RawMesh | Trimesh]  # raises ValueError if the file is damaged; can be pickled
+    read: Callable[[], RawMesh | Trimesh]  # raises ValueError or MissingFile; can be pickled
     copies: int  # objects that are made of it
 
 

