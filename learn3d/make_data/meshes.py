@@ -148,7 +148,7 @@ def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
 
 def _packed(path: Path, number: int) -> RawMesh:
     """Mesh `number` of a pack. Raises ValueError if it is damaged."""
-    vertices, faces = (npz.read(path, f"{kind}{number}", _PACK) for kind in "vf")
+    vertices, faces = npz.read_several(path, [f"v{number}", f"f{number}"], _PACK)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
         found = f"{vertices.dtype} {list(vertices.shape)}, {faces.dtype} {list(faces.shape)}"
         raise ValueError(f"not a triangle mesh: wanted vertices float [V, 3] and faces int [F, 3], got {found}")

@@ -61,7 +61,7 @@ def load(
     with the nearest rotation; only the MMD depends on it.
     """
     paths = _paths(folder, category, split)
-    found = read_all([Call(npz.read_ragged, path, ("images",), _WANTED)] for path in paths)
+    found = read_all([Call(npz.read_ragged, path, ("images", _WANTED), _WANTED)] for path in paths)
     files = [findings.attempt(_parse, path, result, findings) for path, (result,) in zip(paths, found, strict=True)]
     findings.objects = sum(len(file[0]) for file in files if file is not None)
     if not findings.strict:

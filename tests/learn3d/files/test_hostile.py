@@ -73,7 +73,7 @@ def read_npz(path: Path) -> object:
 
 
 def read_ragged(path: Path) -> object:
-    return sandbox.read(npz.read_ragged, path, "images")
+    return sandbox.read(npz.read_ragged, path, "images", "images")
 
 
 def mat(path: Path) -> bytes:

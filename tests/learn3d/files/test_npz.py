@@ -36,7 +36,7 @@ def refused(path: Path, said: str = "", max_bytes: int | None = None) -> None:
 
 
 def ragged(path: Path, member: bytes) -> list[np.ndarray]:
-    return sandbox.read(npz.read_ragged, write(path, member), "a")
+    return sandbox.read(npz.read_ragged, write(path, member), "a", "images")
 
 
 def object_array(*items: object) -> np.ndarray:
@@ -62,7 +62,7 @@ def test_names_and_arrays_with_items(tmp_path):
     np.savez(path, a=np.arange(6), images=object_array(*IMAGES), boxes=np.ones((2, 4)))
     assert npz.names(path, "arrays") == ["a", "images", "boxes"]
     assert [array.shape for array in npz.read_several(path, ["boxes", "a"], "arrays")] == [(2, 4), (6,)]
-    same(sandbox.read(npz.read_ragged, path, "images"), IMAGES)
+    same(sandbox.read(npz.read_ragged, path, "images", "images"), IMAGES)
 
 
 HEADERS = {
