@@ -146,7 +146,7 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
 def load_config(path: Path) -> TrainConfig:
     """Read the config.json of a run. Raises MissingFile or ValueError if it is missing or damaged."""
     wanted = "the options of a run; to start a new run, leave out --resume"
-    return config_from_dict(read_json(path, limits.CONFIG_BYTES, wanted), source=str(path))
+    return config_from_dict(read_json(path, limits.TEXT_BYTES, wanted), source=str(path))
 
 
 _MAY_DIFFER_NAMES = {

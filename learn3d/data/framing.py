@@ -22,8 +22,6 @@ MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
 SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop (the box) and of the largest
-_MEMORY_PER_PIXEL = 40  # bytes, for masking and framing
-_PIXELS_PER_SECOND = 2e7
 
 
 def read_photo(
@@ -116,7 +114,6 @@ def frame(colors: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, 
 def _open(path: Path) -> Image.Image:
     """The image, turned upright by its EXIF data."""
     image = open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
-    sandbox.allow(_MEMORY_PER_PIXEL * image.width * image.height, image.width * image.height / _PIXELS_PER_SECOND)
     try:
         return ImageOps.exif_transpose(image)
     except Exception:  # Pillow raises various errors for damaged EXIF data; the image itself is sound

@@ -18,8 +18,7 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import LookAtPoses, PoseCandidates, wrap_deg
 from learn3d.data.view_bins import view_classes
 from learn3d.files import npz
-from learn3d.files.reading import DamagedFile
-from learn3d.files.sandbox import read
+from learn3d.files.reading import faults_of
 from learn3d.files.writing import replacing
 
 _WANTED = "a table that learn3d estimate-poses wrote"
@@ -47,8 +46,6 @@ class PoseTable:
             wanted = (count, shape[1]) if name in ("azimuth_deg", "elevation_deg", "weights") else (count,)
             if (values.dtype, values.shape) != (dtype, wanted):
                 raise ValueError(f"{name} must be {dtype} {list(wanted)}, got {values.dtype} {values.shape}")
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name} has values that are not finite")
             if name in ("weights", "confidence") and not 0 <= values.min() <= values.max() <= 1.001:
                 raise ValueError(f"{name} must lie in 0 .. 1")
         if not self.poses(np.arange(count)).in_range().all():
@@ -76,11 +73,8 @@ class PoseTable:
     def read(cls, path: Path | str) -> PoseTable:
         """Read an untrusted table. Raises DamagedFile and MissingFile."""
         names = [field.name for field in dataclasses.fields(cls)]
-        arrays = read(npz.read_several, Path(path), names, wanted=_WANTED)
-        try:
-            return cls(*arrays)
-        except ValueError as error:
-            raise DamagedFile(Path(path), f"{error}; expected {_WANTED}") from None
+        with faults_of(path, _WANTED):
+            return cls(*npz.read_several(Path(path), names, _WANTED))
 
     def apply(self, dataset: ViewDataset, source: str) -> ViewDataset:
         """The data set with the poses of this table and view classes from them. `source` names the table in messages.

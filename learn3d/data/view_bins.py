@@ -59,11 +59,6 @@ class AngleBins:
         span = self.elevation_high_deg - self.elevation_low_deg
         return azimuth, max(1, int(np.ceil(span / self.elevation_width_deg - 1e-9)))
 
-    @property
-    def count(self) -> int:
-        """K."""
-        return self.shape[0] * self.shape[1]
-
     def ids(self, poses: LookAtPoses) -> Tensor:
         """The class of every pose, int64 [M] in 0 .. K-1."""
         azimuths, elevations = self.shape

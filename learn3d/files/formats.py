@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import DamagedFile, MissingFile, open_file, read_bytes
+from learn3d.files.reading import DamagedFile, open_file, read_bytes
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # trimesh reads these without further packages
-_MEMORY_PER_BYTE = 30  # trimesh takes about 20 times the size of a text file
-_BYTES_PER_SECOND = 1e6  # trimesh is about twice as fast
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +24,10 @@ class RawMesh:
 def read_mesh(path: Path) -> RawMesh:
     """Read all triangles of a mesh file; the meshes of a scene are transformed and concatenated.
 
-    Other files that it refers to must be in its folder or below. Raises ValueError with the reason if it cannot be
+    Other files that it refers to must be in its folder or below. Raises MissingFile, and DamagedFile if it cannot be
     read, has no triangle, or has over 256 MiB.
     """
-    try:
-        return sandbox.read(_read, path, wanted="a mesh file")
-    except (DamagedFile, MissingFile) as error:
-        raise ValueError(error.message) from error
+    return sandbox.read(_read, path, wanted="a mesh file")
 
 
 def _read(path: Path) -> RawMesh:
@@ -66,7 +61,7 @@ class _FilesBelow:
 def _content(path: Path) -> bytes:
     """The content of a file; of an OBJ or OFF file as valid UTF-8, since comments may be in Latin-1."""
     content = read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file, or a file that a mesh refers to")
-    sandbox.allow(_MEMORY_PER_BYTE * len(content), len(content) / _BYTES_PER_SECOND)
+    sandbox.allow(30 * len(content), len(content) / 1e6)  # for text, trimesh takes two thirds of that
     is_text = path.suffix.lower() in (".obj", ".off")
     return content.decode("utf-8", "replace").encode() if is_text else content
 

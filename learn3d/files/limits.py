@@ -6,10 +6,8 @@
 MIB, GIB = 2**20, 2**30
 
 # Text and JSON
-TEXT_BYTES = 16 * MIB  # list of ids; all ids of ShapeNet: 2 MB
+TEXT_BYTES = 16 * MIB  # list of ids, table or config.json; all ids of ShapeNet: 2 MB
 PHOTO_TABLE_BYTES = 4 * MIB  # poses.csv, for about 60,000 photographs; it takes 80 times as much memory
-TABLE_BYTES = MIB  # view.txt of an object; 24 rows: 2 kB
-CONFIG_BYTES = MIB  # config.json of a run; ours: 2 kB
 JSON_BYTES = 16 * MIB  # splits.json: 2 MB; test.json of a run on 10,000 objects: 1 MB
 METRICS_BYTES = 256 * MIB  # metrics.jsonl; a million lines
 CURVES = 100  # curves in metrics.jsonl, each a panel of a figure; ours: 20

@@ -3,10 +3,11 @@
 A fault is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError), whose message names the file.
 """
 
+import contextlib
 import json
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeVar
@@ -77,18 +78,36 @@ class Findings:
 STRICT = Findings(strict=True)
 
 
+@contextlib.contextmanager
+def faults_of(path: Path | str, wanted: str) -> Iterator[None]:
+    """Turn errors into a DamagedFile or MissingFile: libraries raise various ones for damaged files.
+
+    wanted: description of the file, for messages.
+    """
+    try:
+        yield
+    except (DamagedFile, MissingFile):
+        raise
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingFile(Path(path), f"is missing; expected {wanted}") from None
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [""])[0][:300]
+        if isinstance(error, MemoryError):
+            reason = "it takes too much memory"
+        elif type(error) is not ValueError:
+            reason = f"{type(error).__name__}: {reason}".removesuffix(": ")
+        advice = "" if getattr(error, "errno", None) else f". {FETCH_AGAIN}"  # the system has named the cause
+        raise DamagedFile(Path(path), f"cannot be read ({reason}); expected {wanted}{advice}") from error
+
+
 def open_file(path: Path | str, max_bytes: int, wanted: str) -> BinaryIO:
     """Open an untrusted file for reading. wanted: description of the file, for messages.
 
     Raises MissingFile, and DamagedFile for files above `max_bytes` bytes and, at once, for pipes and devices.
     """
     path = Path(path)
-    try:
+    with faults_of(path, wanted):
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingFile(path, f"is missing; expected {wanted}") from None
-    except (OSError, ValueError) as error:
-        raise DamagedFile(path, f"cannot be read ({error}); expected {wanted}") from error
     status = os.fstat(file.fileno())
     fault = f"has {status.st_size} bytes; the limit is {max_bytes}" if status.st_size > max_bytes else ""
     if not stat.S_ISREG(status.st_mode):
@@ -107,20 +126,15 @@ def read_bytes(path: Path | str, max_bytes: int, wanted: str) -> bytes:
 
 def read_text(path: Path | str, max_bytes: int, wanted: str, *, encoding: str = "utf-8", errors: str = "strict") -> str:
     """The content of a text file, with line ends \\n. Raises as `open_file`, and DamagedFile for another encoding."""
-    try:
+    with faults_of(path, wanted):
         text = read_bytes(path, max_bytes, wanted).decode(encoding, errors)
-    except UnicodeDecodeError as error:
-        raise DamagedFile(Path(path), f"cannot be read as text ({error}); expected {wanted}. {FETCH_AGAIN}") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_json(path: Path | str, max_bytes: int, wanted: str) -> Any:
     """The value of a JSON file. Raises as `open_file`, and DamagedFile for other content."""
-    content = read_bytes(path, max_bytes, wanted)
-    try:
-        return parse_json(content)
-    except ValueError as error:
-        raise DamagedFile(Path(path), f"is not valid JSON ({error}); expected {wanted}. {FETCH_AGAIN}") from error
+    with faults_of(path, wanted):
+        return parse_json(read_bytes(path, max_bytes, wanted))
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -9,13 +9,11 @@ import numpy as np
 from PIL import Image
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, open_file, read_text
+from learn3d.files.reading import DamagedFile, MissingFile, faults_of, open_file, read_text
 
 # TIFF is not supported: a small file can list millions of strips, for which Pillow makes objects before it decodes.
 RENDERINGS = ("PNG", "JPEG")
 PHOTOGRAPHS = ("PNG", "JPEG", "WEBP", "BMP")
-_MEMORY_PER_PIXEL = 16  # bytes; three copies of four channels, and some room
-_PIXELS_PER_SECOND = 2e7
 
 
 def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image:
@@ -24,21 +22,16 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
     Raises MissingFile, and DamagedFile for another format, a file above 256 MiB, a side above `max_side` pixels, and
     more than 64 million pixels.
     """
-    with open_file(path, limits.IMAGE_FILE_BYTES, "an image") as file:
-        try:
-            image = Image.open(file, formats=formats)
-            pixels, most = image.width * image.height, limits.IMAGE_PIXELS
-            if max(image.size) > max_side or pixels > most:
-                size = f"{image.width}x{image.height} pixels"
-                raise DamagedFile(path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller")
-            sandbox.allow(_MEMORY_PER_PIXEL * pixels, pixels / _PIXELS_PER_SECOND)
-            image.load()
-            return image
-        except (DamagedFile, MemoryError):
-            raise
-        except Exception as error:  # Pillow raises various errors for damaged files
-            kinds = f"an image in the format {', '.join(formats)}"
-            raise DamagedFile(path, f"cannot be decoded as {kinds} ({sandbox.reason(error)}). {FETCH_AGAIN}") from error
+    wanted = f"an image in the format {', '.join(formats)}"
+    with faults_of(path, wanted), open_file(path, limits.IMAGE_FILE_BYTES, wanted) as file:
+        image = Image.open(file, formats=formats)
+        pixels, most = image.width * image.height, limits.IMAGE_PIXELS
+        if max(image.size) > max_side or pixels > most:
+            size = f"{image.width}x{image.height} pixels"
+            raise DamagedFile(path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller")
+        sandbox.allow(56 * pixels, pixels / 1e7)  # for decoding, masking and framing
+        image.load()
+        return image
 
 
 MASK_SIZE = 64
@@ -98,9 +91,7 @@ def _view(color: np.ndarray, mask: np.ndarray, size: int) -> View:
 
 def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None if the image has none."""
-    if image.mode == "P":
-        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-    if image.mode not in ("RGBA", "LA", "PA"):
+    if not image.has_transparency_data:
         return np.asarray(image.convert("RGB")), None
     image = image.convert("RGBA")
     alpha = image.getchannel("A")
@@ -137,7 +128,7 @@ def _area_weights(source: int, size: int) -> np.ndarray:
 
 def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
     """The first rows and columns of a table of numbers in a text file: float64 [rows, columns], all finite."""
-    text = io.StringIO(read_text(path, limits.TABLE_BYTES, wanted))
+    text = io.StringIO(read_text(path, limits.TEXT_BYTES, wanted))
     table = np.loadtxt(text, comments=None, usecols=range(columns), max_rows=rows, ndmin=2)
     if (found := np.isfinite(table).all(axis=1).sum()) < rows:
         raise ValueError(f"{found} rows of finite numbers, {rows} are needed")

@@ -1,14 +1,13 @@
 """A sandbox for untrusted files: worker processes that may crash, hang or run out of memory.
 
-`read` and `read_all` run functions in workers, with limits of memory (on Linux), processor time and elapsed time. Two
-more than there are cores start on demand, and read many files each. A failure becomes a `DamagedFile` or `MissingFile`
-with the name of the file, and a dead worker is replaced. This module imports neither torch nor scipy, so that a worker
-starts in a tenth of a second. It needs a POSIX system.
+`read` and `read_all` run functions in workers, with limits of memory (on Linux) and processor time. Two more than there
+are cores start on demand, and read many files each. A failure becomes a `DamagedFile` or `MissingFile` with the name of
+the file, and a dead worker is replaced. This module imports neither torch nor NumPy, so that a worker starts in a tenth
+of a second. It needs a POSIX system.
 """
 
 import atexit
 import contextlib
-import math
 import mmap
 import os
 import pickle
@@ -16,23 +15,18 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
-from multiprocessing.reduction import recv_handle, send_handle
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, faults_of
 
-from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile
-
-MEMORY = 256 * 2**20  # bytes that a call may allocate; large arrays made by `empty` do not count
-SECONDS = 5.0  # processor time of a call
+MEMORY = 256 * 2**20  # bytes that a call may allocate before it calls `allow`
+SECONDS = 5.0  # processor time of a call, likewise
 _GROWTH = 256 * 2**20  # a worker that keeps more bytes after its calls is replaced
-_LARGE = 2**20  # size in bytes from which `empty` uses shared memory
 _LINUX = sys.platform == "linux"
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -45,9 +39,7 @@ class Call:
     path: Path
     arguments: tuple[Any, ...] = ()
     wanted: str = "an intact file"  # description of the file, for messages
-    memory: int = MEMORY  # limit in bytes, without the result
-    seconds: float = SECONDS  # limit of processor time
-    timeout: float = 600.0  # limit of elapsed seconds; disks can be slow
+    seconds: float = SECONDS
 
 
 def read(function: Callable[..., Any], path: Path | str, *arguments: Any, **options: Any) -> Any:
@@ -125,22 +117,19 @@ def _start(calls: list[Call]) -> _Worker:
 
 def _finish(worker: _Worker, calls: list[Call]) -> list[Any]:
     """Wait for the results of a worker; if it dies, find the file at fault."""
-    buffers = []
     try:
         data, sizes, grown = worker.connection.recv()
-        for size in sizes:
-            with open(recv_handle(worker.connection), "r+b") as file:
-                buffers.append(memoryview(mmap.mmap(file.fileno(), size)))
+        buffers = [bytearray(size) for size in sizes]
+        for buffer in buffers:
+            worker.connection.recv_bytes_into(buffer)
         worker.end() if grown else _idle.append(worker)
         return pickle.loads(data, buffers=buffers)
     except (EOFError, OSError, pickle.UnpicklingError):
         status = worker.end()
     if len(calls) > 1:
         return [next(read_all([[call]]))[0] for call in calls]
-    fault = {
-        -signal.SIGXCPU: f"takes more than {calls[0].seconds:g} seconds of processor time",
-        -signal.SIGALRM: f"was stopped after {calls[0].timeout:g} seconds",
-    }.get(status, f"crashed its process (status {status})")
+    slow = f"takes more than {calls[0].seconds:g} seconds of processor time"
+    fault = slow if status == -signal.SIGPROF else f"crashed its process (status {status})"
     return [DamagedFile(calls[0].path, f"reading it {fault}; expected {calls[0].wanted}. {FETCH_AGAIN}")]
 
 
@@ -152,31 +141,20 @@ os.register_at_fork(after_in_child=lambda: (_workers.clear(), _idle.clear()))  #
 
 # The rest runs in workers.
 
-_limits: tuple[float, float] | None = None  # bytes of private memory, seconds of processor time; None if no worker
-_shared: dict[int, int] = {}  # address of an array in shared memory -> its file descriptor
+_working = False  # True in a worker
 
 
-def allow(memory: int = 0, seconds: float = 0.0) -> None:
+def allow(memory: int, seconds: float = 0.0) -> None:
     """Raise the limits of the running call by bytes and seconds, for a file whose header shows an acceptable size."""
-    if _limits is not None:
-        _limit(_limits[0] + memory, _limits[1] + seconds)
-
-
-def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An uninitialised array. On Linux a large one is in shared memory, so that the parent gets it without a copy."""
-    dtype = np.dtype(dtype)
-    size = math.prod(shape) * dtype.itemsize
-    if _limits is None or size < _LARGE or not _LINUX:
-        return np.empty(shape, dtype)
-    file = os.memfd_create("learn3d")
-    os.ftruncate(file, size)
-    array = np.frombuffer(mmap.mmap(file, size), dtype).reshape(shape)
-    _shared[array.ctypes.data] = file
-    return array
+    if _working:
+        left, _ = signal.getitimer(signal.ITIMER_PROF)
+        _limit(resource.getrlimit(resource.RLIMIT_DATA)[0] + memory, left + seconds)
 
 
 def _serve(end: int) -> None:
     """Run the requests, each a current folder and a list of calls, until the connection is closed."""
+    global _working
+    _working = True
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent kills workers after an interruption
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     start = _memory()
@@ -184,58 +162,34 @@ def _serve(end: int) -> None:
         while True:
             folder, calls = connection.recv()
             os.chdir(folder)
-            results, sent = [_attempt(call) for call in calls], []
-            _limit(math.inf, math.inf)
-            signal.setitimer(signal.ITIMER_REAL, 0)
-
-            def in_band(buffer: pickle.PickleBuffer, sent: list[tuple[int, int]] = sent) -> bool:
-                content = np.frombuffer(buffer.raw(), np.uint8)
-                if shared := content.ctypes.data in _shared:
-                    sent.append((_shared[content.ctypes.data], content.nbytes))
-                return not shared
-
-            data = pickle.dumps(results, 5, buffer_callback=in_band)
-            connection.send((data, [size for _, size in sent], _memory() - start > _GROWTH))
-            for file, _ in sent:
-                send_handle(connection, file, None)
-            for file in _shared.values():
-                os.close(file)
-            _shared.clear()
-            del results, data
+            results, buffers = [_attempt(call) for call in calls], []
+            data = pickle.dumps(results, 5, buffer_callback=buffers.append)  # arrays are sent without copies
+            buffers = [buffer.raw() for buffer in buffers]
+            connection.send((data, [buffer.nbytes for buffer in buffers], _memory() - start > _GROWTH))
+            for buffer in buffers:
+                connection.send_bytes(buffer)
+            del results, data, buffers
 
 
 def _attempt(call: Call) -> Any:
     """The result of the call, or the fault of its file as a DamagedFile or MissingFile."""
-    _limit(_memory() + call.memory, time.process_time() + call.seconds)
-    signal.setitimer(signal.ITIMER_REAL, call.timeout)  # SIGALRM ends the process
+    _limit(_memory() + MEMORY, call.seconds)
     try:
-        return call.function(call.path, *call.arguments)
+        with faults_of(call.path, call.wanted):
+            try:
+                return call.function(call.path, *call.arguments)
+            finally:  # an error message takes memory, too
+                _limit(resource.RLIM_INFINITY, 0)
     except (DamagedFile, MissingFile) as error:
         return error
-    except FileNotFoundError:
-        return MissingFile(call.path, f"is missing; expected {call.wanted}")
-    except MemoryError:
-        _limit(math.inf, math.inf)
-        return DamagedFile(call.path, f"reading it would take too much memory; expected {call.wanted}")
-    except Exception as error:  # libraries raise various errors for damaged files
-        return DamagedFile(call.path, f"cannot be read ({reason(error)}); expected {call.wanted}. {FETCH_AGAIN}")
 
 
-def reason(error: Exception) -> str:
-    """The first line of an error's text, with its class unless that is ValueError."""
-    text = (str(error).strip().splitlines() or [""])[0][:300]
-    return text if text and type(error) is ValueError else f"{type(error).__name__}: {text}"
-
-
-def _limit(memory: float, seconds: float) -> None:
-    """Limit the private memory of this process in bytes, and its processor time; math.inf for no limit."""
-    global _limits
-    _limits = memory, seconds
-    # Only Linux counts malloc's large blocks in RLIMIT_DATA.
-    for kind, value in ((resource.RLIMIT_CPU, seconds), (resource.RLIMIT_DATA, memory if _LINUX else math.inf)):
-        hard = resource.getrlimit(kind)[1]
-        most = math.inf if hard == resource.RLIM_INFINITY else hard
-        resource.setrlimit(kind, (hard if value >= most else math.ceil(value), hard))
+def _limit(memory: int, seconds: float) -> None:
+    """Limit the private memory of this process in bytes, and its further processor time; RLIM_INFINITY, 0: no limit."""
+    signal.setitimer(signal.ITIMER_PROF, seconds)  # then SIGPROF ends the process
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    if _LINUX and hard == resource.RLIM_INFINITY:  # elsewhere it does not count malloc's large blocks
+        resource.setrlimit(resource.RLIMIT_DATA, (memory, hard))
 
 
 def _memory() -> int:

@@ -14,7 +14,7 @@ from trimesh import Trimesh
 
 from learn3d.data import conventions
 from learn3d.data.categories import SPLITS, synset_of
-from learn3d.files import npz, sandbox
+from learn3d.files import npz
 from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
 from learn3d.make_data.writers import WRITERS, WrittenLayout
 from learn3d.settings import Count, FilePath, Rare, Weight, checked
@@ -108,7 +108,7 @@ class Item:
     name: str  # name of the object, valid as a file name
     split: str
     file: str  # name of the mesh in its source
-    read: Callable[[], RawMesh | Trimesh]  # raises ValueError if the file is damaged; can be pickled
+    read: Callable[[], RawMesh | Trimesh]  # raises ValueError or MissingFile; can be pickled
     copies: int  # objects that are made of it
 
 
@@ -136,7 +136,7 @@ def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
     A pack is an npz file with v0 float [V, 3], f0 int [F, 3], v1, f1, ... Raises ValueError if there is no mesh.
     """
     if source.suffix == ".npz" and source.is_file():
-        count = sum(name[:1] == "v" and name[1:].isdigit() for name in sandbox.read(npz.names, source, wanted=_PACK))
+        count = sum(name[:1] == "v" and name[1:].isdigit() for name in npz.names(source, _PACK))
         found = {f"{i:0{len(str(count - 1))}d}": partial(_packed, source, i) for i in range(count)}
     else:
         paths = {p.relative_to(source).as_posix(): p for p in source.rglob("*") if p.suffix.lower() in EXTENSIONS}
@@ -148,7 +148,7 @@ def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
 
 def _packed(path: Path, number: int) -> RawMesh:
     """Mesh `number` of a pack. Raises ValueError if it is damaged."""
-    vertices, faces = (sandbox.read(npz.read, path, f"{kind}{number}", wanted=_PACK) for kind in "vf")
+    vertices, faces = npz.read_several(path, [f"v{number}", f"f{number}"], _PACK)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
         found = f"{vertices.dtype} {list(vertices.shape)}, {faces.dtype} {list(faces.shape)}"
         raise ValueError(f"not a triangle mesh: wanted vertices float [V, 3] and faces int [F, 3], got {found}")

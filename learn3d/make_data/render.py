@@ -12,7 +12,7 @@ from learn3d.data.categories import SPLITS, synset_of
 from learn3d.data.conventions import mesh_to_object, view_poses
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.files.formats import RawMesh
-from learn3d.files.reading import read_json
+from learn3d.files.reading import MissingFile, read_json
 from learn3d.files.writing import publishing, write_json
 from learn3d.make_data.meshes import DatasetConfig, Item, check, fit_to_box, split_items
 from learn3d.make_data.writers import WRITERS
@@ -107,8 +107,8 @@ def render_meshes(
             raw = check(item.read())
             objects = [_render(config, raw, item, copy) for copy in range(item.copies)]
             mesh["objects"] = [rendered.name for rendered in objects]
-        except ValueError as error:  # a damaged or invisible mesh must not end the whole data set
-            mesh["reason"] = str(error)
+        except (ValueError, MissingFile) as error:  # a damaged or invisible mesh must not end the whole data set
+            mesh["reason"] = getattr(error, "message", str(error))
         made.append(mesh)
         if objects and item.split in rows and len(rows[item.split]) < ROWS:
             grid = WRITERS[config.layout].convention.to_object(torch.from_numpy(objects[0].voxels)[None])[0].numpy()

@@ -36,20 +36,13 @@ def eat(path: Path) -> int:
 
 
 def keep(path: Path, megabytes: int, held: list = []) -> int:  # noqa: B006
-    sandbox.allow(memory=megabytes * 2**20)
+    sandbox.allow(megabytes * 2**20)
     held.append(bytearray(megabytes * 2**20))
     return os.getpid()
 
 
 def fail(path: Path) -> None:
     raise KeyError("a strange word")
-
-
-def shared(path: Path, count: int) -> np.ndarray:
-    array = sandbox.empty((count,), np.float64)
-    array[:] = 1
-    array[-1] = count - 1
-    return array
 
 
 def arrays(path: Path) -> dict[str, object]:

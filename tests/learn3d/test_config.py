@@ -79,10 +79,10 @@ def test_files_that_are_no_json_or_too_large(tmp_path, monkeypatch):
         load_config(path)
     for text in ("[" * 100_000, '{"seed": NaN}', "{", "\xff"):
         path.write_text(text, encoding="latin-1")
-        with pytest.raises(ValueError, match=r"config\.json: is not valid JSON|seed must be"):
+        with pytest.raises(ValueError, match=r"config\.json: cannot be read \(|seed must be"):
             load_config(path)
     path.write_text(json.dumps(BASE))
     assert config_to_dict(load_config(path)) == config_to_dict(config_from_dict(BASE))
-    monkeypatch.setattr(limits, "CONFIG_BYTES", 10)
+    monkeypatch.setattr(limits, "TEXT_BYTES", 10)
     with pytest.raises(ValueError, match=r"config\.json: has \d+ bytes; the limit is 10"):
         load_config(path)

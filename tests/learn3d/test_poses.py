@@ -211,7 +211,7 @@ def test_a_table_is_read_as_written_and_matched_by_image(tmp_path: Path, tiny_se
         ({"weights": np.full((72, 3), 1 / 3)}, "weights must be float32"),
         ({"distance": np.zeros(72, np.float32)}, "impossible"),
         ({"distance": np.ones(71, np.float32)}, r"distance must be float32 \[72\]"),
-        ({"confidence": np.full(72, np.nan, np.float32)}, "not finite"),
+        ({"confidence": np.full(72, np.nan, np.float32)}, r"must lie in 0 \.\. 1"),
         ({"confidence": np.full(72, -1, np.float32)}, r"confidence must lie in 0 \.\. 1"),
         ({"azimuth_deg": np.zeros((72, 0), np.float32)}, r"azimuth_deg must be \[N, C\]"),
         ({"distance": np.array([{}] * 72)}, "'distance' must be numbers"),

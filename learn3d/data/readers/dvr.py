@@ -51,8 +51,8 @@ def load(folder: Path | str, category: str, split: str, *, findings: Findings = 
     def files(name: str) -> list[Call]:
         images, masks = ([root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)] for part in ("image", "mask"))
         return [
-            Call(npz.read_several, root / name / "cameras.npz", (_MATRICES, 16 * 8), _CAMERAS),
-            Call(npz.read, root / name / "pointcloud.npz", ("points", limits.OBJECT_BYTES), _CLOUD),
+            Call(npz.read_several, root / name / "cameras.npz", (_MATRICES, _CAMERAS, 16 * 8)),
+            Call(npz.read, root / name / "pointcloud.npz", ("points", _CLOUD, limits.OBJECT_BYTES)),
             *(Call(renderings.read_with_mask, i, (m, IMAGE_SIZE)) for i, m in zip(images, masks, strict=True)),
         ]
 

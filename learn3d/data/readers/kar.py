@@ -30,7 +30,7 @@ from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelC
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers.renderings import check_lists, check_poses, join_objects, read_objects
 from learn3d.files import formats, limits, renderings
-from learn3d.files.reading import STRICT, DamagedFile, Findings, read_bytes, read_json
+from learn3d.files.reading import STRICT, DamagedFile, Findings, faults_of, read_bytes, read_json
 from learn3d.files.sandbox import Call
 
 #: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.
@@ -102,16 +102,14 @@ def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     """Read splits.json of a folder: synset -> split -> ids. Raises MissingFile and DamagedFile."""
     path = folder / "splits.json"
     lists = read_json(path, limits.JSON_BYTES, _LISTS)
-    try:
+    with faults_of(path, _LISTS):
         named = [entry.get(split, []) for entry in lists.values() for split in SPLITS]
-    except AttributeError:  # a list, a number ...
-        named = [None]
-    if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named):
-        raise DamagedFile(path, f"has another structure; expected {_LISTS}")
+        if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named):
+            raise ValueError("ids must be lists of text")
     return lists
 
 
 def _rows(path: Path) -> int:
     """Number of rows of a table, or 20 if it has more."""
-    lines = read_bytes(path, limits.TABLE_BYTES, _TABLE).splitlines()
+    lines = read_bytes(path, limits.TEXT_BYTES, _TABLE).splitlines()
     return min(NUM_RENDERS, sum(bool(line.strip()) for line in lines))

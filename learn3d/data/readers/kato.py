@@ -26,7 +26,6 @@ from learn3d.data.conventions import (
 from learn3d.data.dataset import ViewDataset
 from learn3d.files import npz
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile
-from learn3d.files.sandbox import read
 
 PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
 
@@ -96,7 +95,7 @@ def _read(path: Path, kind: str, count: int | None) -> np.ndarray:
     dtype, shape = _ARRAYS[kind]
     wanted = f"an npz file with {dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}' and no pickled objects"
     max_bytes = None if count is None else count * math.prod(shape) * dtype.itemsize
-    array = read(npz.read, path, _KEY, max_bytes, wanted=wanted)
+    array = npz.read(path, _KEY, wanted, max_bytes)
     if (array.dtype, array.shape[1:]) != (dtype, shape) or not array.shape:
         raise DamagedFile(path, f"the {kind} file must be {wanted}, got {array.dtype} {list(array.shape)}")
     return array

@@ -28,7 +28,7 @@ from learn3d.data.poses import RotationPoses
 from learn3d.data.view_bins import training_classes
 from learn3d.files import npz
 from learn3d.files.reading import STRICT, DamagedFile, Findings
-from learn3d.files.sandbox import Call, read, read_all
+from learn3d.files.sandbox import Call, read_all
 
 #: The grid spans [-1, 1]; axes (-x, -z, -y) of the object frame.
 PASCAL3D = VoxelConvention("pascal3d", swap=(2, 3), flip=(1, 2, 3), cube_side=2.0)
@@ -61,8 +61,7 @@ def load(
     with the nearest rotation; only the MMD depends on it.
     """
     paths = _paths(folder, category, split)
-    sizes = {key: 8 * int(np.prod(shape)) for key, shape in _SHAPES.items()}
-    found = read_all([Call(npz.read_ragged, path, ("images", sizes), _WANTED)] for path in paths)
+    found = read_all([Call(npz.read_ragged, path, ("images", _WANTED), _WANTED)] for path in paths)
     files = [findings.attempt(_parse, path, result, findings) for path, (result,) in zip(paths, found, strict=True)]
     findings.objects = sum(len(file[0]) for file in files if file is not None)
     if not findings.strict:
@@ -137,13 +136,13 @@ def _paths(folder: Path | str, category: str, split: str) -> list[Path]:
 
 def _parse(path: Path, found: Any, findings: Findings) -> tuple[list[np.ndarray], ...]:
     """Check the arrays of a file. Returns N images uint8 [H, W, 3] and the arrays of `_SHAPES`."""
-    (flat, shapes), *arrays = STRICT.take(found)
-    parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]) if shapes else []
-    images = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
-    for (key, shape), array in zip(_SHAPES.items(), arrays, strict=True):
+    images, arrays = STRICT.take(found), []
+    for key, shape in _SHAPES.items():
+        array = npz.read(path, key, _WANTED, 8 * len(images) * int(np.prod(shape)))
         if array.shape != (len(images), *shape) or (key == "images_ref" and array.dtype != np.uint8):
             wanted, got = f"{list(shape)} for each of {len(images)} images", f"{array.dtype} {list(array.shape)}"
             raise DamagedFile(path, f"{key} must be {wanted} (uint8 if images), got {got}")
+        arrays.append(array)
     if not len(images):
         raise DamagedFile(path, "it holds no images")
     references, boxes, rotations, voxels = arrays
@@ -176,7 +175,7 @@ def _check_rotations(path: Path, rotations: np.ndarray, findings: Findings) -> N
 
 def _training_rotations(path: Path) -> np.ndarray:
     """Read only the rotations of a file: float64 [N, 3, 3]."""
-    rotations = read(npz.read, path, "rotation_matrices", _ROTATION_BYTES, wanted=_WANTED)
+    rotations = npz.read(path, "rotation_matrices", _WANTED, _ROTATION_BYTES)
     _check_rotations(path, rotations, STRICT)
     return rotations.astype(np.float64)
 

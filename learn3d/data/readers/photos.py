@@ -27,7 +27,7 @@ from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import view_classes
 from learn3d.files import limits
-from learn3d.files.reading import STRICT, DamagedFile, Findings, read_text
+from learn3d.files.reading import STRICT, DamagedFile, Findings, faults_of, read_text
 from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
 from learn3d.terminal import is_watched
@@ -157,12 +157,10 @@ def read_photo_table(table: Path, findings: Findings) -> list[Photo]:
         raise DamagedFile(table, f"has the columns {', '.join(names)[:200]}; expected {_WANTED}")
     masks = {path.stem: path for path in sorted((table.parent / "masks").glob("*"))}
     photos: dict[Path, Photo] = {}
-    try:
+    with faults_of(table, _WANTED):  # csv.Error
         for row in reader:
             if photo := findings.attempt(_photo, table, reader.line_num, row, masks, photos):
                 photos[photo.file] = photo
-    except csv.Error as error:
-        raise DamagedFile(table, f"line {reader.line_num} cannot be read as CSV: {error}") from None
     return list(photos.values())
 
 

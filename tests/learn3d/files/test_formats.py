@@ -48,7 +48,7 @@ def test_decoders_of_other_formats_are_never_tried(tmp_path, kind):
     Image.new("RGB", (16, 16)).save(content, kind)
     (tmp_path / "a.png").write_bytes(content.getvalue())
     for kinds in (RENDERINGS, PHOTOGRAPHS):
-        with pytest.raises(ValueError, match=r"a\.png: cannot be decoded as an image in the format PNG, JPEG"):
+        with pytest.raises(ValueError, match=r"a\.png: cannot be read \(.*; expected an image in the format PNG, JPEG"):
             open_image(tmp_path / "a.png", kinds, 100)
 
 
@@ -150,7 +150,7 @@ def test_buffers_from_elsewhere_are_refused(tmp_path):
     model = json.loads(path.read_text())
     for buffer in model["buffers"]:
         (tmp_path / "in" / buffer["uri"]).rename(tmp_path / buffer["uri"])
-    with pytest.raises(ValueError, match="is missing"):
+    with pytest.raises(FileNotFoundError, match="is missing"):
         read_mesh(path)
     for buffer in model["buffers"]:
         buffer["uri"] = "../" + buffer["uri"]
