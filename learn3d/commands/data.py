@@ -18,7 +18,7 @@ from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.views import MIN_CONFIDENCE, CameraOptions, compare, draw_sheet, estimate_views, load_views
 from learn3d.settings import Count, split_names
-from learn3d.terminal import is_watched, note, say
+from learn3d.terminal import align, is_watched, note, say
 
 
 class MakeDataset(Command):
@@ -79,14 +79,16 @@ class CheckDataset(Command):
     def run(self) -> int:
         if self.json is not None:
             check_target(self.json, "--json")
-        report = check_folder(self.layout, self.folder, split_names(self.category), self.split)
-        for split in report.splits:
-            for problem in split.problems:
-                say(f"{problem.severity}: {problem.path}: {problem.message}")
-        errors, warnings = report.count("error"), report.count("warning")
-        say(f"\n{report.table()}\n\n{errors} errors, {warnings} warnings")
+        splits = check_folder(self.layout, self.folder, split_names(self.category), self.split)
+        for problem in (problem for split in splits for problem in split.problems):
+            say(f"{problem.severity}: {problem.path}: {problem.message}")
+        rows = [(s.category, s.split, s.objects, s.count("error"), s.count("warning")) for s in splits]
+        errors, warnings = (sum(row[column] for row in rows) for column in (3, 4))
+        table = align([("category", "split", "objects", "errors", "warnings"), *(tuple(map(str, row)) for row in rows)])
+        say(f"\n{table}\n\n{errors} errors, {warnings} warnings")
         if self.json is not None:
-            write_json(self.json, {"errors": errors, "warnings": warnings} | dataclasses.asdict(report))
+            report = {"errors": errors, "warnings": warnings, "layout": self.layout, "folder": str(self.folder)}
+            write_json(self.json, report | {"splits": [dataclasses.asdict(split) for split in splits]})
         return 1 if errors else 0
 
 
