@@ -35,7 +35,7 @@ class MakeDataset(Command):
     def run(self) -> int:
         if self.config.shards:
             return make_shards(self.config)
-        say(make_dataset(self.config, progress=is_watched()).text())
+        say(make_dataset(self.config).text())
         return 0
 
 
@@ -52,7 +52,7 @@ class FetchDebianModels(Command):
     """Folder for the .deb files; missing ones are downloaded into it (default: a temporary folder)."""
 
     def run(self) -> None:
-        say(fetch_debian_models(self.output, self.packages_dir, progress=is_watched()).summary())
+        say(fetch_debian_models(self.output, self.packages_dir).summary())
         say(f"written to {self.output}")
 
 

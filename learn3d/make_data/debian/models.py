@@ -23,7 +23,7 @@ from learn3d.files.formats import RawMesh
 from learn3d.files.writing import publishing
 from learn3d.make_data.debian.packages import PACKAGES
 from learn3d.make_data.meshes import check, fit_to_box
-from learn3d.terminal import note
+from learn3d.terminal import is_watched, note
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side of the grids that are compared to find duplicates
@@ -47,7 +47,7 @@ class Report:
         return "\n".join([*lines, *(f"{n} skipped: {reason}" for reason, n in reasons.most_common())])
 
 
-def fetch_debian_models(output: Path, packages_dir: Path | None = None, progress: bool = True) -> Report:
+def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Report:
     """Write the meshes into the folder `output`, which appears when it is complete.
 
     packages_dir: folder of the .deb files, into which missing ones are downloaded (default: a temporary folder). The
@@ -73,7 +73,7 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None, progress
             for path in [path for path in files if path.endswith(notice)]:
                 (folder / "licences" / f"{name}.copyright").write_bytes(files[path])
             about = {"package": name, "version": unquote(package.stem.split("_")[1])}
-            for facts, read in tqdm(find_models(files), desc=name, unit="model", disable=not progress, leave=False):
+            for facts, read in tqdm(find_models(files), desc=name, unit="model", disable=not is_watched(), leave=False):
                 try:
                     mesh = clean_mesh(read())
                     report.models.append(about | facts | _write_model(mesh, facts, folder, kept[facts["category"]]))
