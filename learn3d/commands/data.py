@@ -3,8 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-from tqdm import tqdm
-
 from learn3d.commands.command import Command, DataFolder, Split
 from learn3d.data import shards
 from learn3d.data.categories import synset_of
@@ -18,7 +16,7 @@ from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.views import MIN_CONFIDENCE, CameraOptions, compare, draw_sheet, estimate_views, load_views
 from learn3d.settings import Count, split_names
-from learn3d.terminal import align, is_watched, note, say
+from learn3d.terminal import align, note, say
 
 
 class MakeDataset(Command):
@@ -166,8 +164,7 @@ class EstimatePoses(Command):
     def run(self) -> None:
         check_target(self.output, "--output")
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
-        with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:
-            views = estimate_views(datasets, self.cameras, self.options, bar.update)
+        views = estimate_views(datasets, self.cameras, self.options)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
         say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}")
