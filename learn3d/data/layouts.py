@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from learn3d.data import shards
-from learn3d.data.categories import SPLITS, synset_of
+from learn3d.data.categories import SPLITS, find_splits, synset_of
 from learn3d.data.conventions import IMAGE_SIZE, LayoutProperties
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.pose_table import PoseTable
@@ -133,7 +133,7 @@ def check_folder(
     """
     check_options(layout)
     require_folder(folder)
-    found = shards.contents(folder)
+    found = find_splits(folder, f"*/SPLIT/{shards.SET_FILE}")
     with contextlib.suppress(*(ValueError, OSError) if found or categories else ()):  # the check finds this fault, too
         for category, there in READERS[layout].contents(folder).items():
             found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))

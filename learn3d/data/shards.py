@@ -30,7 +30,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from learn3d.data.categories import find_splits, synset_of
+from learn3d.data.categories import synset_of
 from learn3d.data.dataset import ViewDataset, join_datasets
 from learn3d.data.disk_array import CHANGED, MAX_BYTES, ROW, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, RotationPoses
@@ -86,11 +86,6 @@ def holds(folder: Path | str, category: str, split: str) -> bool:
 def shard_path(folder: Path, number: int) -> Path:
     """Path of shard `number` in the folder of its split. The file exists only if it is complete."""
     return folder / f"{number:05d}.safetensors"
-
-
-def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """The categories of a folder that are stored as shards, and the splits of each."""
-    return find_splits(folder, f"*/SPLIT/{SET_FILE}")
 
 
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
