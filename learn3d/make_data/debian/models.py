@@ -122,7 +122,8 @@ def _write_model(
     kept: name -> [surface grid, surface grid stretched to a cube] of the category's meshes. Raises ValueError if the
     mesh is a near-duplicate of a kept one.
     """
-    surface = [surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cube) for cube in (False, True)]
+    stretched = mesh.vertices / np.ptp(mesh.vertices, axis=0)
+    surface = [surface_grid(vertices, mesh.faces, GRID) for vertices in (mesh.vertices, stretched)]
     for name, others in kept.items():
         for kind, mine, other in zip(("", "stretched "), surface, others, strict=True):
             iou = np.count_nonzero(mine & other) / np.count_nonzero(mine | other)
@@ -157,14 +158,12 @@ def clean_mesh(raw: RawMesh) -> trimesh.Trimesh:
     return mesh
 
 
-def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: bool = False) -> np.ndarray:
+def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
     """Grid bool [size, size, size] of the cells with a surface sample; samples are at most a third of a cell apart.
 
-    The bounding box is centred in the grid. Its longest side, or with `per_axis` each side, fills the grid.
+    The grid is the cube -0.5 .. 0.5, in which all vertices lie.
     """
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    scale = high - low if per_axis else (high - low).max()
-    corners = (((vertices - (low + high) / 2) / scale + 0.5) * size)[faces]
+    corners = ((vertices + 0.5) * size)[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     steps = np.maximum(np.ceil(3 * edges).astype(np.int64), 1)
     grid = np.zeros((size, size, size), dtype=bool)
