@@ -3,8 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-from tqdm import tqdm
-
 from learn3d.commands.command import Command, DataFolder, Split
 from learn3d.data import shards
 from learn3d.data.categories import synset_of
@@ -18,7 +16,7 @@ from learn3d.pictures.sheets import save_png
 from learn3d.poses.estimate import PoseOptions
 from learn3d.poses.views import MIN_CONFIDENCE, CameraOptions, compare, draw_sheet, estimate_views, load_views
 from learn3d.settings import Count, split_names
-from learn3d.terminal import is_watched, note, say
+from learn3d.terminal import align, note, say
 
 
 class MakeDataset(Command):
@@ -35,7 +33,7 @@ class MakeDataset(Command):
     def run(self) -> int:
         if self.config.shards:
             return make_shards(self.config)
-        say(make_dataset(self.config, progress=is_watched()).text())
+        say(make_dataset(self.config).text())
         return 0
 
 
@@ -52,7 +50,7 @@ class FetchDebianModels(Command):
     """Folder for the .deb files; missing ones are downloaded into it (default: a temporary folder)."""
 
     def run(self) -> None:
-        say(fetch_debian_models(self.output, self.packages_dir, progress=is_watched()).summary())
+        say(fetch_debian_models(self.output, self.packages_dir).summary())
         say(f"written to {self.output}")
 
 
@@ -79,14 +77,16 @@ class CheckDataset(Command):
     def run(self) -> int:
         if self.json is not None:
             check_target(self.json, "--json")
-        report = check_folder(self.layout, self.folder, split_names(self.category), self.split)
-        for split in report.splits:
-            for problem in split.problems:
-                say(f"{problem.severity}: {problem.path}: {problem.message}")
-        errors, warnings = report.count("error"), report.count("warning")
-        say(f"\n{report.table()}\n\n{errors} errors, {warnings} warnings")
+        splits = check_folder(self.layout, self.folder, split_names(self.category), self.split)
+        for problem in (problem for split in splits for problem in split.problems):
+            say(f"{problem.severity}: {problem.path}: {problem.message}")
+        rows = [(s.category, s.split, s.objects, s.count("error"), s.count("warning")) for s in splits]
+        errors, warnings = (sum(row[column] for row in rows) for column in (3, 4))
+        table = align([("category", "split", "objects", "errors", "warnings"), *(tuple(map(str, row)) for row in rows)])
+        say(f"\n{table}\n\n{errors} errors, {warnings} warnings")
         if self.json is not None:
-            write_json(self.json, {"errors": errors, "warnings": warnings} | dataclasses.asdict(report))
+            report = {"errors": errors, "warnings": warnings, "layout": self.layout, "folder": str(self.folder)}
+            write_json(self.json, report | {"splits": [dataclasses.asdict(split) for split in splits]})
         return 1 if errors else 0
 
 
@@ -164,8 +164,7 @@ class EstimatePoses(Command):
     def run(self) -> None:
         check_target(self.output, "--output")
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
-        with tqdm(total=self.options.all_steps, desc="poses", unit="step", disable=not is_watched()) as bar:
-            views = estimate_views(datasets, self.cameras, self.options, bar.update)
+        views = estimate_views(datasets, self.cameras, self.options)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
         say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}")

@@ -61,11 +61,9 @@ class DiskArray:
         return zlib.crc32(np.ascontiguousarray(self.rows["crc"]))
 
     def __getitem__(self, samples: np.ndarray) -> np.ndarray:
-        if not isinstance(samples, np.ndarray) or samples.ndim != 1 or samples.dtype.kind not in "iu":
-            raise TypeError(f"the index of an array on disk must be an integer array [B], got {samples!r}")
         file_of, row_of, crc_of = (self.rows[samples][name] for name in ROW.names)
-        result, size = np.empty((len(samples), *self.row_shape), self.dtype), math.prod(self.row_shape)
-        content = result.reshape(len(samples), size).view(np.uint8)
+        result, size = np.empty((len(row_of), *self.row_shape), self.dtype), math.prod(self.row_shape)
+        content = result.reshape(len(row_of), size).view(np.uint8)
         for number, samples_of_file in itertools.groupby(np.lexsort((row_of, file_of)), key=file_of.__getitem__):
             path, position = self.files[number]
             try:

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from learn3d.data import shards
-from learn3d.data.categories import SPLITS, synset_of
+from learn3d.data.categories import SPLITS, find_splits, synset_of
 from learn3d.data.conventions import IMAGE_SIZE, LayoutProperties
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.pose_table import PoseTable
 from learn3d.data.readers import READERS
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, Problem
-from learn3d.terminal import align
 
 Layout = Literal[tuple(READERS)]
 LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader in READERS.items()}
@@ -112,7 +111,7 @@ def _check_layout(folder: Path | str, asked: str) -> None:
 
 @dataclass(frozen=True)
 class SplitReport:
-    """Faults of one category and split."""
+    """Faults of one category and split. Errors are those that `load_dataset` would raise; it would accept warnings."""
 
     category: str
     split: str
@@ -124,27 +123,9 @@ class SplitReport:
         return sum(problem.severity == severity for problem in self.problems)
 
 
-@dataclass(frozen=True)
-class Report:
-    """Faults of a folder. Errors are faults that `load_dataset` would raise, warnings those that it would accept."""
-
-    layout: str
-    folder: str
-    splits: tuple[SplitReport, ...]
-
-    def count(self, severity: str) -> int:
-        """Number of problems that are an "error" or a "warning"."""
-        return sum(split.count(severity) for split in self.splits)
-
-    def table(self) -> str:
-        """A line per category and split: objects, errors, warnings."""
-        rows = [(s.category, s.split, s.objects, s.count("error"), s.count("warning")) for s in self.splits]
-        return align([("category", "split", "objects", "errors", "warnings"), *(tuple(map(str, row)) for row in rows)])
-
-
 def check_folder(
     layout: Layout, folder: Path | str, categories: Sequence[str] = (), splits: Sequence[str] = ()
-) -> Report:
+) -> list[SplitReport]:
     """Examine all files of the categories and splits of a folder (default: all that it has).
 
     A missing category or split is an error of the report. Raises ValueError for an unknown layout, FileNotFoundError if
@@ -152,7 +133,7 @@ def check_folder(
     """
     check_options(layout)
     require_folder(folder)
-    found = shards.contents(folder)
+    found = find_splits(folder, f"*/SPLIT/{shards.SET_FILE}")
     with contextlib.suppress(*(ValueError, OSError) if found or categories else ()):  # the check finds this fault, too
         for category, there in READERS[layout].contents(folder).items():
             found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))
@@ -169,4 +150,4 @@ def check_folder(
                 path, message = getattr(error, "path", folder), getattr(error, "message", str(error))
                 findings.problems.append(Problem(str(path), message))
             reports.append(SplitReport(category, split, findings.objects, tuple(dict.fromkeys(findings.problems))))
-    return Report(layout, str(folder), tuple(reports))
+    return reports

@@ -20,18 +20,17 @@ alone. Axes and colours are those of the layout (`kato`, `kar` ...).
 import dataclasses
 import itertools
 import json
-import math
-import os
 import zlib
 from pathlib import Path
 from typing import Annotated, BinaryIO, Literal
 
 import numpy as np
 from pydantic import Field
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from learn3d.data.categories import find_splits, synset_of
+from learn3d.data.categories import synset_of
 from learn3d.data.dataset import ViewDataset, join_datasets
 from learn3d.data.disk_array import CHANGED, MAX_BYTES, ROW, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, RotationPoses
@@ -46,11 +45,11 @@ SHARD_BYTES = 2**28  # approximate size of the images in a shard
 _FILES = 5 * "[0-9]" + "*.safetensors"
 _REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes from `make_data.render`
 _ARRAYS = ("images", "masks", "depth", "voxels", "points")
-_DTYPES = {  # name of a tensor -> names of its dtype in safetensors and NumPy; all others are float32
-    **dict.fromkeys(("images", "masks", "depth"), ("U8", np.uint8)),
-    **dict.fromkeys(("object_ids", "view_ids"), ("I32", np.int32)),
-    "voxels": ("BOOL", np.bool_),
-    "checksums": ("U32", np.uint32),
+_DTYPES = {  # by tensor; all others are float32
+    **dict.fromkeys(("images", "masks", "depth"), np.uint8),
+    **dict.fromkeys(("object_ids", "view_ids"), np.int32),
+    "voxels": np.bool_,
+    "checksums": np.uint32,
 }
 _POSES = {kind.__name__: kind for kind in (LookAtPoses, RotationPoses)}
 _MAKE_AGAIN = "make or copy it again"
@@ -87,11 +86,6 @@ def holds(folder: Path | str, category: str, split: str) -> bool:
 def shard_path(folder: Path, number: int) -> Path:
     """Path of shard `number` in the folder of its split. The file exists only if it is complete."""
     return folder / f"{number:05d}.safetensors"
-
-
-def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """The categories of a folder that are stored as shards, and the splits of each."""
-    return find_splits(folder, f"*/SPLIT/{SET_FILE}")
 
 
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
@@ -215,39 +209,31 @@ def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDa
             if dataset.image_size != facts.image_size:
                 raise ValueError(f"its images have {dataset.image_size} pixels, not {facts.image_size}")
             return dataset
-        except (ValueError, TypeError, LookupError, AttributeError, OSError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, OSError, SafetensorError) as error:
             text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             raise DamagedFile(path, f"cannot be read as {WANTED} ({text}); {_MAKE_AGAIN}") from error
 
 
 def _read_tables(path: Path, file: BinaryIO) -> tuple[list[str], dict[str, np.ndarray], dict[str, DiskArray]]:
     """The names of objects, the tables, and the arrays of a shard."""
-    size, end = int.from_bytes(file.read(8), "little"), os.fstat(file.fileno()).st_size
-    header = parse_json(file.read(min(size, limits.JSON_BYTES)))
-    metadata = parse_json(header.pop("__metadata__")["shard"])
-    tables, positions = {}, {}
-    for name, info in header.items():
-        code, dtype = _DTYPES.get(name.partition(".")[2] or name, ("F32", np.float32))
-        begin, stop = (8 + size + offset for offset in info["data_offsets"])
-        shape, count = info["shape"], math.prod(info["shape"])
-        if info["dtype"] != code or not all(type(n) is int and n >= 0 for n in (*shape, *info["data_offsets"])):
-            raise ValueError(f"{name} is {info}; expected {code}")
-        if stop > end or stop - begin != count * np.dtype(dtype).itemsize:
-            raise ValueError(f"{name} has another length than its shape; the file has {end} bytes")
-        if name in _ARRAYS:
-            positions[name] = begin, tuple(shape), np.dtype(dtype)
-        else:
-            file.seek(begin)
-            tables[name] = np.fromfile(file, dtype, count).reshape(shape)
+    with safe_open(path, "np") as shard:  # it compares shapes and positions with the length of the file
+        metadata = parse_json(shard.metadata()["shard"])
+        read = {name: shard.get_slice(name)[:0] if name in _ARRAYS else shard.get_tensor(name) for name in shard.keys()}
+    for name, array in read.items():
+        if array.dtype != (wanted := _DTYPES.get(name.partition(".")[2] or name, np.float32)):
+            raise ValueError(f"{name} is {array.dtype}; expected {np.dtype(wanted)}")
+    tables = {name: array for name, array in read.items() if name not in _ARRAYS}
     if _crc(metadata["objects"], tables) != metadata["crc"]:
         raise ValueError(CHANGED)
-    arrays = {}
-    for name, (begin, (count, *row_shape), dtype) in positions.items():
+    size = int.from_bytes(file.read(8), "little")
+    header, arrays = parse_json(file.read(size)), {}
+    for name in read.keys() - tables.keys():
         rows = np.zeros(len(tables[f"{name}.checksums"]), ROW)
         rows["row"], rows["crc"] = np.arange(len(rows)), tables[f"{name}.checksums"]
-        if len(rows) != count:
-            raise ValueError(f"{name} has {count} rows, but {len(rows)} checksums")
-        arrays[name] = DiskArray(((path, begin),), rows, tuple(row_shape), dtype)
+        if len(rows) != header[name]["shape"][0]:
+            raise ValueError(f"{name} has {header[name]['shape'][0]} rows, but {len(rows)} checksums")
+        begin = 8 + size + header[name]["data_offsets"][0]
+        arrays[name] = DiskArray(((path, begin),), rows, read[name].shape[1:], read[name].dtype)
     return metadata["objects"], tables, arrays
 
 

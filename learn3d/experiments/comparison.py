@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from learn3d.data.categories import SYNSETS
 from learn3d.experiments.measurement import HEADERS, Result, figures
 from learn3d.experiments.plan import PlannedRun, Request, command_line, select_rows
-from learn3d.experiments.tables import CATEGORIES, MEAN, TABLES
+from learn3d.experiments.tables import MEAN, TABLES
 from learn3d.files import limits
 from learn3d.files.reading import read_json
 
@@ -113,7 +114,7 @@ def make_report(
 
 def _format_printed(printed: Mapping[str, float], column: str, categories: Sequence[str]) -> str:
     """The paper's figure for a column. Its mean is over the same categories as ours, else in parentheses."""
-    if column == MEAN and set(categories) != (set(printed) - {MEAN} or set(CATEGORIES)):
+    if column == MEAN and set(categories) != (set(printed) - {MEAN} or set(SYNSETS)):
         if all(name in printed for name in categories):
             return f"{np.mean([printed[name] for name in categories]):.3f}"
         return f"({printed[MEAN]:.3f})" if MEAN in printed else "-"

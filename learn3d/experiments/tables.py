@@ -10,14 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from learn3d.data.categories import SYNSETS
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.methods.plus import PlusSettings
 
-#: The 13 categories, in the order of the paper's columns.
-CATEGORIES = tuple(
-    "airplane bench cabinet car chair display lamp loudspeaker rifle sofa table telephone vessel".split()
-)
 MEAN = "mean"  # the column after the categories
 BATCH_DIVISOR = 4  # a step of Plus sees a quarter of the other methods' images, and Plus takes four times the steps
 
@@ -103,12 +100,12 @@ def read_tables() -> dict[str, Table]:
     """The tables by name, from tables.csv and rows.csv beside this module."""
     rows: dict[str, dict[str, Row]] = {}
     for line in _read_csv("rows.csv"):
-        printed = {name: float(line[name]) for name in (*CATEGORIES, MEAN) if line[name]}
+        printed = {name: float(line[name]) for name in (*SYNSETS, MEAN) if line[name]}
         row = Row(line["variant"] or None, line["source"], printed)
         rows.setdefault(line["experiment"], {})[line["method"]] = row
     tables = {}
     for line in _read_csv("tables.csv"):
-        name, categories = line.pop("experiment"), tuple(line["categories"].split()) or CATEGORIES
+        name, categories = line.pop("experiment"), tuple(line["categories"].split()) or tuple(SYNSETS)
         tables[name] = Table(**line | {"categories": categories, "seeds": int(line["seeds"]), "rows": rows[name]})
     return tables
 

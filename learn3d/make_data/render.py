@@ -20,7 +20,7 @@ from learn3d.make_data.writers.writer import RenderedObject, write_png
 from learn3d.pictures.sheets import LEGEND, ROWS, draw_sheet, make_row
 from learn3d.pictures.studio import KEY_LIGHT, natural_look, photograph, studio_lights
 from learn3d.runs.tasks import Task, run_tasks
-from learn3d.terminal import INTERRUPTED, note, say, stop_on_signal
+from learn3d.terminal import INTERRUPTED, is_watched, note, say, stop_on_signal
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
 MAX_LISTED = 100  # skipped meshes in the text of a report; the card has all of them
@@ -63,7 +63,7 @@ def report_files(category: str) -> tuple[str, str]:
     return f"{synset_of(category)}_card.json", f"{synset_of(category)}_contact.png"
 
 
-def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
+def make_dataset(config: DatasetConfig) -> DatasetReport:
     """Make the data set that `config` describes, and return a report. Unusable meshes are skipped.
 
     Writes the layout's files (see `learn3d.make_data.writers`) for every split that is not empty, `{synset}_card.json`
@@ -82,7 +82,7 @@ def make_dataset(config: DatasetConfig, progress: bool = True) -> DatasetReport:
         )
     config.output.mkdir(parents=True, exist_ok=True)
     made, rows = [], {split: [] for split in SPLITS}
-    bar = tqdm(items, desc=config.category, unit="mesh", disable=not progress, dynamic_ncols=True)
+    bar = tqdm(items, desc=config.category, unit="mesh", disable=not is_watched(), dynamic_ncols=True)
     with publishing(config.output, [*paths, *writer.shared]) as folder:
         writer.write(render_meshes(config, bar, made, rows), config.category, folder, config.output)
         if writer.fixed_splits:

@@ -30,12 +30,14 @@ import torch
 from pydantic import Field
 from scipy import ndimage
 from torch import Tensor
+from tqdm import tqdm
 
 import nmr
 from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.networks.encoders import CODE_SIZE
 from learn3d.networks.generators import GENERATORS
 from learn3d.settings import Rare, checked
+from learn3d.terminal import is_watched
 
 SIZE = 32  # side of the compared masks and renderings, in pixels
 MAX_FITTED = 6000  # images that shapes are fitted to and that can be neighbours
@@ -51,8 +53,6 @@ _NEIGHBOUR_SCALE = 0.1  # distance at which the weight of a neighbour has fallen
 _FAR = 9.0  # distance of masks that must not be neighbours
 _PEAK_WIDTH = 5  # peaks of upper outlines are narrower, in pixels
 _PEAK_WEIGHT = 0.002  # weight of their votes; that of nearly equal masks is 1
-
-Tick = Callable[[], object]  # called after each of the `PoseOptions.all_steps` steps
 
 
 @checked
@@ -73,11 +73,6 @@ class PoseOptions:
     """Seed of the initial shapes and of the order of the images."""
     candidates: Annotated[int, Field(ge=1, le=MAX_CANDIDATES)] = 4
     """Number of poses of each image with a probability above 0; each training step draws one."""
-
-    @property
-    def all_steps(self) -> int:
-        """Number of optimisation steps of the whole estimate."""
-        return self.steps * (self.restarts + STAGES) * self.repeats
 
 
 class Candidates(NamedTuple):
@@ -113,9 +108,7 @@ class Estimate:
     front_votes: float  # similar masks with equal azimuths, over those with equal or opposite ones; 1 if there are none
 
 
-def estimate(
-    data: Masks, fitted: Tensor, candidates: Candidates, options: PoseOptions, tick: Tick = lambda: None
-) -> Estimate:
+def estimate(data: Masks, fitted: Tensor, candidates: Candidates, options: PoseOptions) -> Estimate:
     """Estimate the poses of N masks, none of them empty. The same arguments and number of threads give the same bits.
 
     fitted: int64, rows of the masks that shapes are fitted to; of more than MAX_FITTED rows, a random part is used.
@@ -124,9 +117,11 @@ def estimate(
     fitted = fitted[torch.randperm(len(fitted), generator=rng)[:MAX_FITTED].sort().values]
     subset = data.select(fitted)
     neighbours = (Neighbours.of(subset, subset), Neighbours.of(data, subset))
-    with torch.random.fork_rng(devices=[]):
+    steps = options.steps * (options.restarts + STAGES) * options.repeats
+    bar = tqdm(total=steps, desc="poses", unit="step", disable=not is_watched())
+    with torch.random.fork_rng(devices=[]), bar:
         torch.manual_seed(options.seed)
-        create = functools.partial(Shapes, subset, candidates, options, rng, tick)
+        create = functools.partial(Shapes, subset, candidates, options, rng, bar)
         parts = [_estimate_once(options, create, data, *neighbours) for _ in range(options.repeats)]
     posteriors, agreements, shapes, weights, front_votes = zip(*parts, strict=True)
     shifts = _common_frame([posterior.sum(2) for posterior in posteriors], rng)
@@ -202,9 +197,9 @@ class Shapes:
     """
 
     def __init__(
-        self, data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, tick: Tick
+        self, data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, bar: tqdm
     ) -> None:
-        self.data, self.candidates, self.options, self.rng, self.tick = data, candidates, options, rng, tick
+        self.data, self.candidates, self.options, self.rng, self.bar = data, candidates, options, rng, bar
         self.network = GENERATORS["sphere-small"](symmetry="x")
         scale = torch.exp(torch.empty(3).uniform_(np.log(0.3), 0.0, generator=rng))
         self.base = 0.5 * self.network.place(self.network.sphere) * (scale - 1)
@@ -266,7 +261,7 @@ class Shapes:
             optimizer.zero_grad()
             total.backward()
             optimizer.step()
-            self.tick()
+            self.bar.update()
         self.codes.requires_grad_(False)
 
     def loss(self) -> float:

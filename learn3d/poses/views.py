@@ -36,7 +36,6 @@ from learn3d.poses.estimate import (
     Estimate,
     Masks,
     PoseOptions,
-    Tick,
     estimate,
 )
 from learn3d.settings import checked
@@ -115,9 +114,7 @@ def load_views(layout: Layout, data: Path, category: str, views_per_object: int 
     return datasets
 
 
-def estimate_views(
-    datasets: Sequence[ViewDataset], cameras: CameraOptions, options: PoseOptions, tick: Tick = lambda: None
-) -> EstimatedViews:
+def estimate_views(datasets: Sequence[ViewDataset], cameras: CameraOptions, options: PoseOptions) -> EstimatedViews:
     """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
     The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight. Raises ValueError if all
@@ -139,7 +136,7 @@ def estimate_views(
     nearest = (elevation[:, None] - grid).abs().argmin(1)
     allowed = (nearest[:, None] == torch.arange(len(grid))) | (not own_elevation)
     data = Masks(masks, allowed, _objects(datasets)).select(shown)
-    result = estimate(data, torch.searchsorted(shown, training), candidates, options, tick)
+    result = estimate(data, torch.searchsorted(shown, training), candidates, options)
 
     posterior = torch.full((len(masks), len(azimuths), len(grid)), 1 / (len(azimuths) * len(grid)))
     posterior[shown] = result.posterior

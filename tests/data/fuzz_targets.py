@@ -83,7 +83,7 @@ def layout_target(tmp: Path, layout: str) -> Target:
     source.mkdir()
     write_meshes(source)
     config = DatasetConfig(output=folder, category="chair", source=source, layout=layout, **SETTINGS[layout])
-    make_dataset(config, progress=False)
+    make_dataset(config)
     first = {
         "dvr": lambda: (folder / "03001627" / "softras_test.lst").read_text().split()[0],
         "kar": lambda: json.loads((folder / "splits.json").read_text())["03001627"]["test"][0],

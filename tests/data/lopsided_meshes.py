@@ -30,4 +30,4 @@ def write_meshes(folder: Path) -> Path:
 def make(out: Path, source: Path | None, layout: str = "kato", **settings: object) -> DatasetReport:
     """A data set of chairs without val and test splits, unless the settings say so."""
     config = {"category": "chair", "val": 0, "test": 0, **settings}
-    return make_dataset(DatasetConfig(output=out, source=source, layout=layout, **config), progress=False)
+    return make_dataset(DatasetConfig(output=out, source=source, layout=layout, **config))

@@ -21,7 +21,7 @@ from learn3d.files.reading import Problem
 
 def problems(layout: str, folder: Path, split: str, category: str = "chair") -> tuple[Problem, ...]:
     """Everything that `check-dataset` finds in a split."""
-    (report,) = check_folder(layout, folder, [category], [split]).splits
+    (report,) = check_folder(layout, folder, [category], [split])
     return report.problems
 
 

@@ -90,4 +90,4 @@ def entry(name: str, stem: str, **more: str) -> dict:
 
 def fetch(folder: Path, debs: Path | None) -> Report:
     """The recipe on a folder of packages."""
-    return fetch_debian_models(folder, debs, progress=False)
+    return fetch_debian_models(folder, debs)

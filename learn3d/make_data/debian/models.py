@@ -23,7 +23,7 @@ from learn3d.files.formats import RawMesh
 from learn3d.files.writing import publishing
 from learn3d.make_data.debian.packages import PACKAGES
 from learn3d.make_data.meshes import check, fit_to_box
-from learn3d.terminal import note
+from learn3d.terminal import is_watched, note
 
 CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side of the grids that are compared to find duplicates
@@ -47,7 +47,7 @@ class Report:
         return "\n".join([*lines, *(f"{n} skipped: {reason}" for reason, n in reasons.most_common())])
 
 
-def fetch_debian_models(output: Path, packages_dir: Path | None = None, progress: bool = True) -> Report:
+def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Report:
     """Write the meshes into the folder `output`, which appears when it is complete.
 
     packages_dir: folder of the .deb files, into which missing ones are downloaded (default: a temporary folder). The
@@ -73,7 +73,7 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None, progress
             for path in [path for path in files if path.endswith(notice)]:
                 (folder / "licences" / f"{name}.copyright").write_bytes(files[path])
             about = {"package": name, "version": unquote(package.stem.split("_")[1])}
-            for facts, read in tqdm(find_models(files), desc=name, unit="model", disable=not progress, leave=False):
+            for facts, read in tqdm(find_models(files), desc=name, unit="model", disable=not is_watched(), leave=False):
                 try:
                     mesh = clean_mesh(read())
                     report.models.append(about | facts | _write_model(mesh, facts, folder, kept[facts["category"]]))
@@ -122,7 +122,8 @@ def _write_model(
     kept: name -> [surface grid, surface grid stretched to a cube] of the category's meshes. Raises ValueError if the
     mesh is a near-duplicate of a kept one.
     """
-    surface = [surface_grid(mesh.vertices, mesh.faces, GRID, per_axis=cube) for cube in (False, True)]
+    stretched = mesh.vertices / np.ptp(mesh.vertices, axis=0)
+    surface = [surface_grid(vertices, mesh.faces, GRID) for vertices in (mesh.vertices, stretched)]
     for name, others in kept.items():
         for kind, mine, other in zip(("", "stretched "), surface, others, strict=True):
             iou = np.count_nonzero(mine & other) / np.count_nonzero(mine | other)
@@ -157,14 +158,12 @@ def clean_mesh(raw: RawMesh) -> trimesh.Trimesh:
     return mesh
 
 
-def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int, per_axis: bool = False) -> np.ndarray:
+def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
     """Grid bool [size, size, size] of the cells with a surface sample; samples are at most a third of a cell apart.
 
-    The bounding box is centred in the grid. Its longest side, or with `per_axis` each side, fills the grid.
+    The grid is the cube -0.5 .. 0.5, in which all vertices lie.
     """
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    scale = high - low if per_axis else (high - low).max()
-    corners = (((vertices - (low + high) / 2) / scale + 0.5) * size)[faces]
+    corners = ((vertices + 0.5) * size)[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     steps = np.maximum(np.ceil(3 * edges).astype(np.int64), 1)
     grid = np.zeros((size, size, size), dtype=bool)

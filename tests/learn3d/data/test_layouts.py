@@ -95,8 +95,8 @@ AIRPLANE = "02691156"
 
 
 def test_missing_categories_and_splits_are_errors(tiny_folder, tmp_path) -> None:
-    report = check_folder("kato", tiny_folder, ["table"], ["train", "test"])
-    assert [(s.split, s.objects, s.count("error")) for s in report.splits] == [("train", 0, 2), ("test", 0, 2)]
+    found = check_folder("kato", tiny_folder, ["table"], ["train", "test"])
+    assert [(s.split, s.objects, s.count("error")) for s in found] == [("train", 0, 2), ("test", 0, 2)]
     with pytest.raises(FileNotFoundError, match="there is no such folder"):
         check_folder("kato", tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match="layout 'kato', not 'dvr'; add --layout kato"):

@@ -267,8 +267,8 @@ def test_wrong_names_are_refused(tmp_path: Path) -> None:
 
 
 def test_everything_wrong_is_found_in_one_walk(folder: Path, contents: dict[str, dict]) -> None:
-    report = check_folder("pascal3d", folder)
-    assert [(s.split, s.objects, s.problems) for s in report.splits] == [("train", 6, ()), ("val", 3, ())]
+    found = check_folder("pascal3d", folder)
+    assert [(s.split, s.objects, s.problems) for s in found] == [("train", 6, ()), ("val", 3, ())]
     references, voxels = (contents["val"][key].copy() for key in ("images_ref", "voxels"))
     references[1, ..., 3] = 0
     voxels[2] = False

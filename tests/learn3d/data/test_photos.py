@@ -73,8 +73,7 @@ def write_rows(folder: Path, rows: list[dict[str, str]]) -> None:
 
 def check(chairs: Path, severity: str) -> list[tuple[str, str]]:
     """(file, message) of all errors or warnings of the category."""
-    report = check_folder("photos", chairs.parent)
-    found = dict.fromkeys(p for split in report.splits for p in split.problems)
+    found = dict.fromkeys(p for split in check_folder("photos", chairs.parent) for p in split.problems)
     return [(Path(p.path).name, p.message) for p in found if p.severity == severity]
 
 
@@ -101,7 +100,7 @@ def test_the_examples_folder_is_read(made: Path) -> None:
     large = photos.load(made, "chair", "val", image_size=224)
     assert large.images.shape == (3, 4, 224, 224) and large.masks.shape == (3, 64, 64)
     np.testing.assert_array_equal(large.masks, sets["val"].images[:, 3])
-    found = [(s.split, s.objects, s.problems) for s in check_folder("photos", made).splits]
+    found = [(s.split, s.objects, s.problems) for s in check_folder("photos", made)]
     assert found == [("train", 2, ()), ("val", 1, ()), ("test", 1, ())]
     assert len(load_dataset("photos", made, "chair", "train")) == 6
     assert load_dataset("photos", made, "chair", "train", view_bins="90x30:0:60").num_views == 8

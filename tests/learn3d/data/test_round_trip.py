@@ -33,7 +33,7 @@ def made(request, sources, tmp_path_factory):
     output = tmp_path_factory.mktemp("data")
     settings = SETTINGS[request.param]
     config = DatasetConfig(output=output, category="chair", source=sources, layout=request.param, **settings)
-    make_dataset(config, progress=False)
+    make_dataset(config)
     card = json.loads((output / "03001627_card.json").read_text())
     return SimpleNamespace(layout=request.param, folder=output, sources=sources, card=card)
 

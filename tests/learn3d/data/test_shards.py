@@ -143,7 +143,7 @@ def rewrite(stored: Path, **changes) -> Path:
         ({"sides": None}, "KeyError: 'sides'"),
         ({"azimuth_deg": np.zeros(23, np.float32)}, "poses of 24 images of 1 objects must be [24], got [23]"),
         ({"images": np.zeros((24, 4, 32, 32), np.uint8)}, "images of 32 pixels need masks of 64"),
-        ({"view_ids": np.zeros(24, np.float32)}, "view_ids is {'dtype': 'F32'"),
+        ({"view_ids": np.zeros(24, np.float32)}, "view_ids is float32; expected int32"),
     ],
 )
 def test_impossible_tables_are_refused(stored, changes, message) -> None:
@@ -209,17 +209,12 @@ def test_another_layout_or_set_file(stored) -> None:
         shards.load(stored, "airplane", "train", layout="kar")
     with pytest.raises(ValueError, match=r"expected 224 pixels in 'kato'; .* another --image-size"):
         shards.load(stored, "airplane", "train", layout="kato", image_size=224)
-    assert all(split.count("error") == 1 for split in check_folder("kar", stored).splits)
-    assert check_folder("kato", stored).count("error") == 0
+    assert all(split.count("error") == 1 for split in check_folder("kar", stored))
+    assert sum(split.count("error") for split in check_folder("kato", stored)) == 0
     path = stored / "02691156" / "train" / "set.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "shards": 0}))
     with pytest.raises(DamagedFile, match=r"set\.json: is no description of shards \(shards must "):
         load_dataset("kato", stored, "airplane", "train")
-
-
-def test_an_index_must_be_a_list_of_rows(stored) -> None:
-    with pytest.raises(TypeError, match="must be an integer array"):
-        load_dataset("kato", stored, "airplane", "train").images[:, 3]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is measured on Linux only")

@@ -51,8 +51,8 @@ def test_a_damaged_file_ends_training_with_its_name_and_what_to_do(tmp_path: Pat
     assert text.endswith(f"faults of the data set, run: learn3d check-dataset '{folder}' --layout {layout}")
     assert text.count("cut short") == text.count("fetch it again") == 1
     assert not {path.name for path in (tmp_path / "run").glob("*")} - {".lock"}
-    report = check_folder(layout, folder, ["chair"])
-    assert str(named) in {problem.path for split in report.splits for problem in split.problems}
+    found = check_folder(layout, folder, ["chair"])
+    assert str(named) in {problem.path for split in found for problem in split.problems}
 
 
 SECONDS = 20  # an example that takes longer is a hang

@@ -51,7 +51,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_objects_and_the_report_are_those_of_one_process(config, tmp_path, capsys) -> None:
-    report = make_dataset(DatasetConfig(output=tmp_path / "one", **NUMBERS), progress=False)
+    report = make_dataset(DatasetConfig(output=tmp_path / "one", **NUMBERS))
     assert render.make_shards(config) == 0
     out, err = capsys.readouterr()
     assert [*out.splitlines()[:2], "[4/4] " in err] == [*report.text().splitlines()[:2], True]

@@ -26,7 +26,7 @@ SIDES = (0, 6, 12, 18)  # views from the four sides
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> kato.ViewDataset:
     """Eight airplanes, seen from four sides."""
     folder = tmp_path_factory.mktemp("airplanes")
-    make_dataset(DatasetConfig(output=folder, category="airplane", procedural=9, test=1, val=0), progress=False)
+    make_dataset(DatasetConfig(output=folder, category="airplane", procedural=9, test=1, val=0))
     whole = kato.load(folder, "airplane", "train")
     part = whole.select(np.flatnonzero(np.isin(whole.view_ids, SIDES)))
     names = tuple(whole.view_names[view] for view in SIDES)

@@ -144,8 +144,8 @@ def test_surface_grid_of_a_box() -> None:
     faces = triangulate(corners, quads).faces
     shell = np.ones((8, 8, 8), bool)
     shell[1:-1, 1:-1, 1:-1] = False
-    np.testing.assert_array_equal(surface_grid(corners, faces, 8, per_axis=True), shell)
-    flat = surface_grid(corners, faces, 8)
+    np.testing.assert_array_equal(surface_grid(corners / [2, 1.2, 0.8] - 0.5, faces, 8), shell)
+    flat = surface_grid(corners / 2 - [0.5, 0.3, 0.2], faces, 8)
     assert [int(flat.any(axis=axes).sum()) for axes in ((1, 2), (0, 2), (0, 1))] == [8, 6, 4]
 
 
