@@ -24,7 +24,11 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.partial")
     temporary.unlink(missing_ok=True)  # a killed process may have left a hard link, which must not be overwritten
     try:
+        temporary.touch()
+        mode = temporary.stat().st_mode  # as the umask says; safetensors would let only the owner read its files
+        temporary.unlink()
         yield temporary
+        temporary.chmod(mode)
         if sync:
             _sync(temporary)
         os.replace(temporary, path)

@@ -100,10 +100,7 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
     header = {"learn3d": text, "crc32": _checksum(text, flat)}
     try:
         with writing.replacing(path, sync=True) as temporary:
-            temporary.touch()
-            mode = temporary.stat().st_mode
             save_file(flat, temporary, header)
-            temporary.chmod(mode)  # safetensors lets only the owner read its files
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OSError(f"cannot write the checkpoint {path}: {reason}") from error

@@ -53,6 +53,9 @@ def test_training_has_the_same_bits(options, tiny_config, stored, tmp_path) -> N
     assert train(config).finished
     assert train(dataclasses.replace(config, data=stored, output=tmp_path / "disk")).finished
     same_networks(tmp_path / "memory", tmp_path / "disk")
+    (tmp_path / "new").touch()
+    modes = {path.stat().st_mode for path in tmp_path.rglob("*.safetensors")}
+    assert modes == {(tmp_path / "new").stat().st_mode}, "others may read shards and checkpoints as the umask says"
 
 
 def test_several_categories(stored, tiny_folder, tmp_path) -> None:
