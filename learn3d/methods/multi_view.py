@@ -28,8 +28,6 @@ class MultiViewSettings(MeshSettings):
 
     encoder: EncoderName = "conv-relu"
     generator: GeneratorName = "bounded"
-    lambda_smooth: Weight = 0.001
-    """Weight of the smoothness loss (published: 0.001 for one category, 0 for all together)."""
 
 
 class MultiView(MeshMethod):
@@ -48,10 +46,6 @@ class MultiView(MeshMethod):
 
     def check_batch(self, batch: Batch) -> None:
         check_groups(batch, 2, "pairs")
-
-    @property
-    def weights(self) -> dict[str, float]:
-        return {"projection": 1.0, "smoothness": self.settings.lambda_smooth}
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shapes of both views, a and b, in both views. The loss is the mean of the four IoU losses plus
@@ -75,7 +69,6 @@ class ManyViewsSettings(MeshSettings):
     clamp_to_cube: bool = True
     learning_rate: Positive = 4e-4
     lambda_smooth: Weight = 3e-4
-    """Weight of the smoothness loss."""
     lambda_prior: Weight = 1e-4
     """Weight of the mean squared length of the codes."""
     lambda_depth: Weight = 3.0
@@ -97,13 +90,8 @@ class ManyViews(MeshMethod):
     @property
     def weights(self) -> dict[str, float]:
         settings = self.settings
-        return {
-            "projection": 1.0,
-            "depth": settings.lambda_depth,
-            "smoothness": settings.lambda_smooth,
-            "prior": settings.lambda_prior,
-            "view": settings.lambda_view,
-        }
+        own = {"depth": settings.lambda_depth, "prior": settings.lambda_prior, "view": settings.lambda_view}
+        return super().weights | own
 
     def check_batch(self, batch: Batch) -> None:
         super().check_batch(batch)
