@@ -4,8 +4,6 @@ Multi-view is Vanilla-AE as Kato et al. 2018 published it: the shape of each of 
 the shape of one image must explain other views of its object, whose depth is used if it is known.
 """
 
-from typing import Literal
-
 import torch
 from torch import Tensor, nn
 
@@ -26,6 +24,7 @@ CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative 
 class MultiViewSettings(MeshSettings):
     """Networks and loss weight of Kato et al. 2018, with the published code's defaults for one category."""
 
+    sampling = "pairs"
     encoder: EncoderName = "conv-relu"
     generator: GeneratorName = "bounded"
 
@@ -44,9 +43,6 @@ class MultiView(MeshMethod):
             optimizers["centroid"] = SparseGradientAdam(centroid, lr=CENTROID_LEARNING_RATE * rate)
         return optimizers
 
-    def check_batch(self, batch: Batch) -> None:
-        check_groups(batch, 2, "pairs")
-
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shapes of both views, a and b, in both views. The loss is the mean of the four IoU losses plus
         lambda_smooth times the mean smoothness of the shapes.
@@ -64,6 +60,7 @@ class MultiView(MeshMethod):
 class ManyViewsSettings(MeshSettings):
     """Networks and weights of the losses; a loss with weight 0 is not computed."""
 
+    sampling = "groups"
     encoder: EncoderName = "conv-light"
     symmetry: SymmetryOption = "auto"
     clamp_to_cube: bool = True
@@ -93,10 +90,6 @@ class ManyViews(MeshMethod):
         own = {"depth": settings.lambda_depth, "prior": settings.lambda_prior, "view": settings.lambda_view}
         return super().weights | own
 
-    def check_batch(self, batch: Batch) -> None:
-        super().check_batch(batch)
-        check_groups(batch, GROUP_SIZE, "groups")
-
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
         depth + lambda_smooth smoothness + lambda_prior prior + lambda_view view. Every second image of symmetric
@@ -123,13 +116,3 @@ class ManyViews(MeshMethod):
         if uses_depth:
             losses["depth"] = depth_loss(rendered.depth, batch.depth)
         return self.backward_and_step(losses | self.surface_losses(vertices), step)
-
-
-def check_groups(batch: Batch, size: int, sampling: Literal["pairs", "groups"]) -> None:
-    """Raise ValueError unless a batch is [a_1 .. a_n, b_1 .. b_n, ...], `size` views of each of n objects."""
-    count, rest = divmod(len(batch), size)
-    if rest or not torch.equal(batch.object_ids, batch.object_ids[:count].repeat(size)):
-        raise ValueError(
-            f"the method learns from batches of {size} views of each object, [a_1 .. a_n, b_1 .. b_n, ...], but this "
-            f"batch of {len(batch)} views has another form; choose sampling {sampling!r}"
-        )

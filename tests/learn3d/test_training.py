@@ -182,7 +182,6 @@ def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
     ("options", "message"),
     [
         ({"augment": ("crop",)}, "crop must be the first augmentation, and needs"),
-        ({"preset": "kato2018-kato", "sampling": "views"}, "choose sampling 'pairs'"),
         ({"preset": "peng2020-kato-vpl", "batch_size": 1}, "batches of at least 2, got 1"),
         ({"preset": "gadelha2017-kato", "encoder_from_step": 1, "elevation_deg": 20.0}, "PrGAN needs images from 24"),
     ],
