@@ -106,8 +106,7 @@ def slow_adam(weight: float, grads: list[float], rate: float, skip: bool) -> flo
     return weight
 
 
-def test_zero_gradients_leave_weights_and_moments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learn3d.methods.optimization.CHUNK", 4)  # several pieces
+def test_zero_gradients_leave_weights_and_moments_alone() -> None:
     rng = np.random.default_rng(0)
     grads = rng.normal(size=(6, 5, 3)) * (rng.random((6, 5, 3)) < 0.6)
     grads[:, 0] = 0
