@@ -308,11 +308,11 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
 def test_other_data_are_shown_without_the_poses_of_the_training(tiny_config, tiny_set, tmp_path, monkeypatch) -> None:
     configs, loaded = {name: tiny_config(tmp_path, poses=tmp_path / name) for name in ("a", "b")}, []
     monkeypatch.setattr(checkpoint, "load_method", lambda path, which: (Ellipsoids(), configs[path.name], None))
-    monkeypatch.setattr(checkpoint, "load_data", lambda config, split: loaded.append(config.poses) or tiny_set)
+    monkeypatch.setattr(checkpoint, "load_dataset", lambda *_, poses=None, **__: loaded.append(poses) or tiny_set)
     paths = [tmp_path / "a", tmp_path / "b"]
-    open_runs(paths)
-    open_runs(paths, category="chair")
-    assert loaded == [*paths, None]
+    for other in ({}, {"category": "airplane"}, {"data": tmp_path}):
+        open_runs(paths, **other)
+    assert loaded == [*paths, *paths, None]
 
 
 def test_runs_are_called_by_what_tells_them_apart(tiny_config, tmp_path) -> None:
