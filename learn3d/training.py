@@ -108,7 +108,7 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
     metric = result.selection_metric
     iou = result.means.get(metric)
     shown = "undefined" if iou is None else f"{iou:.4f}"
-    mmd = NO_MMD if result.mmd is None else f"MMD {result.mmd:.3f}"
+    mmd = f"MMD {result.means['mmd']:.3f}" if "mmd" in result.means else NO_MMD
     if iou is not None and iou > progress.best_iou:
         shown += " (best so far)"
         progress = dataclasses.replace(progress, best_iou=iou, best_step=step)

@@ -125,7 +125,8 @@ class MeshMethod(Method):
 
     @property
     def weights(self) -> dict[str, float]:
-        return {"projection": 1.0, "smoothness": self.settings.lambda_smooth}
+        settings = self.settings
+        return {"projection": 1.0, "smoothness": settings.lambda_smooth, "view": settings.lambda_view}
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

@@ -86,9 +86,7 @@ class ManyViews(MeshMethod):
 
     @property
     def weights(self) -> dict[str, float]:
-        settings = self.settings
-        own = {"depth": settings.lambda_depth, "prior": settings.lambda_prior, "view": settings.lambda_view}
-        return super().weights | own
+        return super().weights | {"depth": self.settings.lambda_depth, "prior": self.settings.lambda_prior}
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth

@@ -144,10 +144,7 @@ def backpropagate(losses: Mapping[str, Tensor], weights: Mapping[str, float], st
     """
     if missing := [name for name in losses if name not in weights]:
         raise ValueError(f"the method's weights lack {', '.join(missing)}; they have {', '.join(weights) or 'none'}")
-    values = dict.fromkeys(losses, 0.0)
-    for device in {loss.device for loss in losses.values()}:  # one copy from each
-        names = [name for name, loss in losses.items() if loss.device == device]
-        values |= zip(names, torch.stack([losses[name].detach().float() for name in names]).tolist(), strict=True)
+    values = {name: float(loss.detach()) for name, loss in losses.items()}
     values["total"] = sum(weights[name] * value for name, value in values.items())
     if not all(math.isfinite(value) for value in values.values()):
         listed = ", ".join(f"{name} {value:g}" for name, value in values.items())

@@ -146,8 +146,8 @@ def _measure(
     resampled = [resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)]
     rows = []
     for run, result, entry, samples in zip(runs, results, legend, resampled, strict=True):
-        config, iou = run.metadata.config, result.means.get(metric)
-        row = entry | {"about": run.metadata, "method": PRESETS[config.preset].label, "mmd": result.mmd, "iou": iou}
+        config, iou, mmd = run.metadata.config, result.means.get(metric), result.means.get("mmd")
+        row = entry | {"about": run.metadata, "method": PRESETS[config.preset].label, "mmd": mmd, "iou": iou}
         row["interval"] = percentile_interval(samples)
         row["command"] = command_line(config, data="DATA", output="OUTPUT", pretrained="WEIGHTS")
         if rows and None not in (iou, rows[0]["iou"]):
