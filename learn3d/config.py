@@ -111,6 +111,9 @@ class TrainConfig:
             raise ValueError(
                 f"augment 'flip' changes the view class, but {self.preset!r} learns with the class of the original"
             )
+        needed = self.settings.sampling
+        if needed not in (None, self.sampling):
+            raise ValueError(f"{self.preset!r} needs sampling {needed!r}, got {self.sampling!r}; leave sampling out")
         size = VIEWS_OF_OBJECT[self.sampling]
         if self.batch_size % size:
             raise ValueError(

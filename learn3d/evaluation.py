@@ -43,10 +43,6 @@ class Evaluation:
         return self.means.get("voxel_iou")
 
     @property
-    def mmd(self) -> float | None:
-        return self.means.get("mmd")
-
-    @property
     def selection_metric(self) -> str:
         """Metric that selects the best checkpoint: the IoU of silhouettes, which needs no 3D data, if it is known."""
         return "silhouette_iou" if "silhouette_iou" in self.means else "voxel_iou"

@@ -44,7 +44,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     with run_folder.lock_folder(folder):
         if not resume:
             run_folder.check_can_start(folder, overwrite)
-        train_set, val_set = load_splits(config)
+        train_set, val_set = (load_data(config, split) for split in ("train", config.val_split))
         plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
         info = train_set.info(plane, train_set.solidity() if config.settings.wants_solidity else None)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
@@ -97,11 +97,6 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     return Summary(folder, progress, progress.step == config.iterations, time.monotonic() - started)
 
 
-def load_splits(config: TrainConfig) -> tuple[ViewDataset, ViewDataset]:
-    """The training and the validation split of a run."""
-    return load_data(config, "train"), load_data(config, config.val_split)
-
-
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:
     """Measure IoU and MMD on the validation images; save the networks if their IoU is the best so far.
 
@@ -113,7 +108,7 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
     metric = result.selection_metric
     iou = result.means.get(metric)
     shown = "undefined" if iou is None else f"{iou:.4f}"
-    mmd = NO_MMD if result.mmd is None else f"MMD {result.mmd:.3f}"
+    mmd = f"MMD {result.means['mmd']:.3f}" if "mmd" in result.means else NO_MMD
     if iou is not None and iou > progress.best_iou:
         shown += " (best so far)"
         progress = dataclasses.replace(progress, best_iou=iou, best_step=step)

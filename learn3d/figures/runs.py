@@ -45,14 +45,11 @@ def open_runs(
     for path in paths:
         note(f"opening {path}")
         method, config, metadata = checkpoint.load_method(path, which)
-        if data is not None or category is not None:  # without the poses and views of the training
-            own = {"poses": None, "views_per_object": None}
-            config = dataclasses.replace(config, data=data or config.data, category=category or config.category, **own)
-        key = (config.layout, config.data.resolve(), config.category, method.image_size, config.view_bins)
-        key += (config.poses, config.views_per_object)
+        configs.append(dataclasses.replace(config, data=data or config.data, category=category or config.category))
+        key = (config.layout, configs[-1].data.resolve(), configs[-1].category, method.image_size, config.view_bins)
+        key += (config.poses, config.views_per_object) if data is None else ()
         if key not in datasets:
-            datasets[key] = checkpoint.load_data(config, split)
-        configs.append(config)
+            datasets[key] = checkpoint.load_data(config, split, data=data, category=category)
         runs.append((method, datasets[key], metadata))
     return [Run(name, *run) for name, run in zip(name_runs(configs, paths, labels), runs, strict=True)]
 

@@ -34,7 +34,6 @@ MESH_FILE_BYTES = 256 * MIB  # mesh file, and each file that it refers to; the l
 WEIGHTS_BYTES = GIB  # pretrained weights; ResNet-18: 45 MB
 
 # Options of a configuration
-ITERATIONS = 10**9  # steps
 VIEW_CLASSES = 100_000  # cells of azimuth and elevation; 512 in the papers
 
 # Cameras

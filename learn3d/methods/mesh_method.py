@@ -19,7 +19,7 @@ from learn3d.methods.optimization import adam
 from learn3d.networks.encoders import ENCODERS, EncoderName, ViewClassifier, network_input
 from learn3d.networks.generators import GENERATORS, GeneratorName, MeshGenerator, SymmetryOption
 from learn3d.networks.resnet import load_pretrained
-from learn3d.settings import FilePath, Positive, checked
+from learn3d.settings import FilePath, Positive, Weight, checked
 
 AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)  # classes of the view classifier: the azimuth cells of `fitting.fit`
 MIN_COMPACT_SOLIDITY = 0.8  # objects count as compact if the data's solidity is at least this
@@ -55,6 +55,8 @@ class MeshSettings(MethodSettings):
     pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
     weights). VPL then freezes its batch norms."""
+    lambda_smooth: Weight = 0.001
+    """Weight of the smoothness loss (lambda_1 in Peng et al. 2020)."""
 
     def __post_init__(self) -> None:
         if self.pretrained is not None and self.encoder != "resnet18":
@@ -120,6 +122,11 @@ class MeshMethod(Method):
         trained = {name: network for name, network in self.networks.items() if list(network.parameters())}
         rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
         return {name: adam(network, rate, betas) for name, network in trained.items()}
+
+    @property
+    def weights(self) -> dict[str, float]:
+        settings = self.settings
+        return {"projection": 1.0, "smoothness": settings.lambda_smooth, "view": settings.lambda_view}
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

@@ -4,8 +4,6 @@ Multi-view is Vanilla-AE as Kato et al. 2018 published it: the shape of each of 
 the shape of one image must explain other views of its object, whose depth is used if it is known.
 """
 
-from typing import Literal
-
 import torch
 from torch import Tensor, nn
 
@@ -26,10 +24,9 @@ CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative 
 class MultiViewSettings(MeshSettings):
     """Networks and loss weight of Kato et al. 2018, with the published code's defaults for one category."""
 
+    sampling = "pairs"
     encoder: EncoderName = "conv-relu"
     generator: GeneratorName = "bounded"
-    lambda_smooth: Weight = 0.001
-    """Weight of the smoothness loss (published: 0.001 for one category, 0 for all together)."""
 
 
 class MultiView(MeshMethod):
@@ -45,13 +42,6 @@ class MultiView(MeshMethod):
         if centroid:  # the generator "bounded" has this layer
             optimizers["centroid"] = SparseGradientAdam(centroid, lr=CENTROID_LEARNING_RATE * rate)
         return optimizers
-
-    def check_batch(self, batch: Batch) -> None:
-        check_groups(batch, 2, "pairs")
-
-    @property
-    def weights(self) -> dict[str, float]:
-        return {"projection": 1.0, "smoothness": self.settings.lambda_smooth}
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shapes of both views, a and b, in both views. The loss is the mean of the four IoU losses plus
@@ -70,12 +60,12 @@ class MultiView(MeshMethod):
 class ManyViewsSettings(MeshSettings):
     """Networks and weights of the losses; a loss with weight 0 is not computed."""
 
+    sampling = "groups"
     encoder: EncoderName = "conv-light"
     symmetry: SymmetryOption = "auto"
     clamp_to_cube: bool = True
     learning_rate: Positive = 4e-4
     lambda_smooth: Weight = 3e-4
-    """Weight of the smoothness loss."""
     lambda_prior: Weight = 1e-4
     """Weight of the mean squared length of the codes."""
     lambda_depth: Weight = 3.0
@@ -96,18 +86,7 @@ class ManyViews(MeshMethod):
 
     @property
     def weights(self) -> dict[str, float]:
-        settings = self.settings
-        return {
-            "projection": 1.0,
-            "depth": settings.lambda_depth,
-            "smoothness": settings.lambda_smooth,
-            "prior": settings.lambda_prior,
-            "view": settings.lambda_view,
-        }
-
-    def check_batch(self, batch: Batch) -> None:
-        super().check_batch(batch)
-        check_groups(batch, GROUP_SIZE, "groups")
+        return super().weights | {"depth": self.settings.lambda_depth, "prior": self.settings.lambda_prior}
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
@@ -135,13 +114,3 @@ class ManyViews(MeshMethod):
         if uses_depth:
             losses["depth"] = depth_loss(rendered.depth, batch.depth)
         return self.backward_and_step(losses | self.surface_losses(vertices), step)
-
-
-def check_groups(batch: Batch, size: int, sampling: Literal["pairs", "groups"]) -> None:
-    """Raise ValueError unless a batch is [a_1 .. a_n, b_1 .. b_n, ...], `size` views of each of n objects."""
-    count, rest = divmod(len(batch), size)
-    if rest or not torch.equal(batch.object_ids, batch.object_ids[:count].repeat(size)):
-        raise ValueError(
-            f"the method learns from batches of {size} views of each object, [a_1 .. a_n, b_1 .. b_n, ...], but this "
-            f"batch of {len(batch)} views has another form; choose sampling {sampling!r}"
-        )

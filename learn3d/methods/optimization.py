@@ -103,9 +103,6 @@ def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
                 torch.hardshrink(state[name], least, out=state[name])
 
 
-CHUNK = 1 << 20  # weights per update
-
-
 class SparseGradientAdam(torch.optim.Adam):
     """Kato et al. 2018's Adam: a weight whose gradient is exactly zero in a step keeps its value and its moments.
 
@@ -117,31 +114,19 @@ class SparseGradientAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self) -> None:
         for group in self.param_groups:
-            for parameter in (p for p in group["params"] if p.grad is not None):
-                state = self.state[parameter]
+            beta1, beta2 = group["betas"]
+            for weight in (p for p in group["params"] if p.grad is not None):
+                state, grad = self.state[weight], weight.grad
                 if not state:
                     state["step"] = torch.tensor(0.0)
-                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weight), torch.zeros_like(weight)
                 state["step"] += 1
-                self._update(parameter, state, group)
-
-    def _update(self, parameter: Tensor, state: dict[str, Tensor], group: dict) -> None:
-        """Update in chunks that share two buffers; allocation would take five times as long as computation."""
-        (beta1, beta2), count = group["betas"], float(state["step"])
-        rate = group["lr"] * math.sqrt(1 - beta2**count) / (1 - beta1**count)
-        row = parameter[0].numel()
-        rows = max(1, CHUNK // row)
-        memory = parameter.new_empty(2, min(rows, len(parameter)) * row)
-        tensors = (parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"])
-        for weight, grad, first, second in zip(*(tensor.split(rows) for tensor in tensors), strict=True):
-            touched, change = (part[: weight.numel()].view(weight.shape) for part in memory)
-            touched.copy_(grad).ne_(0)
-            torch.sub(grad, first, out=change)
-            first.addcmul_(touched, change, value=1 - beta1)
-            torch.mul(grad, grad, out=change).sub_(second)
-            second.addcmul_(touched, change, value=1 - beta2)
-            torch.sqrt(second, out=change).add_(group["eps"])
-            weight.addcdiv_(touched.mul_(first), change, value=-rate)
+                count, first, second = float(state["step"]), state["exp_avg"], state["exp_avg_sq"]
+                rate = group["lr"] * math.sqrt(1 - beta2**count) / (1 - beta1**count)
+                touched = grad.clone().ne_(0)
+                first.addcmul_(touched, grad - first, value=1 - beta1)
+                second.addcmul_(touched, grad * grad - second, value=1 - beta2)
+                weight.addcdiv_(touched * first, second.sqrt() + group["eps"], value=-rate)
 
 
 def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
@@ -159,10 +144,7 @@ def backpropagate(losses: Mapping[str, Tensor], weights: Mapping[str, float], st
     """
     if missing := [name for name in losses if name not in weights]:
         raise ValueError(f"the method's weights lack {', '.join(missing)}; they have {', '.join(weights) or 'none'}")
-    values = dict.fromkeys(losses, 0.0)
-    for device in {loss.device for loss in losses.values()}:  # one copy from each
-        names = [name for name, loss in losses.items() if loss.device == device]
-        values |= zip(names, torch.stack([losses[name].detach().float() for name in names]).tolist(), strict=True)
+    values = {name: float(loss.detach()) for name, loss in losses.items()}
     values["total"] = sum(weights[name] * value for name, value in values.items())
     if not all(math.isfinite(value) for value in values.values()):
         listed = ", ".join(f"{name} {value:g}" for name, value in values.items())

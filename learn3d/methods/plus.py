@@ -101,7 +101,7 @@ class Plus(PoseInvariant):
 
     @property
     def weights(self) -> dict[str, float]:
-        return super().weights | {"novel_view": self.settings.lambda_novel_view, "view": self.settings.lambda_view}
+        return super().weights | {"novel_view": self.settings.lambda_novel_view}
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """The losses of `PoseInvariant`, lambda_view times that of the azimuths, and lambda_novel_view times that at a

@@ -22,8 +22,6 @@ COMPACT_AREA_WEIGHT = 0.03
 class PoseInvariantSettings(MeshSettings):
     """Networks, weights and forms of the losses in L_tot; a loss with weight 0 is not computed."""
 
-    lambda_smooth: Weight = 0.001
-    """Weight of the smoothness loss (lambda_1)."""
     lambda_smooth_end: Positive | None = None
     """Weight of the smoothness loss at the end of the run, reached by exponential decay. Without it the weight stays
     lambda_smooth."""
@@ -77,9 +75,7 @@ class PoseInvariant(MeshMethod):
     @property
     def weights(self) -> dict[str, float]:
         settings = self.settings
-        return {
-            "projection": 1.0,
-            "smoothness": settings.lambda_smooth,
+        return super().weights | {
             "area": settings.lambda_area,
             "classification": settings.lambda_classification,
             "confusion": settings.lambda_adversarial,

@@ -69,8 +69,6 @@ class VPLSettings(MeshSettings):
     """iou: 1 - soft IoU. pyramid: squared distance of normalised images at five resolutions."""
     adam_beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
     """beta_1 of Adam (beta_2 is 0.999)."""
-    lambda_smooth: Weight = 0.001
-    """Weight of the smoothness loss."""
     lambda_inflation: Weight = 0.0
     """Weight of the inflation loss (internal pressure)."""
     lambda_discriminator: Weight = 1.0
@@ -139,9 +137,7 @@ class VPL(MeshMethod):
     @property
     def weights(self) -> dict[str, float]:
         settings = self.settings
-        return {
-            "projection": 1.0,
-            "smoothness": settings.lambda_smooth,
+        return super().weights | {
             "inflation": settings.lambda_inflation,
             "discrimination": 1.0,
             "adversarial": settings.lambda_discriminator,

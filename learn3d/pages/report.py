@@ -21,11 +21,14 @@ from learn3d.experiments.measurement import MEASURES
 from learn3d.experiments.plan import command_line
 from learn3d.figures.runs import Run, open_runs
 from learn3d.files import limits, writing
-from learn3d.files.reading import parse_json, read_text
+from learn3d.files.reading import read_bytes
 from learn3d.fitting.smoothing import smooth
 from learn3d.pictures.sheets import natural_colors
 from learn3d.pictures.surfaces import Surface, azimuths_deg, eyes, grid_surface
 from learn3d.presets import PRESETS
+from learn3d.runs.folder import METRICS
+from learn3d.runs.log import read_records
+from learn3d.settings import MOST
 from learn3d.terminal import note, plain
 
 UNIT = 1e-4  # length of 1 in the stored int16 coordinates, which reach 3.3; objects reach 1
@@ -79,7 +82,7 @@ def write_report(
     runs = open_runs(paths, labels=labels, data=data, category=category, split=split, which=which)
     _check_same_images(runs, data)
     runs[0].dataset.batch(torch.tensor(indices, dtype=torch.int64))  # raises for wrong indices
-    logs = [read_metrics(path) if (Path(path) / "metrics.jsonl").is_file() else {} for path in paths]
+    logs = [read_metrics(path) if (Path(path) / METRICS).is_file() else {} for path in paths]
     results = []
     for run in runs:
         note(f"measuring {run.label} on {len(run.dataset)} images")
@@ -143,8 +146,8 @@ def _measure(
     resampled = [resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)]
     rows = []
     for run, result, entry, samples in zip(runs, results, legend, resampled, strict=True):
-        config, iou = run.metadata.config, result.means.get(metric)
-        row = entry | {"about": run.metadata, "method": PRESETS[config.preset].label, "mmd": result.mmd, "iou": iou}
+        config, iou, mmd = run.metadata.config, result.means.get(metric), result.means.get("mmd")
+        row = entry | {"about": run.metadata, "method": PRESETS[config.preset].label, "mmd": mmd, "iou": iou}
         row["interval"] = percentile_interval(samples)
         row["command"] = command_line(config, data="DATA", output="OUTPUT", pretrained="WEIGHTS")
         if rows and None not in (iou, rows[0]["iou"]):
@@ -226,29 +229,18 @@ def _mesh(surface: Surface) -> dict[str, Any]:
 
 
 def read_metrics(folder: Path) -> Log:
-    """The curves in a run folder's metrics.jsonl. An incomplete last line is ignored: the run may be writing it.
+    """The curves in a run folder's metrics.jsonl, but for damaged lines: the run may be writing the last one.
 
-    Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or a line that is no record.
+    Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or without numbers.
     """
-    file = Path(folder) / "metrics.jsonl"
-    lines = read_text(file, limits.METRICS_BYTES, "the metrics of a run", errors="replace").splitlines()
+    file = Path(folder) / METRICS
     curves: Log = {}
-    for number, line in enumerate(lines, start=1):
-        try:
-            record = parse_json(line)
-            step, split = record.pop("step"), str(record.pop("split"))
-            titles = [f"{split} {name}" for name in record]
-            valid = all(title.isprintable() and len(title) <= limits.CURVE_NAME for title in titles)
-            if type(step) is not int or not 0 <= step <= limits.ITERATIONS or not valid:
-                raise ValueError
-            known = {k: float(v) for k, v in record.items() if type(v) in (int, float) and k not in _NOT_CURVES}
-        except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
-            if number == len(lines) and number > 1:
-                break
-            wanted = f"record with a step, a split and names of up to {limits.CURVE_NAME} characters"
-            raise ValueError(f"{file}, line {number} is no {wanted}: {line[:60]!r}") from None
-        for name, value in known.items():
-            curves.setdefault((split, name), {})[step] = value
+    for _, record in read_records(read_bytes(file, limits.METRICS_BYTES, "the metrics of a run")):
+        step, split = record.pop("step"), record.pop("split")
+        for name, value in record.items():
+            title, known = f"{split} {name}", type(value) in (int, float) and abs(value) <= MOST
+            if known and name not in _NOT_CURVES and title.isprintable() and len(title) <= limits.CURVE_NAME:
+                curves.setdefault((split, name), {})[step] = float(value)
     if not 0 < len(curves) <= limits.CURVES:
         raise ValueError(f"{file} holds {len(curves)} different numbers; from 1 to {limits.CURVES} are drawn")
     return {key: dict(sorted(curve.items())) for key, curve in curves.items()}

@@ -11,7 +11,7 @@ import time
 import types
 import uuid
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.files import writing
+from learn3d.files.reading import parse_json
 from learn3d.runs.folder import METRICS, METRICS_CSV, TENSORBOARD, WANDB_ID
 from learn3d.terminal import is_watched, note
 
@@ -117,8 +118,8 @@ def _open_writer(config: TrainConfig, start: int) -> Any:
 def _write_csv(folder: Path) -> None:
     """Write metrics.csv: a row for each number in metrics.jsonl, with the columns step, name, value."""
     rows = ["step,name,value\n"]
-    for record in map(json.loads, (folder / METRICS).read_bytes().splitlines()):
-        step, split = record.pop("step"), record.pop("split", "")
+    for _, record in read_records((folder / METRICS).read_bytes()):
+        step, split = record.pop("step"), record.pop("split")
         rows += [
             f"{step},{split}/{name},{value}\n" for name, value in record.items() if isinstance(value, (int, float))
         ]
@@ -146,15 +147,20 @@ def _open_wandb(config: TrainConfig) -> types.SimpleNamespace:
     )
 
 
+def read_records(content: bytes) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """The intact lines of a metrics.jsonl, each with its record: step, split, and values by name."""
+    for line in content.splitlines():
+        with contextlib.suppress(ValueError):
+            record = parse_json(line)
+            if isinstance(record, dict) and type(record.get("step")) is int and type(record.get("split")) is str:
+                yield line, record
+
+
 def _drop_after(path: Path, step: int) -> None:
     """Write the metrics again, without steps after `step` and without damaged lines.
 
     A link of that name is replaced, not followed.
     """
-    kept = []
-    for line in path.read_bytes().splitlines() if path.is_file() else []:
-        # RecursionError and the others: not the JSON of a metric
-        with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
-            if json.loads(line)["step"] <= step:
-                kept.append(line + b"\n")
+    content = path.read_bytes() if path.is_file() else b""
+    kept = [line + b"\n" for line, record in read_records(content) if record["step"] <= step]
     writing.write_bytes(path, b"".join(kept), sync=True)

@@ -63,10 +63,11 @@ def serve() -> None:
     versions()  # once for all runs, so that a commit made during the tests does not tell them apart
     tiny_networks.put_in_place()
     training.PICTURE_ROWS = 1
-    read, sets = training.load_splits, None
+    read, sets = training.load_data, None
     for line in sys.stdin:
-        sets = sets or read(config_from_dict(json.loads(line)["config"]))  # once, and not in every copy
-        training.load_splits = lambda config, sets=sets, **_: sets
+        config = config_from_dict(json.loads(line)["config"])
+        sets = sets or {split: read(config, split) for split in ("train", "val")}  # once, and not in every copy
+        training.load_data = lambda _, split, sets=sets: sets[split]
         print(json.dumps(_fork(json.loads(line))), flush=True)
 
 

@@ -43,6 +43,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "seed": (BASE | {"seed": 2**64}, "seed must be less than"),
     "iterations": (BASE | {"iterations": "abc"}, "iterations must be a valid integer, got 'abc'"),
     "pairs": (BASE | {"sampling": "pairs", "batch_size": 3}, "batch_size must be a multiple of 2, got 3"),
+    "views": (BASE | {"preset": "kato2018-kato", "sampling": "views"}, "needs sampling 'pairs', got 'views'; leave"),
     "unknown": (BASE | {"latent": 1}, "there is no option 'latent'"),
     "channels": (
         BASE | {"preset": "gadelha2017-kato", "settings": {"generator_channels": [10**6, 1, 1, 1]}},

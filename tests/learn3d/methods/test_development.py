@@ -13,7 +13,7 @@ from learn3d import methods, presets
 from learn3d.config import TrainConfig
 from learn3d.evaluation import evaluate
 from learn3d.runs import checkpoint
-from learn3d.training import load_splits, train
+from learn3d.training import load_data, train
 
 PAGE = Path(__file__).parents[3] / "docs" / "contributing.md"
 
@@ -37,7 +37,7 @@ def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, m
     method, config, _ = checkpoint.load_method(tmp_path / "run" / "last.safetensors")
     assert type(method) is page.Mirror
     assert config.settings == settings
-    assert evaluate(method, load_splits(config)[1], max_images=4).voxel_iou > 0
+    assert evaluate(method, load_data(config, "val"), max_images=4).voxel_iou > 0
     lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert lines[0].keys() >= {"projection", "smoothness", "mirror", "total"}
 

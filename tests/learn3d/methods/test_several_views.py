@@ -19,7 +19,7 @@ from learn3d.evaluation import evaluate
 from learn3d.losses import depth_loss
 from learn3d.make_data.render import DatasetConfig, make_shards
 from learn3d.methods import create_method
-from learn3d.methods.multi_view import ManyViews, MultiView, MultiViewSettings, check_groups
+from learn3d.methods.multi_view import ManyViews, MultiView, MultiViewSettings
 from learn3d.methods.optimization import SparseGradientAdam, TrainingSchedule
 from learn3d.networks.generators import deform_bounded_sphere
 from learn3d.presets import PRESETS
@@ -95,12 +95,6 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
         assert all((p != q).any() for p, q in zip(network.parameters(), before[name], strict=True)), name
 
 
-@pytest.mark.parametrize("objects", [[0, 1, 1, 0], [0, 1, 0]])
-def test_batches_must_be_pairs(objects: list[int]) -> None:
-    with pytest.raises(ValueError, match="has another form; choose sampling 'pairs'"):
-        check_groups(make_batch(objects), 2, "pairs")
-
-
 def slow_adam(weight: float, grads: list[float], rate: float, skip: bool) -> float:
     first = second = 0.0
     for t, grad in enumerate(grads, start=1):
@@ -112,8 +106,7 @@ def slow_adam(weight: float, grads: list[float], rate: float, skip: bool) -> flo
     return weight
 
 
-def test_zero_gradients_leave_weights_and_moments_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learn3d.methods.optimization.CHUNK", 4)  # several pieces
+def test_zero_gradients_leave_weights_and_moments_alone() -> None:
     rng = np.random.default_rng(0)
     grads = rng.normal(size=(6, 5, 3)) * (rng.random((6, 5, 3)) < 0.6)
     grads[:, 0] = 0
@@ -157,11 +150,6 @@ def test_groups_are_different_views_of_one_object(dataset: ViewDataset) -> None:
     three = dataset.with_few_views(3)
     of_three = sample_indices(three, "groups", 20, seed=0, step=1).reshape(GROUP_SIZE, 4)
     assert all(len(set(column.tolist())) == 3 for column in of_three.T)
-
-
-def test_other_batches_are_refused(dataset: ViewDataset) -> None:
-    with pytest.raises(ValueError, match=r"5 views of each object.*choose sampling 'groups'"):
-        create(dataset).check_batch(dataset.batch(torch.arange(10)))
 
 
 def test_cameras_stand_all_around_and_see_the_whole_object(dataset: ViewDataset) -> None:
