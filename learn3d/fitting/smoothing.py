@@ -8,30 +8,27 @@ import torch.nn.functional as F
 import trimesh
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_array, diags_array
-from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 from torch import Tensor
+from trimesh.smoothing import filter_taubin
 
 import nmr
 from learn3d.pictures.surfaces import Surface
 
-ROUNDS = 4  # rounds of Taubin's smoothing
+ROUNDS = 4  # rounds of Taubin's smoothing, each of which shrinks the mesh and grows it again
 CELLS = 112  # cells of the grid of `outer_surface` along the longest side
 DEPTH_SIDE = 320  # side of its depth maps in pixels
 _RIM = 4  # empty cells around the shape
 _GROWTH = 1.0  # cells by which the shape is thickened at first, to keep thin parts
-_SHRINK, _GROW = 0.5, -0.53  # weights of Taubin 1995: smoothing without loss of volume
 
 
 def smooth(vertices: Tensor, faces: Tensor) -> Tensor:
     """The vertices [V, 3] of a mesh after a few rounds of Taubin's smoothing, which rounds its edges."""
-    points = vertices.double().numpy()
-    neighbours = joined(faces.numpy(), len(points))
+    neighbours = joined(faces.numpy(), len(vertices))
     mean = diags_array(1 / np.maximum(neighbours.sum(1), 1)) @ neighbours
-    for _ in range(ROUNDS):
-        for share in (_SHRINK, _GROW):
-            points = points + share * (mean @ points - points)
-    return torch.from_numpy(points.astype(np.float32))
+    mesh = trimesh.Trimesh(vertices.double().numpy(), faces.numpy(), process=False)
+    filter_taubin(mesh, 0.5, 0.53, 2 * ROUNDS, mean)
+    return torch.from_numpy(mesh.vertices.astype(np.float32))
 
 
 @torch.no_grad()
@@ -103,8 +100,7 @@ def sharpen(surface: Surface, angle_deg: float = 40.0) -> Surface:
     """The surface with vertices doubled along edges of larger angles, so that normals there are not averaged."""
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
     smooth = mesh.face_adjacency[mesh.face_adjacency_angles < math.radians(angle_deg)]
-    links = coo_array((np.ones(len(smooth)), smooth.T), 2 * [len(mesh.faces)])
-    patch = connected_components(links, directed=False)[1]
+    patch = trimesh.graph.connected_component_labels(smooth, len(mesh.faces))
     corners = np.stack([mesh.faces.ravel(), np.repeat(patch, 3)], 1)
     kept, faces = np.unique(corners, axis=0, return_inverse=True)
     rows = torch.from_numpy(kept[:, 0].astype(np.int64))
