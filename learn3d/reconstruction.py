@@ -11,9 +11,8 @@ import trimesh
 from PIL import Image
 from torch import Tensor, nn
 
-import nmr
 from learn3d.config import TrainConfig
-from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
+from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import MEAN_OBJECT_SIZE, Crops, check_mask, mask_box, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
@@ -22,7 +21,7 @@ from learn3d.files import writing
 from learn3d.fitting.coloring import color_mesh
 from learn3d.fitting.cutting import Box, find_mask, is_plain
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.fitting.fit import Progress, belief, fit, predict
+from learn3d.fitting.fit import Progress, find_view, fit, predict
 from learn3d.fitting.smoothing import divide, outer_surface
 from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.methods.mesh_method import MeshMethod, refine
@@ -306,18 +305,14 @@ def _reduce(mask: np.ndarray) -> Tensor:
 
 @torch.no_grad()
 def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None) -> float:
-    """Azimuth from which the shape's silhouette fits the mask uint8 [S,S] of its image best; a multiple of 15.
+    """Azimuth, in degrees, from which the shape's silhouette fits the mask uint8 [S,S] of its image best.
 
-    A guess for pictures: elevation and distance are unknown, so four elevations are tried, and all outlines are scaled
-    to one size. probabilities: see `fitting.fit.find_view`.
+    A guess, since elevation and distance are unknown; 0 for an empty shape. probabilities: see `find_view`.
     """
-    target, azimuths, losses = centre(_reduce(mask))[0], [15.0 * k for k in range(24)], []
-    for elevation in (0.0, 10.0, 20.0, 30.0):
-        cameras = nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG)
-        silhouettes = centre(nmr.render_silhouette(surface.vertices, surface.faces, cameras, image_size=64)[:, None])
-        losses += [nmr.losses.soft_iou_loss(silhouette, target) for silhouette in silhouettes]
-    losses = torch.stack(losses).view(-1, len(azimuths)) - belief(torch.tensor(azimuths), probabilities)
-    return azimuths[int(losses.argmin()) % len(azimuths)]
+    if not len(surface.faces):
+        return 0.0
+    target = centre(_reduce(mask))[0, 0]
+    return float(find_view(surface.vertices, surface.faces, target, probabilities)[0].azimuth_deg)
 
 
 def export_mesh(path: Path, surface: Surface) -> None:

@@ -174,4 +174,4 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
 def test_a_learnt_azimuth_decides_if_outlines_do_not() -> None:
     mask, probabilities = np.zeros((64, 64), np.uint8), torch.full((24,), 1e-3)
     mask[16:48, 16:48], probabilities[5] = 255, 1.0  # the cell of -105 .. -90 degrees
-    assert input_azimuth_deg(Surface(*nmr.icosphere(2)), mask, probabilities) in (255, 270)
+    assert -110 < input_azimuth_deg(Surface(*nmr.icosphere(2)), mask, probabilities) < -85
