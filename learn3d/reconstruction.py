@@ -1,6 +1,5 @@
 """Reconstruction: from images with masks to mesh files and pictures of them."""
 
-import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,18 +11,17 @@ import trimesh
 from PIL import Image
 from torch import Tensor, nn
 
-import nmr
 from learn3d.config import TrainConfig
-from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
+from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import MEAN_OBJECT_SIZE, Crops, check_mask, mask_box, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.poses import Poses
-from learn3d.files import limits, writing
+from learn3d.files import writing
 from learn3d.fitting.coloring import color_mesh
-from learn3d.fitting.cutting import Box, find_mask
+from learn3d.fitting.cutting import Box, find_mask, is_plain
 from learn3d.fitting.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.fitting.fit import Progress, belief, fit, predict
+from learn3d.fitting.fit import Progress, find_view, fit, predict
 from learn3d.fitting.smoothing import divide, outer_surface
 from learn3d.fitting.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.methods.mesh_method import MeshMethod, refine
@@ -40,7 +38,7 @@ MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 SMALL_MODEL = Path(__file__).with_name("models") / "small.safetensors"  # the model in the package
 STRIP_SIZE = 192  # side of each picture in a strip, in pixels
 _OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
-_PLAIN_SIDE = 1024  # side in pixels to which a photograph with a plain background is reduced
+_SEARCHED_SIDE = 1024  # side in pixels to which a photograph is reduced before its object is searched
 _COLORED = 256  # side in pixels of the picture that gives the colours
 _LONGEST_EDGE = 0.1  # longest edge of a coloured template, since hidden parts have the colours of its vertices
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
@@ -91,7 +89,6 @@ def reconstruct_files(
     masks: Sequence[Path] = (),
     *,
     crop: bool = True,
-    plain_background: bool = False,
     box: Box | None = None,
     refined: bool = True,
     which: str = "last",
@@ -99,10 +96,9 @@ def reconstruct_files(
 ) -> list[Path]:
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
-    masks: a file for each image. Without them images need transparency, except with `plain_background` (the object is
-    everything that differs from the border's colour) or with a `box` (the object is cut out, see
-    `learn3d.fitting.cutting`). refined: see `reconstruct_picture`. Returns the files, named after the images (see
-    `save`). Raises ValueError if a mask is missing or empty, or if a result would replace an input file.
+    masks: a file for each image. Without them the object is searched in images without transparency, and in all of them
+    with a `box` (see `learn3d.fitting.cutting`). refined: see `reconstruct_picture`. Returns the files, named after the
+    images (see `save`). Raises ValueError if a mask is empty, or if a result would replace an input file.
     """
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
@@ -113,10 +109,9 @@ def reconstruct_files(
     if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
         raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
     model = load_model(run, which)
-    read = functools.partial(_read, plain_background=plain_background, box=box)
     made = []
-    for name, photo in zip(names, map(read, images, masks or [None] * len(images)), strict=True):
-        made.append(reconstruct_picture(model, *photo, crop=crop, refined=refined))
+    for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
+        made.append(reconstruct_picture(model, *_read(image, mask, box), crop=crop, refined=refined))
         if made[-1].warning:
             note(f"warning: {name}: {made[-1].warning}")
         elif made[-1].kind:
@@ -171,21 +166,25 @@ def reconstruct(
     return method.decode(method.encode(images)).surfaces()
 
 
-def _read(
-    path: Path, mask_path: Path | None = None, plain_background: bool = False, box: Box | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def _read(path: Path, mask_path: Path | None = None, box: Box | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path`, or found in the image."""
-    searched = mask_path is None and (plain_background or box is not None)
-    side = limits.IMAGE_SIDE if box else _PLAIN_SIDE  # a box is in pixels of the file
-    colors, mask = read_photo(path, max_side=side) if searched else read_photo(path, mask_path)
-    if searched and (box or mask is None):  # a box counts even if the file has transparency
-        mask, more = find_mask(colors, box, plain_background)
+    colors, mask = read_photo(path, mask_path, optional=True)
+    searched = mask is None or box is not None  # a box counts even if the file has transparency
+    if searched:
+        if box is None:
+            photo = Image.fromarray(colors)
+            photo.thumbnail((_SEARCHED_SIDE, _SEARCHED_SIDE))
+            colors = np.asarray(photo)
+            how = "as all that differs from the plain background" if is_plain(colors) else "by GrabCut in the middle"
+            wrong = "if the outline in the strip of views is wrong, give --box or --masks"
+            note(f"note: {path} has no transparency, so the object was searched, {how}; {wrong}")
+        mask, more = find_mask(colors, box)
         if more:
             note(f"note: {path}: several parts were found, and only the largest is used")
     try:
         check_mask(mask, cropped=not searched)
     except ValueError as error:
-        missed = "no object was found in it. Cut the object out (transparency), or give --masks"
+        missed = "no object was found in this photograph. Give --box or --masks, or cut the object out (transparency)"
         raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
     return colors, mask
 
@@ -306,18 +305,14 @@ def _reduce(mask: np.ndarray) -> Tensor:
 
 @torch.no_grad()
 def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None) -> float:
-    """Azimuth from which the shape's silhouette fits the mask uint8 [S,S] of its image best; a multiple of 15.
+    """Azimuth, in degrees, from which the shape's silhouette fits the mask uint8 [S,S] of its image best.
 
-    A guess for pictures: elevation and distance are unknown, so four elevations are tried, and all outlines are scaled
-    to one size. probabilities: see `fitting.fit.find_view`.
+    A guess, since elevation and distance are unknown; 0 for an empty shape. probabilities: see `find_view`.
     """
-    target, azimuths, losses = centre(_reduce(mask))[0], [15.0 * k for k in range(24)], []
-    for elevation in (0.0, 10.0, 20.0, 30.0):
-        cameras = nmr.LookAt.from_angles(DISTANCE, elevation, azimuths, half_fov_deg=HALF_FOV_DEG)
-        silhouettes = centre(nmr.render_silhouette(surface.vertices, surface.faces, cameras, image_size=64)[:, None])
-        losses += [nmr.losses.soft_iou_loss(silhouette, target) for silhouette in silhouettes]
-    losses = torch.stack(losses).view(-1, len(azimuths)) - belief(torch.tensor(azimuths), probabilities)
-    return azimuths[int(losses.argmin()) % len(azimuths)]
+    if not len(surface.faces):
+        return 0.0
+    target = centre(_reduce(mask))[0, 0]
+    return float(find_view(surface.vertices, surface.faces, target, probabilities)[0].azimuth_deg)
 
 
 def export_mesh(path: Path, surface: Surface) -> None:

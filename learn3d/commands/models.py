@@ -60,11 +60,10 @@ class Reconstruct(OnDataset):
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model (default: the small model of the package)."""
     images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
-    """Images of any size, with transparency, --masks, --plain-background or --box (default: images of --data)."""
+    """Images of any size (default: images of --data). Without transparency, --masks or --box the object is searched: it
+    differs from a plain background, or is cut out of the middle (needs the extra photos)."""
     masks: tuple[Path, ...] = ()
     """Mask images (white = object), one for each image (default: the transparency of the images)."""
-    plain_background: bool = False
-    """The background has one colour: pixels that differ from the border belong to the object."""
     box: tuple[int, int, int, int] | None = None
     """Box around the object in a single photograph: X Y WIDTH HEIGHT in pixels, from the upper left. The object is cut
     out of it (needs the extra photos)."""
@@ -83,9 +82,9 @@ class Reconstruct(OnDataset):
     def run(self) -> None:
         if bool(self.images) == (self.data is not None):
             raise ValueError("give either image files, or --data with --indices")
-        if self.box is not None and (len(self.images) > 1 or self.masks or self.plain_background):
-            raise ValueError("--box is for one photograph, without --masks and --plain-background")
-        own = ("masks", "plain_background", "box", "crop")  # options for image files
+        if self.box is not None and (len(self.images) > 1 or self.masks):
+            raise ValueError("--box is for one photograph, without --masks")
+        own = ("masks", "box", "crop")  # options for image files
         self.refuse(*(("--data", *own) if self.data else ("image files", "category", "split", "indices")))
         check_target(self.output, "--output", folder=True)
         if self.data is not None:

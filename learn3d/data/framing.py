@@ -25,15 +25,15 @@ SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop 
 
 
 def read_photo(
-    path: Path, mask_path: Path | None = None, max_side: int | None = None
+    path: Path, mask_path: Path | None = None, *, optional: bool = False
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Read colours uint8 [H, W, 3] and mask uint8 [H, W] of an image with a mask file or with transparency.
 
     Both are turned upright (EXIF). The mask is the transparency of the mask file if it has any, else its grey values:
-    white is the object. max_side: the image is reduced if a side has more pixels, and its mask is None if it has no
-    transparency. Raises FileNotFoundError, and ValueError for unreadable files, a missing mask and different sizes.
+    white is the object. optional: the mask is None if there is neither. Raises FileNotFoundError, and ValueError for
+    unreadable files, a missing mask and different sizes.
     """
-    return sandbox.read(_read, Path(path), mask_path, max_side, wanted="a photograph")
+    return sandbox.read(_read, Path(path), mask_path, optional, wanted="a photograph")
 
 
 class Framed(NamedTuple):
@@ -47,7 +47,7 @@ class Framed(NamedTuple):
 
 def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
     """Read, check and frame a photograph (`frame`); for the sandbox."""
-    colors, mask = _read(path, mask_path, None)
+    colors, mask = _read(path, mask_path, False)
     try:
         check_mask(mask)
     except ValueError as error:
@@ -58,7 +58,7 @@ def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
     return Framed(*frame(colors, mask, size), object_size, touches_border)
 
 
-def _read(path: Path, mask_path: Path | None, max_side: int | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _read(path: Path, mask_path: Path | None, optional: bool) -> tuple[np.ndarray, np.ndarray | None]:
     image = _open(path)
     if image.mode.startswith(("I", "F")):  # Pillow would clamp values above 255
         raise DamagedFile(path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
@@ -69,14 +69,9 @@ def _read(path: Path, mask_path: Path | None, max_side: int | None) -> tuple[np.
     mask = np.asarray(mask_image.convert("RGBA"))[..., 3] if mask_image.has_transparency_data else None
     if mask is None or mask.min() == 255:  # nothing is transparent
         mask = None if mask_path is None else np.asarray(mask_image.convert("L"))
-    if mask is None and max_side is None:
-        wanted = "cut it out, or give a mask (reconstruct: --box, --masks, --plain-background)"
-        raise DamagedFile(path, f"has no transparency and no mask: {wanted}")
-    image = image.convert("RGBA")
-    if max_side is not None:
-        image.thumbnail((max_side, max_side))
-        mask = None if mask is None else np.asarray(image)[..., 3]
-    return np.asarray(image)[..., :3], mask
+    if mask is None and not optional:
+        raise DamagedFile(path, "has no transparency and no mask: cut it out, or give a mask")
+    return np.asarray(image.convert("RGBA"))[..., :3], mask
 
 
 def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:

@@ -1,7 +1,5 @@
 """Masks of photographs without one: by the colour of a plain background, or by GrabCut (OpenCV)."""
 
-import importlib.util
-
 import numpy as np
 from PIL import Image
 from scipy import ndimage
@@ -20,13 +18,13 @@ _AROUND = 16  # width in pixels of the region around the strokes that GrabCut se
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
 
 
-def find_mask(colors: np.ndarray, box: Box | None = None, plain_background: bool = False) -> tuple[np.ndarray, bool]:
+def find_mask(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, bool]:
     """Mask uint8 [H, W], 0 or 255, of the largest object in a photograph uint8 [H, W, 3]; whether there are others.
 
-    GrabCut finds the object in the box or, without one, in the middle. If there is no box, and the background is plain
-    or OpenCV is missing, the object is everything that differs from the border's colour.
+    GrabCut finds the object in the box or, without one, in the middle. If there is no box and the background is plain,
+    the object is everything that differs from the border's colour. Raises ValueError as `cut_out` does.
     """
-    if box is None and (plain_background or is_plain(colors) or importlib.util.find_spec("cv2") is None):
+    if box is None and is_plain(colors):
         return largest_region(threshold_mask(colors))
     return largest_region(cut_out(colors, box))
 

@@ -5,6 +5,7 @@ torchvision itself is no dependency, as it has no build for every PyTorch that n
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import torch
@@ -88,24 +89,13 @@ def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
 
     Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has weights of another network.
     """
-    wanted = "weights of torchvision's resnet18"
-    read = sandbox.read(formats.read_state_dict, path, wanted=wanted)
-    given = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
-    own = {name: value for name, value in encoder.state_dict().items() if not name.startswith("code.")}
-    for name in sorted(own.keys() | given.keys()):
-        if name.endswith("num_batches_tracked") and name not in given:  # files of older versions
-            continue
-        wanted, came = (_describe(values.get(name)) for values in (own, given))
-        if came != wanted:
-            raise ValueError(
-                f"{path} must be a state dict of torchvision's resnet18: {name} is {came}, wanted {wanted}"
-            )
-    encoder.load_state_dict(given, strict=False)
-
-
-def _describe(value: Tensor | None) -> str:
-    if value is None:
-        return "absent"
-    if not value.is_floating_point():
-        return f"{value.dtype} {list(value.shape)}"
-    return f"float {list(value.shape)}" if bool(value.float().isfinite().all()) else "not finite"
+    read = sandbox.read(formats.read_state_dict, path, wanted="weights of torchvision's resnet18")
+    weights = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
+    weights |= {name: value for name, value in encoder.state_dict().items() if name.startswith("code.")}
+    try:
+        encoder.load_state_dict(weights)
+        if odd := [name for name, value in encoder.state_dict().items() if not value.isfinite().all()]:
+            raise RuntimeError(f"{odd[0]} is not finite")
+    except RuntimeError as error:
+        message = textwrap.shorten(str(error), 300)
+        raise ValueError(f"{path} must be a state dict of torchvision's resnet18: {message}") from None

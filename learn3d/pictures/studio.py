@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from trimesh.graph import connected_component_labels
 
 import nmr
 
@@ -86,8 +85,7 @@ def natural_look(
     Connected parts with the same number of faces get the same colour out of three. The light comes from any side.
     palette: the three colours; None for random ones.
     """
-    joined = coo_array((np.ones(len(faces) * 2), (faces[:, :2].ravel(), faces[:, 1:].ravel())), 2 * [len(vertices)])
-    part = connected_components(joined, directed=False)[1][faces[:, 0]]
+    part = connected_component_labels(np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices))[faces[:, 0]]
     kinds = np.unique(np.bincount(part)[part], return_inverse=True)[1]
     palette = np.array(palette or [_material(rng) for _ in range(3)])
     colors = palette[rng.choice(3, size=kinds.max() + 1, p=(0.6, 0.25, 0.15))][kinds]

@@ -41,18 +41,15 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
     picture = np.full((120, 160, 3), 240, np.uint8)
     picture[30:90, 50:110] = (180, 40, 30)
     Image.fromarray(picture).save(tmp_path / "box.png")
-    where = (finished_run, tmp_path / "out", [tmp_path / "box.png"])
-    with pytest.raises(ValueError, match="--plain-background"):
-        reconstruct_files(*where)
-    written = reconstruct_files(*where, plain_background=True)
+    written = reconstruct_files(finished_run, tmp_path / "out", [tmp_path / "box.png"])
     assert len(trimesh.load(written[0], force="mesh").faces) > 100
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
-    with pytest.raises(ValueError, match=r"plain.png: no object was found .* or give --masks"):
-        _read(tmp_path / "plain.png", plain_background=True)
+    with pytest.raises(ValueError, match=r"plain.png: no object was found .* Give --box or --masks"):
+        _read(tmp_path / "plain.png")
     picture[40:80, 120:150] = 0
     Image.fromarray(picture).save(tmp_path / "two.png")
-    for name, said in (("box.png", ""), ("two.png", "several parts were found, and only the largest is used")):
-        mask = _read(tmp_path / name, plain_background=True)[1]
+    for name, said in (("box.png", "differs from the plain background; if"), ("two.png", "several parts were found")):
+        mask = _read(tmp_path / name)[1]
         assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60 and said in capsys.readouterr().err
 
 
@@ -177,4 +174,4 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
 def test_a_learnt_azimuth_decides_if_outlines_do_not() -> None:
     mask, probabilities = np.zeros((64, 64), np.uint8), torch.full((24,), 1e-3)
     mask[16:48, 16:48], probabilities[5] = 255, 1.0  # the cell of -105 .. -90 degrees
-    assert input_azimuth_deg(Surface(*nmr.icosphere(2)), mask, probabilities) in (255, 270)
+    assert -110 < input_azimuth_deg(Surface(*nmr.icosphere(2)), mask, probabilities) < -85
