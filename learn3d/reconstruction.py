@@ -98,7 +98,8 @@ def reconstruct_files(
 
     masks: a file for each image. Without them the object is searched in images without transparency, and in all of them
     with a `box` (see `learn3d.fitting.cutting`). refined: see `reconstruct_picture`. Returns the files, named after the
-    images (see `save`). Raises ValueError if a mask is empty, or if a result would replace an input file.
+    images (see `save`). Raises ValueError if a mask is empty, or if a result would replace an input file. A file that
+    cannot be used is an error after all others are done.
     """
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
@@ -109,14 +110,24 @@ def reconstruct_files(
     if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
         raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
     model = load_model(run, which)
-    made = []
+    paths, faults = [], []
     for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
-        made.append(reconstruct_picture(model, *_read(image, mask, box), crop=crop, refined=refined))
-        if made[-1].warning:
-            note(f"warning: {name}: {made[-1].warning}")
-        elif made[-1].kind:
-            note(f"{name}: category {made[-1].kind}")
-    return save(folder, names, made, model, mesh_format)
+        try:
+            photo = _read(image, mask, box)
+        except (ValueError, OSError) as error:
+            faults.append(error)
+            continue
+        made = reconstruct_picture(model, *photo, crop=crop, refined=refined)
+        if made.warning:
+            note(f"warning: {name}: {made.warning}")
+        elif made.kind:
+            note(f"{name}: category {made.kind}")
+        paths += save(folder, [name], [made], model, mesh_format)
+    for error in faults[1:]:
+        note(f"error: {error}")
+    if faults:
+        raise faults[0]
+    return paths
 
 
 def reconstruct_dataset(
@@ -295,7 +306,8 @@ def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
     if not model.known_codes.is_strange(code):
         return kind, None
     known = ", ".join(kinds)
-    return kind, f"this looks like nothing that the model was trained on ({known}), so its shape is a guess"
+    advice = "so its shape is a guess; check the outline"
+    return kind, f"this looks like nothing that the model was trained on ({known}), {advice}"
 
 
 def _reduce(mask: np.ndarray) -> Tensor:

@@ -81,7 +81,7 @@ def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
     """
     inside = mask > 127
     if not inside.any():
-        raise ValueError("its mask is empty: no pixel is brighter than half; white must be the object")
+        raise ValueError("its mask is empty: no pixel is at least half white, or opaque; white must be the object")
     if inside.all():
         raise ValueError("its mask is all white: white must be the object, black the background")
     border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -114,7 +115,7 @@ class MeshMethod(Method):
         """The network "view_classifier", if `lambda_view` is above 0."""
         if self.settings.lambda_view == 0:
             return {}
-        classifier = ViewClassifier(AZIMUTHS.count, self.info.inverted)
+        classifier = ViewClassifier(math.prod(AZIMUTHS.shape), self.info.inverted)
         return {"view_classifier": classifier.to(memory_format=torch.channels_last)}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:

@@ -169,6 +169,10 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
     assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
     with pytest.raises(ValueError, match="2 images but 1 masks"):
         reconstruct_files(finished_run, tmp_path / "d", twins, [tmp_path / "photo.png"])
+    (tmp_path / "bad.png").write_text("no picture")
+    with pytest.raises(ValueError, match=r"bad\.png"):
+        reconstruct_files(finished_run, tmp_path / "e", [tmp_path / "bad.png", tmp_path / "photo.png"])
+    assert (tmp_path / "e" / "photo.glb").is_file(), "the others are done"
 
 
 def test_a_learnt_azimuth_decides_if_outlines_do_not() -> None:
