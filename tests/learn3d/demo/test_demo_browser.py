@@ -124,8 +124,13 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(page, box) -> None:
 
 def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(page, box, tmp_path) -> None:
     (tmp_path / "broken.png").write_bytes(b"no picture")
-    page.locator("#file").set_input_files(tmp_path / "broken.png")
-    page.get_by_text("not a picture that your browser can open").wait_for()
+    page.locator("#file").set_input_files(box)
+    page.get_by_text("Finding the").first.wait_for()
+    page.locator("#file").set_input_files(tmp_path / "broken.png")  # while the first is in work
+    sentence = page.get_by_text("not a picture that your browser can open")
+    sentence.wait_for()
+    page.wait_for_timeout(1500)
+    assert sentence.is_visible() and page.locator("#progress").is_hidden()
     Image.fromarray(np.full((50, 50, 3), 90, np.uint8)).save(tmp_path / "grey.png")
     page.locator("#file").set_input_files(tmp_path / "grey.png")
     page.get_by_text("No object was found").wait_for()
