@@ -6,6 +6,7 @@
 // geometry is computed in double.
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "corner_values.h"
 #include "geometry.h"
@@ -49,6 +50,12 @@ struct ClipImage {
 // e_k, its derivatives by X and Y, and their sums (index 3).
 struct Areas {
   double e[4], by_x[4], by_y[4];
+
+  // Whether the face is seen so nearly edge-on that S is below the rounding of its corners: 1 / S means nothing then.
+  template <class T>
+  NMR_INLINE bool edge_on() const {
+    return !(std::abs(e[3]) > std::numeric_limits<T>::epsilon() * (std::abs(by_x[3]) + std::abs(by_y[3])));
+  }
 };
 
 NMR_INLINE Areas areas_of(const Corner* q) {
@@ -119,14 +126,16 @@ void clip_weights_forward(const ClipWeights<T>& args) {
         z += a.e[k] * image.position(face, k)[2];
         w += a.e[k] * q[k].w;
       }
+      const double weights[2] = {a.e[0] / a.e[3], a.e[1] / a.e[3]};
+      for (int k = 0; k < 2; ++k) rast[k] = static_cast<T>(unit(weights[k]));
+      rast[2] = static_cast<T>(std::min(std::max(z / w, -1.0), 1.0));
+      rast[3] = static_cast<T>(face + 1);
+      if (a.template edge_on<T>()) continue;
       for (int k = 0; k < 2; ++k) {
-        const double b_k = a.e[k] / a.e[3];
-        rast[k] = static_cast<T>(unit(b_k));
+        const double b_k = weights[k];
         slopes[2 * k] = static_cast<T>((a.by_x[k] - b_k * a.by_x[3]) / a.e[3] * 2 / W);
         slopes[2 * k + 1] = static_cast<T>((a.by_y[k] - b_k * a.by_y[3]) / a.e[3] * 2 / mesh.raster.height);
       }
-      rast[2] = static_cast<T>(std::min(std::max(z / w, -1.0), 1.0));
-      rast[3] = static_cast<T>(face + 1);
     }
   });
 }
@@ -137,20 +146,23 @@ void clip_weights_backward(const ClipWeights<T>& args) {
   sum_positions(mesh, args.grad_positions, [&](int64_t b, int64_t begin, int64_t end, CornerSums<T>& sums) {
     const ClipImage<T> image(mesh, b);
     start_sums(image, begin, end, sums);
+    const double width = mesh.raster.width, height = mesh.raster.height;
+    const int64_t first = b * mesh.raster.pixels();
     for (int64_t n = begin; n < end; ++n) {
       const int64_t face = image.face(n);
       if (face < 0) continue;
       const double X = image.centre_x(n), Y = image.centre_y(n);
       const Corner q[3] = {image.corner(face, 0, X, Y), image.corner(face, 1, X, Y), image.corner(face, 2, X, Y)};
       const Areas a = areas_of(q);
+      if (a.template edge_on<T>()) continue;
       const double S = a.e[3];
       double of_e[4] = {}, of_x[4] = {}, of_y[4] = {};  // gradients of Areas
       for (int k = 0; k < 2; ++k) {
-        double grad = args.grad_rast[4 * (b * mesh.raster.pixels() + n) + k];
+        double grad = args.grad_rast[4 * (first + n) + k];
         const double b_k = a.e[k] / S;
         if (args.grad_slopes) {
-          const T* slopes = args.grad_slopes + 4 * (b * mesh.raster.pixels() + n) + 2 * k;
-          const double x = slopes[0] * 2.0 / mesh.raster.width / S, y = slopes[1] * 2.0 / mesh.raster.height / S;
+          const T* slopes = args.grad_slopes + 4 * (first + n) + 2 * k;
+          const double x = slopes[0] * 2.0 / width / S, y = slopes[1] * 2.0 / height / S;
           of_x[k] += x;
           of_y[k] += y;
           of_x[3] -= b_k * x;

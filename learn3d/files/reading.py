@@ -124,10 +124,10 @@ def read_bytes(path: Path | str, max_bytes: int, wanted: str) -> bytes:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
-def read_text(path: Path | str, max_bytes: int, wanted: str, *, encoding: str = "utf-8", errors: str = "strict") -> str:
+def read_text(path: Path | str, max_bytes: int, wanted: str, *, encoding: str = "utf-8") -> str:
     """The content of a text file, with line ends \\n. Raises as `open_file`, and DamagedFile for another encoding."""
     with faults_of(path, wanted):
-        text = read_bytes(path, max_bytes, wanted).decode(encoding, errors)
+        text = read_bytes(path, max_bytes, wanted).decode(encoding)
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

@@ -188,7 +188,9 @@ def _limit(memory: int, seconds: float) -> None:
     """Limit the private memory of this process in bytes, and its further processor time; RLIM_INFINITY, 0: no limit."""
     signal.setitimer(signal.ITIMER_PROF, seconds)  # then SIGPROF ends the process
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    if _LINUX and hard == resource.RLIM_INFINITY:  # elsewhere it does not count malloc's large blocks
+    if memory == resource.RLIM_INFINITY or (hard != resource.RLIM_INFINITY and memory > hard):
+        memory = hard
+    if _LINUX:  # elsewhere it does not count malloc's large blocks
         resource.setrlimit(resource.RLIMIT_DATA, (memory, hard))
 
 

@@ -25,7 +25,7 @@ class MethodSettings:
 
     # These values have no annotation, so they are no fields: nobody can set them.
     image_size = 64  # side of the encoder's input images in pixels
-    sampling = None  # the only sampling that the training can take; None: any
+    sampling = None  # the sampling that the training needs, or None if it can take all
     reads_view_ids = False  # whether training depends on the view classes
     wants_mirror_plane = False  # whether networks depend on the mirror plane of the training data
     wants_solidity = False  # whether networks or losses depend on the solidity of the training data
