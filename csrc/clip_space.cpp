@@ -146,7 +146,7 @@ void clip_weights_backward(const ClipWeights<T>& args) {
   sum_positions(mesh, args.grad_positions, [&](int64_t b, int64_t begin, int64_t end, CornerSums<T>& sums) {
     const ClipImage<T> image(mesh, b);
     start_sums(image, begin, end, sums);
-    const double width = mesh.raster.width, height = mesh.raster.height;
+    const double scale_x = 2.0 / mesh.raster.width, scale_y = 2.0 / mesh.raster.height;
     const int64_t first = b * mesh.raster.pixels();
     for (int64_t n = begin; n < end; ++n) {
       const int64_t face = image.face(n);
@@ -155,23 +155,24 @@ void clip_weights_backward(const ClipWeights<T>& args) {
       const Corner q[3] = {image.corner(face, 0, X, Y), image.corner(face, 1, X, Y), image.corner(face, 2, X, Y)};
       const Areas a = areas_of(q);
       if (a.template edge_on<T>()) continue;
-      const double S = a.e[3];
+      const double inverse = 1 / a.e[3];
       double of_e[4] = {}, of_x[4] = {}, of_y[4] = {};  // gradients of Areas
       for (int k = 0; k < 2; ++k) {
         double grad = args.grad_rast[4 * (first + n) + k];
-        const double b_k = a.e[k] / S;
+        const double b_k = a.e[k] * inverse;
         if (args.grad_slopes) {
           const T* slopes = args.grad_slopes + 4 * (first + n) + 2 * k;
-          const double x = slopes[0] * 2.0 / width / S, y = slopes[1] * 2.0 / height / S;
+          const double x = slopes[0] * scale_x * inverse, y = slopes[1] * scale_y * inverse;
           of_x[k] += x;
           of_y[k] += y;
           of_x[3] -= b_k * x;
           of_y[3] -= b_k * y;
-          of_e[3] -= x * (a.by_x[k] - b_k * a.by_x[3]) / S + y * (a.by_y[k] - b_k * a.by_y[3]) / S;
+          of_e[3] -= (x * (a.by_x[k] - b_k * a.by_x[3]) + y * (a.by_y[k] - b_k * a.by_y[3])) * inverse;
           grad -= x * a.by_x[3] + y * a.by_y[3];
         }
-        of_e[k] += grad / S;
-        of_e[3] -= b_k * grad / S;
+        grad *= inverse;
+        of_e[k] += grad;
+        of_e[3] -= b_k * grad;
       }
       Corner grads[3] = {};
       for (int k = 0; k < 3; ++k) {
