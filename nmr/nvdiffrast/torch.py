@@ -7,6 +7,7 @@ of https://nvlabs.github.io/nvdiffrast/.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -393,35 +394,38 @@ def _filtered(mip: _Mip, place: _cube.Places, level: Tensor | None, boundary_mod
         texels, grids = mip.pack()
         wrap = "repeat" if boundary_mode == "wrap" else "clamp"
         upright = torch.stack([place.at[..., 0], 1 - place.at[..., 1]], dim=-1)  # row 0 of the kernel is v = 1
-        if level is None or not level.requires_grad:
+
+        def sample(level: Tensor | None) -> Tensor:
             return sample_places(texels, grids, level, upright, wrap)
-        low = level.detach().floor()
-        fine, coarse = (
-            sample_places(texels, grids, x, upright, wrap) for x in (low, (low + 1).clamp(max=len(mip.levels) - 1))
-        )
-        return fine + (level - low).unsqueeze(-1) * (coarse - fine)
-    if level is None:
-        return _bordered(mip.levels[0], place)
-    colors = 0
-    places = level.detach()
-    least, most = (int(places.min()), math.ceil(places.max())) if level.numel() else (0, 0)
-    for n in range(least, most + 1):
-        share = (1 - (level - n).abs()).clamp(min=0)
-        colors = colors + share.unsqueeze(-1) * _bordered(mip.levels[n], place)
-    return colors
+
+        if level is None or not level.requires_grad:
+            return sample(level)
+    else:
+        sample = _with_borders(mip, place)
+        if level is None:
+            return sample(None)
+    low = level.detach().floor()
+    fine, coarse = sample(low), sample((low + 1).clamp(max=len(mip.levels) - 1))
+    return fine + (level - low).unsqueeze(-1) * (coarse - fine)
 
 
-def _bordered(image: Tensor, place: _cube.Places) -> Tensor:
-    """Bilinear colours of an image with a border of zeros, or of a cube map with borders of its neighbours."""
-    height, width = image.shape[-3:-1]
-    padded = F.pad(image, (0, 0, 1, 1, 1, 1)) if place.face is None else _cube.with_borders(image)
-    rows = padded.shape[1]
-    top = 1 if place.face is None else 1 + place.face * (height + 2)
-    column = ((place.at[..., 0] * width).clamp(-1, width + 1) + 1) / (width + 2)
-    row = ((place.at[..., 1] * height).clamp(-1, height + 1) + top) / rows
-    grids, _ = level_grids([(rows, width + 2)] * len(padded), 1)
-    at = torch.stack([column, 1 - row], dim=-1)
-    return sample_places(padded.reshape(-1, image.shape[-1]), grids, None, at, "clamp")
+def _with_borders(mip: _Mip, place: _cube.Places) -> Callable[[Tensor | None], Tensor]:
+    """A function from whole levels ``[B, H, W]`` (None: 0) to bilinear colours. Images have a border of zeros, the faces
+    of cube maps one of their neighbours.
+    """
+    cube = place.face is not None
+    padded = [_cube.with_borders(image) if cube else F.pad(image, (0, 0, 1, 1, 1, 1)) for image in mip.levels]
+    texels, grids = _Mip(padded, None).pack()
+    sizes = place.at.new_tensor([image.shape[-3:-1][::-1] for image in mip.levels])  # [L, 2]: width, height
+
+    def sample(level: Tensor | None) -> Tensor:
+        size = sizes[0] if level is None else sizes[level.long()]
+        column, row = ((place.at * size + 1) / (size + 2)).clamp(0, 1).unbind(-1)
+        if cube:
+            row = (row + place.face) / 6
+        return sample_places(texels, grids, level, torch.stack([column, 1 - row], dim=-1), "clamp")
+
+    return sample
 
 
 def _nearest(tex: Tensor, place: _cube.Places, boundary_mode: str) -> Tensor:
