@@ -410,8 +410,9 @@ def _filtered(mip: _Mip, place: _cube.Places, level: Tensor | None, boundary_mod
 
 
 def _with_borders(mip: _Mip, place: _cube.Places) -> Callable[[Tensor | None], Tensor]:
-    """A function from whole levels ``[B, H, W]`` (None: 0) to bilinear colours. Images have a border of zeros, the faces
-    of cube maps one of their neighbours.
+    """A function from whole levels ``[B, H, W]`` (None: 0) to bilinear colours.
+
+    The border of an image is zero, that of a face of a cube map has the texels of its neighbours.
     """
     cube = place.face is not None
     padded = [_cube.with_borders(image) if cube else F.pad(image, (0, 0, 1, 1, 1, 1)) for image in mip.levels]

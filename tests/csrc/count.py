@@ -42,7 +42,7 @@ def count(workload: str) -> dict[str, int]:
         run("valgrind", "--tool=callgrind", f"--callgrind-out-file={output}", workload, str(IMAGES), str(RUNS))
         report = run("callgrind_annotate", "--inclusive=yes", "--threshold=100", output)
     pattern = r"^ *([\d,]+) .*:(?:void )?nmr::(\w+)(?:<float>)?\(nmr::\w+(?:<float>)? const&\)"
-    found = defaultdict(int)  # a kernel's own line has the largest number; its lambdas and other files' shares have lines, too
+    found = defaultdict(int)  # lambdas and lines of code match, too, but have smaller numbers
     for number, name in re.findall(pattern, report, re.MULTILINE):
         found[name] = max(found[name], int(number.replace(",", "")))
     kernels = re.findall(r"void (\w+)\(const \w+(?:<T>)?& args\)", STAGES.read_text())
