@@ -276,9 +276,8 @@ def reconstruct_picture(
         found = method.view_probabilities(image[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
         return Reconstruction(surface, stored, azimuth_deg)
-    options = {"object_size": CENTRED_SIZE, "size": _COLORED, "layout": "kar"}  # kar: colours are not inverted
-    fine = prepare_image(colors, mask, **options)
-    mask = _reduce(fine[3])[0, 0]
+    framed = frame(colors, mask)
+    mask = reduce_mask(framed[3])
     progress("camera", 0.0)
     predicted = predict(method, image, mask)
     kind, warning = recognize(model, predicted.code[0])
@@ -290,7 +289,7 @@ def reconstruct_picture(
         fitted = fit(method, predicted, mask, progress)
         mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
     progress("colours", 0.9)
-    surface = color_mesh(mesh, fitted.view, fine, mirror, textured=templates is not None)
+    surface = color_mesh(mesh, fitted.view, framed, mirror, textured=templates is not None)
     return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
 
 
@@ -310,9 +309,15 @@ def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
     return kind, f"this looks like nothing that the model was trained on ({known}), {advice}"
 
 
-def _reduce(mask: np.ndarray) -> Tensor:
-    """A mask uint8 [S, S] as float32 [1, 1, 64, 64] in 0 .. 1."""
-    return nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE, mode="area")
+def frame(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """A picture as uint8 [4, 256, 256] on white, framed for `learn3d.fitting`."""
+    # Kar's images are not inverted.
+    return prepare_image(colors, mask, object_size=CENTRED_SIZE, size=_COLORED, layout="kar")
+
+
+def reduce_mask(mask: np.ndarray) -> Tensor:
+    """A mask uint8 [S, S] as float32 [64, 64] in 0 .. 1."""
+    return nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE, mode="area")[0, 0]
 
 
 @torch.no_grad()
@@ -323,7 +328,7 @@ def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor 
     """
     if not len(surface.faces):
         return 0.0
-    target = centre(_reduce(mask))[0, 0]
+    target = centre(reduce_mask(mask)[None, None])[0, 0]
     return float(find_view(surface.vertices, surface.faces, target, probabilities)[0].azimuth_deg)
 
 

@@ -20,6 +20,7 @@ from learn3d.config import load_config
 from learn3d.experiments.measurement import MEASURES
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.run import Summary
+from learn3d.shapes import numbered_shape
 from learn3d.terminal import INTERRUPTED
 
 TOOLS = Path(__file__).parents[3] / "tools"
@@ -223,8 +224,10 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
     assert command(*words)[:2] == (1, out), "the table is not lost"
 
 
-def test_the_fit_of_pictures_is_measured(tiny_folder, capsys) -> None:
-    runpy.run_path(str(TOOLS / "measure_fit.py"))["main"](tiny_folder, "airplane", images=2)
+def test_the_fit_of_pictures_is_measured(tmp_path, capsys) -> None:
+    (tmp_path / "airplane").mkdir()
+    numbered_shape("airplane", 1, 0).export(tmp_path / "airplane" / "plane.ply")
+    runpy.run_path(str(TOOLS / "measure_fit.py"))["main"](tmp_path, "airplane", images=2)
     assert len(capsys.readouterr().out.splitlines()[1].split()) == 10
 
 
