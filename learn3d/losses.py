@@ -30,13 +30,19 @@ def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -
     return difference.square().sum(dim=1).mean()
 
 
-def depth_loss(depth: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of depth maps [B, S, S] over the pixels in which both show a surface.
+def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean absolute differences of depth maps [B, S, S], and of their slopes.
 
-    Pixels without a surface are 100 (nmr's `far`) in `depth` and 0 in `target`. Differentiable in depth.
+    A slope is the difference of the depths of pixels two apart in a row or a column (gradient matching, Li and Snavely
+    2018). Only pixels in which both maps show a surface count; others are 100 (nmr's `far`) in `depth` and 0 in
+    `target`. Differentiable in depth.
     """
     both = (target > 0) & (depth.detach() < 2 * target)
-    return ((depth - target).abs() * both).sum() / both.sum().clamp(min=1)
+    error = (depth - target) * both
+    rows, columns = both[:, 2:] & both[:, :-2], both[:, :, 2:] & both[:, :, :-2]
+    down, right = (error[:, 2:] - error[:, :-2]).abs() * rows, (error[:, :, 2:] - error[:, :, :-2]).abs() * columns
+    slope = down.sum() / rows.sum().clamp(min=1) + right.sum() / columns.sum().clamp(min=1)
+    return error.abs().sum() / both.sum().clamp(min=1), slope
 
 
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:

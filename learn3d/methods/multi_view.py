@@ -10,7 +10,7 @@ from torch import Tensor, nn
 import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.sampling import GROUP_SIZE
-from learn3d.losses import depth_loss, gaussian_prior_loss
+from learn3d.losses import depth_losses, gaussian_prior_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.optimization import SparseGradientAdam
 from learn3d.networks.encoders import EncoderName
@@ -70,6 +70,8 @@ class ManyViewsSettings(MeshSettings):
     """Weight of the mean squared length of the codes."""
     lambda_depth: Weight = 3.0
     """Weight of the depth loss, in views whose depth is known."""
+    lambda_slope: Weight = 3.0
+    """Weight of the loss of the slopes of the depth, which show how surfaces are turned."""
     lambda_view: Weight = 0.0
     """Weight of the loss of a small network that classifies the azimuth of an image; reconstruction places the camera
     of a picture by it. 0: no such network."""
@@ -86,12 +88,14 @@ class ManyViews(MeshMethod):
 
     @property
     def weights(self) -> dict[str, float]:
-        return super().weights | {"depth": self.settings.lambda_depth, "prior": self.settings.lambda_prior}
+        settings = self.settings
+        own = {"depth": settings.lambda_depth, "slope": settings.lambda_slope, "prior": settings.lambda_prior}
+        return super().weights | own
 
     def training_step(self, batch: Batch, step: int) -> dict[str, float]:
         """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
-        depth + lambda_smooth smoothness + lambda_prior prior + lambda_view view. Every second image of symmetric
-        objects is flipped first, but not for the loss view.
+        depth + lambda_slope slope + lambda_smooth smoothness + lambda_prior prior + lambda_view view. Every second
+        image of symmetric objects is flipped first, but not for the loss view.
         """
         settings, count = self.settings, len(batch) // GROUP_SIZE
         images = batch.images[:count]
@@ -102,7 +106,7 @@ class ManyViews(MeshMethod):
         if settings.lambda_view > 0:
             losses["view"] = self.view_loss(images, batch.poses[:count])
         vertices = vertices.cpu()
-        uses_depth = batch.depth is not None and settings.lambda_depth > 0
+        uses_depth = batch.depth is not None and settings.lambda_depth + settings.lambda_slope > 0
         rendered = nmr.render(
             vertices.repeat(GROUP_SIZE, 1, 1),
             self.faces,
@@ -112,5 +116,5 @@ class ManyViews(MeshMethod):
         )
         losses["projection"] = nmr.losses.soft_iou_loss(rendered.alpha, batch.masks)
         if uses_depth:
-            losses["depth"] = depth_loss(rendered.depth, batch.depth)
+            losses["depth"], losses["slope"] = depth_losses(rendered.depth, batch.depth)
         return self.backward_and_step(losses | self.surface_losses(vertices), step)

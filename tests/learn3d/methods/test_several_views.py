@@ -16,7 +16,7 @@ from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices
 from learn3d.evaluation import evaluate
-from learn3d.losses import depth_loss
+from learn3d.losses import depth_losses
 from learn3d.make_data.render import DatasetConfig, make_shards
 from learn3d.methods import create_method
 from learn3d.methods.multi_view import ManyViews, MultiView, MultiViewSettings
@@ -181,13 +181,14 @@ def test_flipped_batches_have_flipped_depth(dataset: ViewDataset) -> None:
     assert torch.equal(changed.depth[~turned], batch.depth[~turned])
 
 
-def test_depth_loss_counts_pixels_where_both_show_a_surface() -> None:
-    depth = torch.tensor([[[2.0, 100.0], [2.5, 2.0]]], requires_grad=True)
-    target = torch.tensor([[[2.3, 2.0], [0.0, 1.9]]])
-    loss = depth_loss(depth, target)
-    assert loss.item() == pytest.approx((0.3 + 0.1) / 2)
-    loss.backward()
-    assert depth.grad.tolist() == [[[-0.5, 0.0], [0.0, 0.5]]]
+def test_depth_losses_count_pixels_where_both_show_a_surface() -> None:
+    depth = torch.tensor([[[2.0, 100.0, 2.2], [2.5, 2.0, 2.0]]], requires_grad=True)
+    target = torch.tensor([[[2.3, 2.0, 2.1], [0.0, 1.9, 1.9]]])
+    loss, slope = depth_losses(depth, target)
+    assert loss.item() == pytest.approx((0.3 + 0.1 + 0.1 + 0.1) / 4)
+    assert slope.item() == pytest.approx(0.4), "rows of three pixels, of which one has both ends"
+    (loss + slope).backward()
+    assert depth.grad.tolist() == [[[-1.25, 0.0, 1.25], [0.0, 0.25, 0.25]]]
 
 
 def test_losses_are_those_written_out(dataset: ViewDataset) -> None:
@@ -196,7 +197,7 @@ def test_losses_are_those_written_out(dataset: ViewDataset) -> None:
     with torch.no_grad():
         method.generator.layers[-1].weight *= 30  # shapes that differ
         codes, vertices = method.predict(batch.images[:2])
-    overlap, distances = [], []
+    overlap, distances, slopes = [], [], []
     for view in range(10):
         shape = vertices[view % 2]
         camera = batch.poses[torch.tensor([view])].cameras()
@@ -204,12 +205,16 @@ def test_losses_are_those_written_out(dataset: ViewDataset) -> None:
         depth = nmr.render_depth(shape, method.faces, camera, image_size=64)[0]
         overlap.append(nmr.losses.soft_iou_loss(seen, batch.masks[view : view + 1]))
         both = (batch.depth[view] > 0) & (depth < 10)
-        distances.append((depth - batch.depth[view])[both].abs())
+        error = torch.where(both, depth - batch.depth[view], torch.nan)
+        distances.append(error[both].abs())
+        slopes.append([(error - error.roll(2, axis)).narrow(axis, 2, 62).abs().flatten() for axis in (0, 1)])
     losses = method.take_step(batch, 1)
     assert losses["projection"] == pytest.approx(float(torch.stack(overlap).mean()), rel=1e-4)
     assert losses["depth"] == pytest.approx(float(torch.cat(distances).mean()), rel=0.02)
+    slope = sum(float(torch.cat(part).nanmean()) for part in zip(*slopes, strict=True))
+    assert losses["slope"] == pytest.approx(slope, rel=0.02)
     assert losses["prior"] == pytest.approx(float(codes.square().sum(1).mean()), rel=1e-4)
-    assert "depth" not in method.take_step(dataclasses.replace(batch, depth=None), 1)
+    assert not {"depth", "slope"} & method.take_step(dataclasses.replace(batch, depth=None), 1).keys()
 
 
 def test_the_azimuth_is_learnt_from_the_pose(dataset: ViewDataset) -> None:
