@@ -58,7 +58,7 @@ class MultiView(MeshMethod):
 
 @checked
 class ManyViewsSettings(MeshSettings):
-    """Networks and weights of the losses; a loss with weight 0 is not computed."""
+    """Networks and weights of the losses; a loss with weight 0 is not computed, but depth and slope are together."""
 
     sampling = "groups"
     encoder: EncoderName = "conv-light"
