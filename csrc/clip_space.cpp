@@ -132,9 +132,8 @@ void clip_weights_forward(const ClipWeights<T>& args) {
       rast[3] = static_cast<T>(face + 1);
       if (a.template edge_on<T>()) continue;
       for (int k = 0; k < 2; ++k) {
-        const double b_k = weights[k];
-        slopes[2 * k] = static_cast<T>((a.by_x[k] - b_k * a.by_x[3]) / a.e[3] * 2 / W);
-        slopes[2 * k + 1] = static_cast<T>((a.by_y[k] - b_k * a.by_y[3]) / a.e[3] * 2 / mesh.raster.height);
+        slopes[2 * k] = static_cast<T>((a.by_x[k] - weights[k] * a.by_x[3]) / a.e[3] * 2 / W);
+        slopes[2 * k + 1] = static_cast<T>((a.by_y[k] - weights[k] * a.by_y[3]) / a.e[3] * 2 / mesh.raster.height);
       }
     }
   });

@@ -106,7 +106,7 @@ void collect_lines(const SweepImage<T>& image, const ColumnPart& part, T* grad_r
   if (part.width >= W) finish_lines(rows, 0, H);
 }
 
-// Joins the pieces of rows [first, last), and finishes them. width: of the parts, in pixels.
+// Joins the pieces of rows [first, last), and finishes them. width: pixels of a part along each row.
 template <class T>
 void join_rows(const SweepImage<T>& image, int64_t width, int64_t first, int64_t last) {
   const int64_t H = image.raster.height, W = image.raster.width;

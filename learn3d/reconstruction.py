@@ -310,8 +310,8 @@ def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
 
 
 def frame(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """A picture as uint8 [4, 256, 256] on white, framed for `learn3d.fitting`."""
-    # Kar's images are not inverted.
+    """A picture uint8 [H, W, 3] and its mask as uint8 [4, 256, 256] on white, with the object centred and large."""
+    # In the layout of Kar, colours are not inverted.
     return prepare_image(colors, mask, object_size=CENTRED_SIZE, size=_COLORED, layout="kar")
 
 

@@ -12,13 +12,14 @@ out=${OUT:-output/small-model}
 categories=airplane,car,chair,lamp,sofa,table
 
 [ -e "$out/models" ] || "$bin/learn3d" fetch-debian-models --output "$out/models"
-"$bin/python" - "$out/models" "$out/free" <<'EOF'
+"$bin/python" - "$out" <<'EOF'
 import csv, pathlib, shutil, sys
-source, target = map(pathlib.Path, sys.argv[1:])
-for row in csv.DictReader(open(source / "index.csv", newline="")):
-    if "Public domain" in row["licence"] or "Creative Commons Attribution" in row["licence"]:
-        (target / row["file"]).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(source / row["file"], target / row["file"])
+out = pathlib.Path(sys.argv[1])
+for row in csv.DictReader(open(out / "models/index.csv", newline="")):
+    is_free = "Public domain" in row["licence"] or "Creative Commons Attribution" in row["licence"]
+    target = out / ("free" if is_free else "others") / row["file"]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(out / "models" / row["file"], target)
 EOF
 for category in ${categories//,/ }; do
     models=$out/free/$category

@@ -60,8 +60,8 @@ class Reconstruct(OnDataset):
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model (default: the small model of the package)."""
     images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
-    """Images of any size (default: images of --data). Without transparency, --masks or --box the object is searched: it
-    differs from a plain background, or is cut out of the middle (needs the extra photos)."""
+    """Images of any size (default: images of --data). In those without transparency, --masks or --box the object is
+    searched: it is what differs from a plain background, or else is cut out of the middle (needs the extra photos)."""
     masks: tuple[Path, ...] = ()
     """Mask images (white = object), one for each image (default: the transparency of the images)."""
     box: tuple[int, int, int, int] | None = None

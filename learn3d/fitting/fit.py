@@ -32,7 +32,7 @@ SMOOTHNESS = 3e-4  # weight of the smoothness loss
 STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
 # Units of azimuth, elevation, distance and shift as variables: a step moves the outline about equally far for each.
 _SCALES = (60.0, 60.0, 1.0, 1.0)
-#: Options of Adam as a function: the class would first import torch._dynamo, which takes a second.
+#: Options of torch's function `adam`. Its class Adam would import torch._dynamo, which takes a second.
 _ADAM = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0, "amsgrad": False, "maximize": False}
 
 Meshes = Tensor | Sequence[Tensor]

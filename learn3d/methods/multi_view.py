@@ -71,7 +71,7 @@ class ManyViewsSettings(MeshSettings):
     lambda_depth: Weight = 3.0
     """Weight of the depth loss, in views whose depth is known."""
     lambda_slope: Weight = 3.0
-    """Weight of the loss of the slopes of the depth, which show how surfaces are turned."""
+    """Weight of the slope loss: how depth changes from pixel to pixel, which shows how surfaces are turned."""
     lambda_view: Weight = 0.0
     """Weight of the loss of a small network that classifies the azimuth of an image; reconstruction places the camera
     of a picture by it. 0: no such network."""

@@ -186,7 +186,7 @@ def test_depth_losses_count_pixels_where_both_show_a_surface() -> None:
     target = torch.tensor([[[2.3, 2.0, 2.1], [0.0, 1.9, 1.9]]])
     loss, slope = depth_losses(depth, target)
     assert loss.item() == pytest.approx((0.3 + 0.1 + 0.1 + 0.1) / 4)
-    assert slope.item() == pytest.approx(0.4), "rows of three pixels, of which one has both ends"
+    assert slope.item() == pytest.approx(0.4), "only the first row has a surface at both ends"
     (loss + slope).backward()
     assert depth.grad.tolist() == [[[-1.25, 0.0, 1.25], [0.0, 0.25, 0.25]]]
 
