@@ -35,37 +35,40 @@ struct RowBlocks {
 
 // The faces that own a pixel, numbered from 1 in ascending order; the background is number 0.
 struct VisibleFaces {
-  std::vector<int32_t> slots;  // [2 F + 1] number of face index id at [id + 1]; defined only for visible faces
+  std::vector<uint8_t> seen;   // [2 F + 1 + 8] by face index + 1
+  std::vector<int32_t> slots;  // [2 F + 1 + 8] number of face index id at [id + 1]; defined only for visible faces
   std::vector<int32_t> ids;    // [count] face indices; ids[0] = -1
   int64_t count;
 
   void reserve_for(int64_t num_faces, int64_t most_visible) {
-    reserve(slots, 2 * num_faces + 1);
-    reserve(ids, most_visible + 2);  // the search may write one entry after the last one
+    reserve(seen, 2 * num_faces + 1 + 8);
+    reserve(slots, 2 * num_faces + 1 + 8);
+    reserve(ids, most_visible + 1 + 8);
   }
 
   NMR_INLINE void find(const int32_t* face_index, int64_t pixels, int64_t num_faces) {
-    int32_t *slot = slots.data(), *id = ids.data();
-    std::fill_n(slot, 2 * num_faces + 1, 0);
+    const int64_t entries = 2 * num_faces + 1;
+    std::fill_n(seen.data(), entries + 8, uint8_t(0));
     int64_t n = 0;
     for (; n + 8 <= pixels; n += 8) {
       uint64_t pairs[4];
       std::memcpy(pairs, face_index + n, sizeof pairs);
       const uint64_t signs = pairs[0] & pairs[1] & pairs[2] & pairs[3];
       if ((~signs & UINT64_C(0x8000000080000000)) == 0) continue;  // background
-      for (int64_t k = 0; k < 8; ++k) slot[face_index[n + k] + 1] = 1;
+      for (int64_t k = 0; k < 8; ++k) seen[face_index[n + k] + 1] = 1;
     }
-    for (; n < pixels; ++n) slot[face_index[n] + 1] = 1;
-    int32_t found = 1;
-    for (int64_t f = 0; f < 2 * num_faces; ++f) {
-      const int32_t visible = slot[f + 1];
-      id[found] = static_cast<int32_t>(f);
-      slot[f + 1] = found;
-      found += visible;
+    for (; n < pixels; ++n) seen[face_index[n] + 1] = 1;
+    seen[0] = 1;  // the background
+    count = 0;
+    for (int64_t e = 0; e < entries; e += 8) {
+      uint64_t any;
+      std::memcpy(&any, seen.data() + e, sizeof any);
+      for (int64_t k = e; any && k < e + 8; ++k) {
+        slots[k] = static_cast<int32_t>(count);
+        ids[count] = static_cast<int32_t>(k - 1);
+        count += seen[k];
+      }
     }
-    id[0] = -1;
-    slot[0] = 0;
-    count = found;
   }
 };
 

@@ -59,6 +59,7 @@ struct Run {
 }  // namespace
 }  // namespace nmr
 
+#define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "project_lanes.h"
 #include "levels.h"
 

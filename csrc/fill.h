@@ -2,33 +2,6 @@
 
 static_assert(kLanes == kTogether, "a vector holds the faces of a block and a row of a block of pixels");
 
-// a & ~b: lanes of a that are not set in b.
-template <class M>
-NMR_INLINE M without(M a, M b) {
-  if constexpr (IsHalves<M>::value)
-    return {without(a.low, b.low), without(a.high, b.high)};
-  else
-#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
-  {
-#if defined(__AVX2__) || NMR_AVX2
-    if constexpr (sizeof(M) == 32) return (M)_mm256_andnot_si256((__m256i)b, (__m256i)a);
-#endif
-    return a & ~b;
-  }
-#else
-    return {a.value & ~b.value};
-#endif
-}
-
-NMR_INLINE int32_t least_lane(Lanes32 v) {
-  const LaneArray<int32_t, Lanes32> each(v);
-  return *std::min_element(each.lane, each.lane + kLanes);
-}
-NMR_INLINE int32_t most_lane(Lanes32 v) {
-  const LaneArray<int32_t, Lanes32> each(v);
-  return *std::max_element(each.lane, each.lane + kLanes);
-}
-
 // --- set-up
 
 // The first and the last of `size` pixels along one axis whose centres lie in [lo, hi]: a face covers no centre
@@ -215,7 +188,9 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
   }
   table.num_front[chunk] = static_cast<int32_t>(num_front);
   table.num_back[chunk] = static_cast<int32_t>(num_back);
-  table.boxes[chunk] = {least_lane(column_first), most_lane(column_last), least_lane(row_first), most_lane(row_last)};
+  const Lanes32 none = splat(int32_t(0));
+  table.boxes[chunk] = {least_lane<int32_t>(column_first), -least_lane<int32_t>(none - column_last),
+                        least_lane<int32_t>(row_first), -least_lane<int32_t>(none - row_last)};
 }
 
 // --- fill
@@ -365,10 +340,7 @@ NMR_INLINE void bound_blocks(const Band<T>& band, const Window& window, int64_t 
         row += band.stride;
         least = min_of(load_lanes<Lanes<T>>(row), least);
       }
-      const LaneArray<T, Lanes<T>> each(least);
-      T smallest = each.lane[0];
-      for (int64_t k = 1; k < kLanes; ++k) smallest = each.lane[k] < smallest ? each.lane[k] : smallest;
-      block_least[(j / kLanes) * blocks + n] = smallest;
+      block_least[(j / kLanes) * blocks + n] = least_lane<T>(least);
     }
 }
 

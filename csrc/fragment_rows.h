@@ -1,7 +1,5 @@
 // The inner loops of fragments and depth images; included by levels.h for every instruction set. See fragments.cpp.
 
-#include "visible.h"
-
 // --- the faces of a block
 
 // Numbers the block's visible faces and fills in the table. Entry 0, of the background, has weights (1, 0, 0) and
@@ -9,20 +7,18 @@
 template <class T>
 NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& scratch) {
   const int64_t W = block.raster.width, F = block.num_faces;
-  int32_t *ids = scratch.ids.data(), *slots = scratch.slots.data() + 1;
-  mark_visible(block.face_index + block.first * W, (block.last - block.first) * W, F, scratch.seen.data());
-  scratch.count = list_visible(F, scratch.seen.data(), ids);
-  slots[-1] = 0;
+  scratch.visible.find(block.face_index + block.first * W, (block.last - block.first) * W, F);
+  const int32_t* ids = scratch.visible.ids.data() + 1;
+  const int64_t count = scratch.visible.count - 1;
   T* table = scratch.table.data();
   for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
   const Lanes<T> width = splat(static_cast<T>(W)), height = splat(static_cast<T>(block.raster.height));
-  for (int64_t start = 0; start < scratch.count; start += kLanes) {
-    const int64_t last = scratch.count - 1;
+  for (int64_t start = 0; start < count; start += kLanes) {
+    const int64_t last = count - 1;
     T corner[3][3][kLanes];  // x, y, z of the corners
     for (int64_t n = 0; n < kLanes; ++n) {
       const int64_t at = std::min(start + n, last);  // the last face fills the vector
       const int32_t id = ids[at];
-      slots[id] = static_cast<int32_t>(at + 1);
       const bool reversed = id >= F;
       const int64_t* face = block.faces + 3 * (reversed ? id - F : id);
       for (int k = 0; k < 3; ++k)
@@ -62,19 +58,11 @@ struct FragmentPixels {
   int64_t slot[kLanes];
 };
 
-// Face indices of the pixels [i, i + 8) of a row of the raster; background beyond its end.
-NMR_INLINE Lanes32 load_face_indices(const int32_t* row, int64_t i, int64_t width) {
-  if (i + kLanes <= width) return load_lanes<Lanes32>(row + i);
-  int32_t rest[kLanes];
-  for (int64_t n = 0; n < kLanes; ++n) rest[n] = i + n < width ? row[i + n] : -1;
-  return load_lanes<Lanes32>(rest);
-}
-
 // Weights and depths of the pixels [i, i + 8) with these face indices, in the row of pixel coordinate y.
 template <class T>
 NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32 ids, int64_t i, Lanes<T> y) {
   FragmentPixels<T> p;
-  const LaneArray<int32_t, Lanes32> slots(gather_lanes(scratch.slots.data() + 1, ids));
+  const LaneArray<int32_t, Lanes32> slots(gather_values(scratch.visible.slots.data() + 1, ids));
   const T* entry[kLanes];
   for (int64_t n = 0; n < kLanes; ++n) {
     p.slot[n] = slots.lane[n];
@@ -209,17 +197,12 @@ NMR_INLINE Lanes<T> depth_or_zero(Lanes<T> z) {
   return keep(absolute<T>(z) < splat(sizeof(T) == sizeof(double) ? T(1e100) : T(1e15)), z);
 }
 
-// Adds four numbers per pixel to those of its face: lane k of the columns to sums[stride slot[k] + 0 .. 3].
+// Adds four numbers per pixel to those of its face, of which there are `stride` per face.
 template <class T>
-NMR_INLINE void add_quads(const Lanes<T> (&column)[4], const int64_t (&slot)[kLanes], int64_t stride, T* sums) {
-  T term[kLanes][4];
-  store_quads<T>(column, term);
-  for (int64_t n = 0; n < kLanes; ++n) {
-    T* sum = sums + stride * slot[n];
-    T total[4];
-    for (int c = 0; c < 4; ++c) total[c] = sum[c] + term[n][c];
-    std::copy_n(total, 4, sum);
-  }
+NMR_INLINE void add_to_faces(const Lanes<T> (&column)[4], const FragmentPixels<T>& p, int64_t stride, T* sums) {
+  T* at[kLanes];
+  for (int64_t n = 0; n < kLanes; ++n) at[n] = sums + stride * p.slot[n];
+  add_quads<T>(column, at);
 }
 
 // Columns of the numbers of the faces [slot, slot + 8) in an array with `stride` numbers per face.
@@ -248,10 +231,10 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
                           FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t W = block.raster.width, w = args.image.width;
   set_up_faces(block, scratch);
-  result.list(scratch.ids.data(), scratch.count);
+  result.list(scratch.visible.ids.data() + 1, scratch.visible.count - 1);
   T *grad = scratch.rows.data(), *sums = scratch.sums.data();
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));
-  std::fill_n(sums, 4 * (scratch.count + 1 + kLanes), T(0));
+  std::fill_n(sums, 4 * (scratch.visible.count + kLanes), T(0));
   std::fill_n(grad + W, kLanes, T(0));
   for (int64_t j = block.first; j < block.last; ++j) {
     const T* upstream = args.grad_depth + b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
@@ -266,13 +249,13 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
           const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
           const Lanes<T> z = scratch.perspective ? depth_or_zero<T>(p.z) : one;
           const Lanes<T> c = load_lanes<Lanes<T>>(grad + i) * z * z;
-          add_quads<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p.slot, 4, sums);
+          add_to_faces<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p, 4, sums);
         },
         [](int64_t) {});
   }
   const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
                  half_height = splat(static_cast<T>(block.raster.height) / 2);
-  for (int64_t slot = 1; slot <= scratch.count; slot += kLanes) {
+  for (int64_t slot = 1; slot < scratch.visible.count; slot += kLanes) {
     Lanes<T> sum[4], mx[4], my[4], z[4], out[9];
     const T* table = scratch.table.data();
     load_face_quads<T>(sums, slot, 4, sum);
@@ -301,10 +284,10 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
                               FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t W = block.raster.width;
   set_up_faces(block, scratch);
-  result.list(scratch.ids.data(), scratch.count);
+  result.list(scratch.visible.ids.data() + 1, scratch.visible.count - 1);
   T* sums = scratch.sums.data();
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));
-  std::fill_n(sums, 12 * (scratch.count + 1 + kLanes), T(0));
+  std::fill_n(sums, 12 * (scratch.visible.count + kLanes), T(0));
   for (int64_t j = block.first; j < block.last; ++j) {
     const int64_t row = b * block.raster.pixels() + j * W;
     for_covered(
@@ -339,13 +322,13 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
             for (int m = 0; m < 3; ++m) h[m] = h[m] + scale * (u[m] - mean);
           }
           for (int m = 0; m < 3; ++m)
-            add_quads<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p.slot, 12, sums + 4 * m);
+            add_to_faces<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p, 12, sums + 4 * m);
         },
         [](int64_t) {});
   }
   const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
                  half_height = splat(static_cast<T>(block.raster.height) / 2);
-  for (int64_t slot = 1; slot <= scratch.count; slot += kLanes) {
+  for (int64_t slot = 1; slot < scratch.visible.count; slot += kLanes) {
     Lanes<T> sum[3][4], mx[4], my[4], z[4], slope_x[3], slope_y[3], out[9];
     const T* table = scratch.table.data();
     for (int m = 0; m < 3; ++m) load_face_quads<T>(sums + 4 * m, slot, 12, sum[m]);

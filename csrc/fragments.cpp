@@ -24,14 +24,10 @@ constexpr int64_t kTogether = 8;  // faces or pixels that are worked on together
 // Numbers per face in the table: columns 0, 1, 2 of M and the depths, each padded to four.
 constexpr int64_t kEntry = 16;
 
-// Memory for one block. Faces that own a pixel are numbered from 1, ascending; the background is number 0.
+// Memory for one block.
 template <class T>
 struct FragmentScratch {
-  std::vector<uint8_t> seen;   // [2 F + 1 + 8] of mark_visible
-  // [2 F + 1] number of face index id at [id + 1]; defined for visible faces and background.
-  std::vector<int32_t> slots;
-  std::vector<int32_t> ids;    // [visible + 8] face index of face n at [n - 1]
-  int64_t count;               // visible faces
+  VisibleFaces visible;
   std::vector<T> table;        // [visible + 1 + 8, kEntry]
   std::vector<T> rows;         // [2, W + 8] a row of depths or gradients each
   std::vector<T> sums;         // [visible + 1 + 8, 4 or 12] gradients per face
@@ -40,9 +36,7 @@ struct FragmentScratch {
   void reserve_for(int64_t num_faces, const RowBlocks& blocks, bool has_perspective) {
     const int64_t most = blocks.most_visible(num_faces);
     perspective = has_perspective;
-    reserve(seen, 2 * num_faces + 1 + kTogether);
-    reserve(slots, 2 * num_faces + 1);
-    reserve(ids, most + kTogether);
+    visible.reserve_for(num_faces, most);
     reserve(table, (most + 1 + kTogether) * kEntry);
     reserve(rows, 2 * (blocks.raster.width + kTogether));
   }

@@ -78,24 +78,6 @@ NMR_INLINE T clamp_weight(T w) {
   return w < 1 ? w : T(1);
 }
 
-// Coordinate t of the infinite line A-B at the scan coordinate s = n.
-template <class T>
-NMR_INLINE T line_height(T as, T at, T bs, T bt, T n) {
-  return (bt - at) / (bs - as) * (n - as) + at;
-}
-
-// The last pixel of a sweep into a face, before it leaves the face on the far side. The sweep goes towards smaller t if
-// d > 0, towards larger t if d < 0. The result lies in [-1, R]. As published: rounded towards the inner pixel, clamped;
-// NaN becomes 0.
-template <class T>
-NMR_INLINE int64_t sweep_limit(T far_side, int64_t d, int64_t R) {
-  const T t = d > 0 ? std::ceil(far_side) : std::floor(far_side);
-  if (!(t == t)) return 0;
-  if (t <= -1) return -1;
-  if (t >= static_cast<T>(R)) return R;
-  return static_cast<int64_t>(t);
-}
-
 template <class T>
 NMR_INLINE T min3(T a, T b, T c) {
   const T ab = a < b ? a : b;

@@ -35,6 +35,7 @@ struct LayerBand {
 }  // namespace
 }  // namespace nmr
 
+#define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "fill_layers.h"
 #include "levels.h"
 

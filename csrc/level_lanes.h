@@ -205,10 +205,43 @@ NMR_INLINE V choose(M mask, V yes, V no) {
   return select(mask, yes, no);
 }
 
+// a & ~b: lanes of a that are not set in b.
+template <class M>
+NMR_INLINE M without(M a, M b) {
+  if constexpr (IsHalves<M>::value)
+    return {without(a.low, b.low), without(a.high, b.high)};
+  else
+#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
+  {
+#if defined(__AVX2__) || NMR_AVX2
+    if constexpr (sizeof(M) == 32) return (M)_mm256_andnot_si256((__m256i)b, (__m256i)a);
+#endif
+    return a & ~b;
+  }
+#else
+    return {a.value & ~b.value};
+#endif
+}
+
 // |x|
 template <class T>
 NMR_INLINE Lanes<T> absolute(Lanes<T> x) {
   return max_of(x, splat(T(0)) - x);
+}
+
+// The smallest lane.
+template <class E>
+NMR_INLINE E least_lane(Lanes<E> v) {
+#if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<E, float>) {
+    const __m128 four = _mm_min_ps(_mm256_castps256_ps128((__m256)v), _mm256_extractf128_ps((__m256)v, 1));
+    const __m128 two = _mm_min_ps(four, _mm_movehl_ps(four, four));
+    return _mm_cvtss_f32(_mm_min_ss(two, _mm_movehdup_ps(two)));
+  }
+#endif
+  E each[kLanes];
+  store_lanes(each, v);
+  return *std::min_element(each, each + kLanes);
 }
 
 // to_pixel of geometry.h
@@ -294,45 +327,15 @@ NMR_INLINE uint32_t lane_bits(M mask) {
   }
 }
 
-// p[offset[0]], ..., p[offset[7]]
-NMR_INLINE Lanes32 gather_lanes(const int32_t* p, Lanes32 offset) {
-#if defined(__AVX2__) || NMR_AVX2
-  return (Lanes32)_mm256_i32gather_epi32(p, (__m256i)offset, 4);
-#else
-  int32_t at[kLanes], value[kLanes];
-  store_lanes(at, offset);
-  for (int64_t k = 0; k < kLanes; ++k) value[k] = p[at[k]];
-  return load_lanes<Lanes32>(value);
-#endif
-}
-
-// The bytes of a word, the lowest in lane 0.
-NMR_INLINE Lanes32 byte_lanes(uint64_t bytes) {
-#if defined(__AVX2__) || NMR_AVX2
-  return (Lanes32)_mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(bytes)));
-#else
-  int32_t value[kLanes];
-  for (int64_t k = 0; k < kLanes; ++k) value[k] = static_cast<int32_t>(bytes >> 8 * k & 0xff);
-  return load_lanes<Lanes32>(value);
-#endif
-}
-
-// p[offset[0]], ..., p[offset[7]] of values.
+// p[offset[0]], ..., p[offset[7]]. Eight loads: the gather instructions of x86-64 are slower.
 template <class T>
 NMR_INLINE Lanes<T> gather_values(const T* p, const int32_t* offset) {
-#if defined(__AVX2__) || NMR_AVX2
-  if constexpr (std::is_same_v<T, float>)
-    return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)load_lanes<Lanes32>(offset), 4);
-#endif
   T value[kLanes];
   for (int64_t k = 0; k < kLanes; ++k) value[k] = p[offset[k]];
   return load_lanes<Lanes<T>>(value);
 }
 template <class T>
 NMR_INLINE Lanes<T> gather_values(const T* p, Lanes32 offset) {
-#if defined(__AVX2__) || NMR_AVX2
-  if constexpr (std::is_same_v<T, float>) return (Lanes<T>)_mm256_i32gather_ps(p, (__m256i)offset, 4);
-#endif
   int32_t at[kLanes];
   store_lanes(at, offset);
   return gather_values(p, at);
@@ -355,13 +358,16 @@ constexpr SetBits kSetBits;
 
 // Writes the lanes whose bit is set to out, one after the other, and anything to the rest of out[0..7]; returns how
 // many are set.
-NMR_INLINE int64_t compress_lanes(Lanes32 v, uint32_t bits, int32_t* out) {
+template <class E>
+NMR_INLINE int64_t compress_lanes(Lanes<E> v, uint32_t bits, E* out) {
 #if defined(__AVX2__) || NMR_AVX2
-  const __m256i order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(kSetBits.entry[bits])));
-  store_lanes(out, _mm256_permutevar8x32_epi32((__m256i)v, order));
-  return __builtin_popcount(bits);
-#else
-  int32_t value[kLanes];
+  if constexpr (sizeof(E) == 4) {
+    const __m256i order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(kSetBits.entry[bits])));
+    store_lanes(out, _mm256_permutevar8x32_epi32((__m256i)v, order));
+    return __builtin_popcount(bits);
+  }
+#endif
+  E value[kLanes];
   store_lanes(value, v);
   int64_t count = 0;
   for (int64_t k = 0; k < kLanes; ++k) {
@@ -369,7 +375,6 @@ NMR_INLINE int64_t compress_lanes(Lanes32 v, uint32_t bits, int32_t* out) {
     count += bits >> k & 1;
   }
   return count;
-#endif
 }
 
 // floor(x), for x in the range of int32
@@ -401,20 +406,20 @@ NMR_INLINE void transpose_quads(__m256d (&q)[4]) {
 #endif
 #endif
 
-// Four numbers per lane: column[c] gets row[k][c] in lane k.
+// Four numbers of four or eight bytes per lane: column[c] gets row[k][c] in lane k.
 template <class T>
 NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4]) {
 #if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
-  if constexpr (std::is_same_v<T, float>) {
+  if constexpr (sizeof(T) == 4) {
+    const auto quad = [&](int64_t k) { return _mm_loadu_ps(reinterpret_cast<const float*>(row[k])); };
 #if defined(__AVX2__) || NMR_AVX2
     __m256 q[4];
-    for (int k = 0; k < 4; ++k)
-      q[k] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row[k])), _mm_loadu_ps(row[k + 4]), 1);
+    for (int k = 0; k < 4; ++k) q[k] = _mm256_insertf128_ps(_mm256_castps128_ps256(quad(k)), quad(k + 4), 1);
     transpose_quads(q);
     for (int c = 0; c < 4; ++c) column[c] = (Lanes<T>)q[c];
 #else
     __m128 low[4], high[4];
-    for (int k = 0; k < 4; ++k) low[k] = _mm_loadu_ps(row[k]), high[k] = _mm_loadu_ps(row[k + 4]);
+    for (int k = 0; k < 4; ++k) low[k] = quad(k), high[k] = quad(k + 4);
     transpose_quads(low);
     transpose_quads(high);
     for (int c = 0; c < 4; ++c) {
@@ -425,7 +430,7 @@ NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4])
     return;
   }
 #if defined(__AVX2__) || NMR_AVX2
-  if constexpr (std::is_same_v<T, double>) {
+  if constexpr (sizeof(T) == 8) {
     __m256d low[4], high[4];
     for (int k = 0; k < 4; ++k) low[k] = _mm256_loadu_pd(row[k]), high[k] = _mm256_loadu_pd(row[k + 4]);
     transpose_quads(low);
@@ -489,6 +494,26 @@ NMR_INLINE void store_quads(const Lanes<T> (&column)[4], T (&rows)[kLanes][4]) {
   for (int c = 0; c < 4; ++c) store_lanes(value[c], column[c]);
   for (int64_t k = 0; k < kLanes; ++k)
     for (int c = 0; c < 4; ++c) rows[k][c] = value[c][k];
+}
+
+// Adds four numbers per lane: lane k of the columns to sums[k][0 .. 3].
+template <class T>
+NMR_INLINE void add_quads(const Lanes<T> (&column)[4], T* const (&sums)[kLanes]) {
+  T term[kLanes][4];
+  store_quads<T>(column, term);
+  for (int64_t n = 0; n < kLanes; ++n) {
+    T total[4];
+    for (int c = 0; c < 4; ++c) total[c] = sums[n][c] + term[n][c];
+    std::copy_n(total, 4, sums[n]);
+  }
+}
+
+// Face indices of the pixels [i, i + 8) of a line of pixels; background beyond its end.
+NMR_INLINE Lanes32 load_face_indices(const int32_t* line, int64_t i, int64_t length) {
+  if (i + kLanes <= length) return load_lanes<Lanes32>(line + i);
+  int32_t rest[kLanes];
+  for (int64_t n = 0; n < kLanes; ++n) rest[n] = i + n < length ? line[i + n] : -1;
+  return load_lanes<Lanes32>(rest);
 }
 
 // Lanes of a vector as an array, for code that treats them one by one.

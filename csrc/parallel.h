@@ -30,9 +30,9 @@
 namespace nmr {
 
 // Number of the lowest bit that is set; bits must not be 0.
-NMR_INLINE int64_t lowest_bit(uint32_t bits) {
+NMR_INLINE int64_t lowest_bit(uint64_t bits) {
 #if defined(__GNUC__)
-  return __builtin_ctz(bits);
+  return __builtin_ctzll(bits);
 #else
   int64_t n = 0;
   while (!(bits >> n & 1)) ++n;

@@ -27,6 +27,7 @@ struct SmoothnessScratch {
 }  // namespace
 }  // namespace nmr
 
+#define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "smoothness_lanes.h"
 #include "levels.h"
 

@@ -108,6 +108,7 @@ struct SoftBand {
 }  // namespace
 }  // namespace nmr
 
+#define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "soft_faces.h"
 #include "levels.h"
 

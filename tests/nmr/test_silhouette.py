@@ -124,13 +124,16 @@ def test_running_out_of_memory_is_an_exception():
     code = (
         "import resource, torch, nmr\n"
         "torch.set_num_threads(2)\n"
-        "v, f = nmr.icosphere(1); v = (v * .3 + torch.tensor([0, 0, 2.])).repeat(2, 1, 1)\n"
-        "v.requires_grad_(); nmr.render_silhouette(v, f, image_size=64).sum().backward()\n"
+        "def meshes(n):\n"
+        "    v, f = nmr.icosphere(n)\n"
+        "    return (v * .3 + torch.tensor([0, 0, 2.])).repeat(2, 1, 1).requires_grad_(), f\n"
+        "small, large = meshes(1), meshes(7)\n"
+        "nmr.render_silhouette(*small, image_size=64).sum().backward()\n"
         "held = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (held + 2**28, -1))\n"  # the gradient takes more
-        "try: nmr.render_silhouette(v, f, image_size=2048).sum().backward()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (held + 2**24, -1))\n"  # a table of 327,680 faces takes more
+        "try: nmr.render_silhouette(*large, image_size=64).sum().backward()\n"
         "except (MemoryError, RuntimeError): print('refused')\n"
-        "nmr.render_silhouette(v, f, image_size=64); print('alive')"
+        "nmr.render_silhouette(*small, image_size=64); print('alive')"
     )
     if sys.platform != "linux":
         pytest.skip("sets RLIMIT_AS")

@@ -1,32 +1,30 @@
-// NMR's gradient of an image with any number of channels. For every edge of a visible face and every raster line that
-// crosses it, let c be the crossing, `in` the pixel just inside and `out` the pixel just outside:
-//   outside: if the face owns `in`, each pixel m from `out` to the border would become I(in) if the edge moved out
-//            to it;
-//   inside:  each pixel m of the face would become I(out) if the edge moved in past it.
-// If this lowers the loss, D = sum over channels of (I(m) - I(in or out)) g(m) > 0, then m pulls both ends of the edge
-// with D / (distance they must travel). Lines of constant x (axis 0) move y, lines of constant y (axis 1) move x. If a
-// gradient of an image is not finite, those of the corners of all its visible faces are NaN.
+// From the raster to the image: coverage of a face index map, and pixels.
 #include <algorithm>
-#include <cmath>
 #include <cstdint>
-#include <cstring>
-#include <limits>
 #include <vector>
 
-#include "scanline_colors.h"
 #include "corner_values.h"
-#include "geometry.h"
 #include "parallel.h"
-#include "scanline_grads.h"
 #include "stages.h"
-#include "swept_image.h"
-
-#define NMR_LEVEL_FILE "color_sweep.h"
-#include "levels.h"
 
 namespace nmr {
 
 namespace {
+
+constexpr int64_t kBandPixels = int64_t(1) << 16;  // of an image, that one task averages
+
+// alpha [h, w]: the covered share of each pixel of an image whose face index map has twice its size.
+template <class T>
+void average_coverage(const int32_t* face_index, Size image, T* alpha) {
+  for (int64_t y = 0; y < image.height; ++y, alpha += image.width) {
+    const int32_t *upper = face_index + 4 * y * image.width, *lower = upper + 2 * image.width;
+    for (int64_t x = 0; x < image.width; ++x) {
+      const int upper_covered = (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
+      const int lower_covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0);
+      alpha[x] = T(0.25) * static_cast<T>(upper_covered + lower_covered);
+    }
+  }
+}
 
 // A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the background and the
 // mean of four background pixels [2, C], or nullptr. kChannels: C, or 0 if it is known only at run time.
@@ -69,6 +67,24 @@ NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, i
 }
 
 }  // namespace
+
+// Bands of rows of all images in parallel.
+template <class T>
+void silhouette_forward(const SilhouetteForward<T>& args) {
+  const Size image = args.image, raster = raster_of(image, args.anti_aliasing);
+  const int64_t bands = std::min(image.height, image.pixels() / kBandPixels + 1);
+  parallel_for(args.batch * bands, args.num_threads, [&](int64_t n) {
+    const int64_t b = n / bands, k = n % bands, first = k * image.height / bands;
+    const Size band{(k + 1) * image.height / bands - first, image.width};
+    const int32_t* face_index = args.face_index + b * raster.pixels() + first * (raster.pixels() / image.height);
+    T* alpha = args.alpha + b * image.pixels() + first * image.width;
+    if (!args.anti_aliasing) {
+      for (int64_t i = 0; i < band.pixels(); ++i) alpha[i] = face_index[i] >= 0 ? T(1) : T(0);
+      return;
+    }
+    average_coverage(face_index, band, alpha);
+  });
+}
 
 // The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, if it is given.
 template <class T>
@@ -121,77 +137,11 @@ void resolve_backward(const Resolve<T>& args) {
     });
 }
 
-namespace {
-
-template <class T>
-struct EdgeLines {
-  ScanlineColors<T> lines[2];  // [0] columns: lines of constant x, swept along y; [1] rows
-};
-
-template <class T>
-void edges_backward_image(const EdgesBackward<T>& args, int64_t b, int num_threads) {
-  const Size raster = raster_of(args.image, args.anti_aliasing);
-  const int64_t H = raster.height, W = raster.width, C = args.channels;
-  ScanlineColors<T>* lines = thread_scratch<EdgeLines<T>>().lines;
-  const ColorImage<T> image{args.mesh.image_vertices(b),
-                            args.mesh.image_faces(b),
-                            args.mesh.face_count(b),
-                            raster,
-                            args.image,
-                            args.anti_aliasing,
-                            args.eps,
-                            args.face_index + b * raster.pixels(),
-                            args.pixels + b * raster.pixels() * C,
-                            args.background ? args.background + (args.background_batch == 1 ? 0 : b * C) : nullptr,
-                            args.grad_resolved + b * args.image.pixels() * C,
-                            C,
-                            lines,
-                            args.eps > T(1e-15) ? T(1e15) : T(0)};
-  T* grad_vertices = args.grad_vertices + 3 * args.mesh.vertex_start(b);
-  std::fill_n(grad_vertices, 3 * args.mesh.vertex_count(b), T(0));
-  lines[0].reserve_lines(0, W, H, C);
-  lines[1].reserve_lines(1, H, W, C);
-  sweep_image(
-      image, num_threads,
-      [&](int64_t first, int64_t last, uint8_t* seen) {
-        NMR_AT_BEST_LEVEL(mark_visible, image.face_index + first, last - first, image.num_faces, seen);
-      },
-      [&](uint8_t* seen, int32_t* ids) { return NMR_AT_BEST_LEVEL(list_visible, image.num_faces, seen, ids); },
-      [&] { return NMR_AT_BEST_LEVEL(all_finite, image.grad_resolved, args.image.pixels() * C); },
-      [&] {  // on several threads: bands of columns, then bands of rows
-        const int64_t band = band_width(std::max(H, W), num_threads), column_bands = (W + band - 1) / band;
-        const auto part = [band](int64_t k, int64_t lines) { return std::min(k * band, lines); };
-        parallel_for(num_threads > 1 ? column_bands + (H + band - 1) / band : 1, num_threads, [&](int64_t n) {
-          T* grad_row = reserve(thread_scratch<SweepTask<T>>().grad_row, C * (W + kPad));
-          const int64_t k = n - column_bands;  // number of a band of rows
-          const LineRange range = num_threads <= 1 ? LineRange{0, H, 0, W}
-                                  : k < 0          ? LineRange{0, 0, part(n, W), part(n + 1, W)}
-                                                   : LineRange{part(k, H), part(k + 1, H), 0, 0};
-          NMR_AT_BEST_LEVEL(collect_colors, image, range, grad_row);
-        });
-      },
-      [&](const int32_t* ids, int64_t first, int64_t last, SweepScratch<T>& block, T* grad) {
-        NMR_AT_BEST_LEVEL(sweep_color_faces, image, ids, first, last, block, grad);
-      },
-      grad_vertices);
-}
-
-}  // namespace
-
-template <class T>
-void edges_backward(const EdgesBackward<T>& args) {
-  // Few images: all threads share the lines and faces of one image. Each face has its own sum, so the result is the
-  // same.
-  const bool share_images = args.mesh.batch < args.num_threads;
-  parallel_for(args.mesh.batch, share_images ? 1 : args.num_threads,
-               [&](int64_t b) { edges_backward_image(args, b, share_images ? args.num_threads : 1); });
-}
-
+template void silhouette_forward(const SilhouetteForward<float>&);
+template void silhouette_forward(const SilhouetteForward<double>&);
 template void resolve_forward(const Resolve<float>&);
 template void resolve_forward(const Resolve<double>&);
 template void resolve_backward(const Resolve<float>&);
 template void resolve_backward(const Resolve<double>&);
-template void edges_backward(const EdgesBackward<float>&);
-template void edges_backward(const EdgesBackward<double>&);
 
 }  // namespace nmr

@@ -1,0 +1,348 @@
+// NMR's gradient (Kato et al. 2018) of a silhouette, or of an image with any number of channels. For every edge of a
+// visible face and every line of pixels (a column or a row) that crosses it, let c be the crossing, `inner` the pixel
+// just inside and `outer` the pixel just outside:
+//   outside: if the face owns `inner`, each pixel m from `outer` to the border would become I(inner) if the edge moved
+//            out to it;
+//   inside:  each pixel m of the face would become I(outer) if the edge moved in past it.
+// If this lowers the loss, D = sum over channels of (I(m) - I(inner or outer)) g(m) > 0, then m pulls both ends of the
+// edge with D / (distance they must travel). A silhouette is an image with I = 1 on faces and 0 on the background.
+// Columns move y, rows move x. If a gradient of an image is not finite, those of all its visible faces are NaN.
+//
+// Only faces that own a pixel of a line have a part in it. So the work goes by runs: the longest stretches of pixels
+// of a line with one face. Runs come in the order of the line, and eight of them share its list of pulling pixels.
+// Columns are the rows of the transposed face index map.
+//
+// With s the coordinate across the lines and t along them, edge P-Q crosses line n of M pixels at
+//   c = (Qt - Pt) / (Qs - Ps) (n - Ps) + Pt.
+// If P moves by 1 (in [-1, 1] coordinates), c moves by r = (Qs - n) / (Qs - Ps) M / 2 pixels; so P must travel
+// |m - c| / |r| to reach m. `eps` is added to that, and D / (|m - c| / |r| + eps) = D |r| / (|m - c| + eps |r|).
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+#include "blocks.h"
+#include "corner_values.h"
+#include "geometry.h"
+#include "parallel.h"
+#include "stages.h"
+
+namespace nmr {
+namespace {
+
+constexpr int64_t kCoverage = -1;  // in place of a number of channels: a silhouette
+constexpr int64_t kGroup = 16;     // lines that are read together: columns of one cache line
+constexpr int64_t kPad = 8;        // values behind the pixels of a line that vectors may touch
+constexpr int64_t kEntry = 16;     // numbers per face: x of its corners in pixels, y, gradients of x, of y; four of each
+
+// Pixels first, ..., last - 1 of a line.
+struct PixelRange {
+  int64_t first, last;
+};
+
+// The columns and the rows (from the top) that contain the vertices, and so all that is drawn; within the raster.
+struct Reach {
+  PixelRange columns, rows;
+};
+
+template <class T>
+Reach reach_of(const T* vertices, int64_t count, Size raster) {
+  T low[2] = {2, 2}, high[2] = {-2, -2};
+  for (int64_t v = 0; v < count; ++v)
+    for (int k = 0; k < 2; ++k) {
+      low[k] = std::min(low[k], vertices[3 * v + k]);
+      high[k] = std::max(high[k], vertices[3 * v + k]);
+    }
+  const auto pixels = [](T from, T to, int64_t size) {  // one more on both sides
+    const T n = static_cast<T>(size), first = to_pixel(std::max(from, T(-2)), n), last = to_pixel(std::min(to, T(2)), n);
+    return PixelRange{std::clamp<int64_t>(static_cast<int64_t>(first) - 1, 0, size),
+                      std::clamp<int64_t>(static_cast<int64_t>(last) + 3, 0, size)};
+  };
+  return {pixels(low[0], high[0], raster.width), pixels(-high[1], -low[1], raster.height)};
+}
+
+// One image.
+template <class T>
+struct EdgeImage {
+  const T* vertices;
+  const int64_t* faces;
+  int64_t num_faces;
+  Size raster, size;  // H x W, and that of the image
+  bool anti_aliasing;
+  T eps;
+  const int32_t* face_index;  // [H, W]
+  const T* grad;              // [h, w, C]
+  int64_t channels;           // C; 1 of a silhouette
+  const T* pixels;            // [H, W, C], or nullptr: a silhouette
+  const T* background;        // [C] the colour of pixels without a face, or nullptr: that in `pixels`
+  Reach reach;
+};
+
+// Up to kGroup lines: columns, or rows from the top.
+struct LineRange {
+  int64_t first, count;
+  bool columns;
+};
+
+// First and last pixels of runs; their face indices, then the numbers of these faces in EdgeSums. Each line's runs are
+// filled up to a multiple of eight by runs of the background.
+struct RunList {
+  int32_t *first, *last, *face;
+};
+
+// A group of lines of M pixels, upwards or to the right, and its runs.
+template <class T>
+struct LineGroup {
+  LineRange lines;
+  int64_t length, stride;     // M; stride: between the lines of colours and gradients
+  PixelRange window;          // where faces can be; whole vectors
+  const int32_t* face_index;  // [count, face_stride]
+  int64_t face_stride;
+  RunList runs;
+  int64_t* runs_end;      // [count] the end of each line's
+  int32_t* transposed;    // [count, stride] memory for columns
+  T *colors, *grads;      // [count, C, stride]; with anti-aliasing, two lines share their gradients
+  T* half_grads;          // with anti-aliasing: [count / 2, C, stride] gradients of the image
+};
+
+// One line.
+template <class T>
+struct EdgeLine {
+  const int32_t* face_index;         // [M]
+  const T *colors, *grads;           // [C, stride]; 0 behind the pixels
+  int64_t length, stride, channels;  // M, C
+  bool columns;
+  T number, eps;    // number: of the column, or of the row from the bottom
+  int64_t pulling;  // number of pixels in its list
+  bool gains;       // a pixel of a face can pull an edge inwards
+};
+
+// The pixels of a line that pull edges from outside, in order.
+template <class T>
+struct PixelList {
+  T *position, *weight;  // weight: of a silhouette
+  int32_t* pixel;        // of an image: the number of the pixel
+  T* near_colors;        // [C, 8] scratch
+};
+
+// The faces that own a pixel of one task, numbered as they are met; the background is number 0.
+template <class T>
+struct EdgeSums {
+  std::vector<int32_t> ids;  // face indices
+  Buffer<T> entries;         // [faces, kEntry], corners in drawing order
+  int64_t count;
+};
+
+template <class T>
+struct EdgeScratch {
+  std::vector<int32_t> numbers;  // [2 F + 1] number of face index id at [id + 1]; -1: not met yet
+  Buffer<int32_t> transposed, run_first, run_last, run_face;
+  Buffer<T> colors, grads, half_grads;
+  std::vector<int64_t> runs_end;
+  std::vector<int32_t> pixel;
+  std::vector<T> position, weight, near_colors;
+  PixelList<T> list;
+
+  // Memory for lines of up to `longest` pixels.
+  LineGroup<T> reserve_group(const EdgeImage<T>& image, int64_t longest) {
+    const int64_t C = image.channels, stride = (longest + 7) / 8 * 8 + kPad, size = kGroup * stride;
+    list = {reserve(position, stride + kPad) + kPad, reserve(weight, stride), reserve(pixel, stride),
+            reserve(near_colors, 8 * C)};
+    return {{},
+            0,
+            stride,
+            {},
+            nullptr,
+            0,
+            {reserve(run_first, size), reserve(run_last, size), reserve(run_face, size)},
+            reserve(runs_end, kGroup),
+            reserve(transposed, size),
+            image.pixels ? reserve(colors, size * C) : nullptr,
+            reserve(grads, size * C),
+            image.anti_aliasing ? reserve(half_grads, size * C / 2) : nullptr};
+  }
+};
+
+}  // namespace
+}  // namespace nmr
+
+#define NMR_LEVEL_FILE "edge_runs.h"
+#include "levels.h"
+
+namespace nmr {
+namespace {
+
+// Numbers the faces of `count` runs, and writes the corners of new ones.
+template <class T>
+void number_faces(const EdgeImage<T>& image, const RunList& runs, int64_t count, EdgeScratch<T>& scratch,
+                  EdgeSums<T>& sums) {
+  int32_t *numbers = scratch.numbers.data() + 1, *ids = sums.ids.data(), *face_of_run = runs.face;
+  int32_t found = static_cast<int32_t>(sums.count);
+  for (int64_t r = 0; r < count; ++r) {
+    const int32_t id = face_of_run[r], known = numbers[id], number = known < 0 ? found : known;
+    ids[found] = id;
+    numbers[id] = number;
+    face_of_run[r] = number;
+    found += known < 0;
+  }
+  const T width = static_cast<T>(image.raster.width), height = static_cast<T>(image.raster.height);
+  for (int64_t n = sums.count; n < found; ++n) {
+    T* entry = sums.entries.data() + n * kEntry;
+    const bool reversed = ids[n] >= image.num_faces;
+    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
+    for (int k = 0; k < 3; ++k) {
+      const T* vertex = image.vertices + 3 * face[reversed ? 2 - k : k];
+      entry[k] = to_pixel(vertex[0], width);
+      entry[4 + k] = to_pixel(vertex[1], height);
+    }
+    entry[3] = entry[7] = 0;
+    std::fill_n(entry + 8, 8, T(0));
+  }
+  sums.count = found;
+}
+
+// The tasks of one image: each has a band of rows and a band of columns.
+struct EdgeBands {
+  RowBlocks rows;
+  int64_t columns;  // per task
+
+  EdgeBands(Size raster, int64_t num_faces) : rows(raster, num_faces) {
+    columns = (raster.width + rows.count - 1) / rows.count;
+    columns += columns % 2;
+  }
+  // Lines of a task that faces can reach; whole pairs.
+  LineRange band(int64_t task, bool in_columns, const PixelRange& reached) const {
+    const int64_t width = in_columns ? columns : rows.rows;
+    const int64_t first = std::max(task * width, reached.first / 2 * 2);
+    const int64_t last = std::min(reached.last + reached.last % 2, in_columns ? rows.raster.width : rows.raster.height);
+    return {first, std::min((task + 1) * width, last) - first, in_columns};
+  }
+};
+
+// The sums of one task. If a gradient of the image is not finite, they are NaN.
+template <class T>
+void sum_bands(const EdgeImage<T>& image, const EdgeBands& bands, int64_t task, bool finite, EdgeSums<T>& sums) {
+  const Size raster = image.raster;
+  const int64_t entries = 2 * image.num_faces + 1;
+  const int64_t most =
+      std::min(entries, 1 + bands.rows.rows * raster.width + bands.columns * raster.height);
+  EdgeScratch<T>& scratch = thread_scratch<EdgeScratch<T>>();
+  LineGroup<T> group = scratch.reserve_group(image, std::max(raster.width, raster.height));
+  std::fill_n(reserve(scratch.numbers, entries), entries, -1);
+  reserve(sums.ids, most + 1);  // one may be written behind the last
+  std::fill_n(reserve(sums.entries, most * kEntry), kEntry, T(0));  // of the background: a point, which no line crosses
+  scratch.numbers[0] = 0;
+  sums.count = 1;
+  for (const bool columns : {false, true}) {
+    const Reach& reach = image.reach;
+    const LineRange band = bands.band(task, columns, columns ? reach.columns : reach.rows);
+    const PixelRange bottom_up{raster.height - reach.rows.last, raster.height - reach.rows.first};
+    const PixelRange& along = columns ? bottom_up : reach.columns;
+    group.window = {along.first / 8 * 8, (along.last + 7) / 8 * 8};
+    for (int64_t n = 0; n < band.count; n += kGroup) {
+      group.lines = {band.first + n, std::min(kGroup, band.count - n), columns};
+      group.length = columns ? raster.height : raster.width;
+      NMR_AT_BEST_LEVEL(find_group_runs, image, group);
+      const int64_t runs = group.runs_end[group.lines.count - 1];
+      if (runs == 0) continue;
+      number_faces(image, group.runs, runs, scratch, sums);
+      if (!finite) continue;
+      if (!image.pixels)
+        NMR_AT_BEST_LEVEL(pull_group<kCoverage>, image, group, scratch.list, sums.entries.data());
+      else
+        with_channels<T>(image.channels, [&](auto known) {
+          constexpr int64_t kChannels = known();
+          NMR_AT_BEST_LEVEL(pull_group<kChannels>, image, group, scratch.list, sums.entries.data());
+        });
+    }
+  }
+  if (!finite) std::fill_n(sums.entries.data(), sums.count * kEntry, std::numeric_limits<T>::quiet_NaN());
+}
+
+// Gradients of all images; image_of(b) describes one.
+template <class T, class ImageOf>
+void sum_edges(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads, const ImageOf& image_of) {
+  std::vector<char> finite(mesh.batch);
+  std::vector<Reach> reach(mesh.batch);
+  parallel_for(mesh.batch, num_threads, [&](int64_t b) {
+    const EdgeImage<T> image = image_of(b);
+    const int64_t count = image.size.pixels() * image.channels;
+    finite[b] = NMR_AT_BEST_LEVEL(all_finite, image.grad, count);
+    reach[b] = reach_of(image.vertices, mesh.vertex_count(b), raster);
+    std::fill_n(grad_vertices + 3 * mesh.vertex_start(b), 3 * mesh.vertex_count(b), T(0));
+  });
+  const auto bands_of = [&](int64_t b) { return EdgeBands(raster, mesh.face_count(b)); };
+  sum_blocks<EdgeSums<T>>(
+      mesh.batch, false, num_threads, [&](int64_t b) { return bands_of(b).rows.count; },
+      [&](int64_t b, int64_t task, EdgeSums<T>& sums) {
+        EdgeImage<T> image = image_of(b);
+        image.reach = reach[b];
+        sum_bands(image, bands_of(b), task, finite[b], sums);
+      },
+      [&](int64_t b, const EdgeSums<T>& sums) {
+        const int64_t F = mesh.face_count(b);
+        T* grad_image = grad_vertices + 3 * mesh.vertex_start(b);
+        for (int64_t n = 1; n < sums.count; ++n) {  // skips the background
+          const int32_t id = sums.ids[n];
+          const int64_t* face = mesh.image_faces(b) + 3 * (id < F ? id : id - F);
+          const T* grads = sums.entries.data() + n * kEntry + 8;
+          for (int k = 0; k < 3; ++k) {
+            T* grad = grad_image + 3 * face[id < F ? k : 2 - k];
+            grad[0] += grads[k];
+            grad[1] += grads[4 + k];
+          }
+        }
+      });
+}
+
+template <class Args>
+auto edge_image(const Args& args, int64_t b) {
+  using T = decltype(Args::eps);
+  const Size raster = raster_of(args.image, args.anti_aliasing);
+  return EdgeImage<T>{args.mesh.image_vertices(b),
+                      args.mesh.image_faces(b),
+                      args.mesh.face_count(b),
+                      raster,
+                      args.image,
+                      args.anti_aliasing,
+                      args.eps,
+                      args.face_index + b * raster.pixels(),
+                      nullptr,
+                      1,
+                      nullptr,
+                      nullptr,
+                      {}};
+}
+
+}  // namespace
+
+template <class T>
+void silhouette_backward(const SilhouetteBackward<T>& args) {
+  sum_edges(args.mesh, raster_of(args.image, args.anti_aliasing), args.grad_vertices, args.num_threads, [&](int64_t b) {
+    EdgeImage<T> image = edge_image(args, b);
+    image.grad = args.grad_alpha + b * args.image.pixels();
+    return image;
+  });
+}
+
+template <class T>
+void edges_backward(const EdgesBackward<T>& args) {
+  const Size raster = raster_of(args.image, args.anti_aliasing);
+  sum_edges(args.mesh, raster, args.grad_vertices, args.num_threads, [&](int64_t b) {
+    EdgeImage<T> image = edge_image(args, b);
+    image.channels = args.channels;
+    image.grad = args.grad_resolved + b * args.image.pixels() * args.channels;
+    image.pixels = args.pixels + b * raster.pixels() * args.channels;
+    image.background = args.background ? args.background + (args.background_batch == 1 ? 0 : b * args.channels) : nullptr;
+    return image;
+  });
+}
+
+template void silhouette_backward(const SilhouetteBackward<float>&);
+template void silhouette_backward(const SilhouetteBackward<double>&);
+template void edges_backward(const EdgesBackward<float>&);
+template void edges_backward(const EdgesBackward<double>&);
+
+}  // namespace nmr
