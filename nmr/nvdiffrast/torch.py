@@ -37,38 +37,28 @@ __all__ = [
 _LARGEST = 16384  # pixels per side
 # Faces are cut at this part of the largest |w|: nearer points have no finite image in float32.
 _NEAREST = 1e-6
-_log_level = 1
 
 
 def get_log_level() -> int:
-    """The number given to :func:`set_log_level`, 1 at first."""
-    return _log_level
+    """1, whatever was set."""
+    return 1
 
 
 def set_log_level(level: int) -> None:
-    """Keeps the number, for code that sets it; nothing is printed at any level."""
-    global _log_level
-    _log_level = level
+    """Accepted, without effect: nothing is printed at any level."""
 
 
 class RasterizeCudaContext:
-    """Holds nothing but the depth peeler that is active; ``device`` is ignored."""
+    """Accepted in place of a context; its arguments have no effect. It knows the depth peeler that is active."""
 
-    def __init__(self, device: object = None) -> None:
+    def __init__(self, *args: object, **kwargs: object) -> None:
         self.active_depth_peeler = None
 
 
 class RasterizeGLContext(RasterizeCudaContext):
-    """The same under its older name; all arguments are ignored."""
+    """The same under its older name."""
 
-    def __init__(self, output_db: bool = True, mode: str = "automatic", device: object = None) -> None:
-        super().__init__(device)
-
-    def set_context(self) -> None:
-        """Does nothing."""
-
-    def release_context(self) -> None:
-        """Does nothing."""
+    set_context = release_context = lambda self: None
 
 
 # --- rasterize

@@ -359,7 +359,7 @@ def soft_colors(
     dist_eps: float = 1e-4,
     perspective: bool = True,
 ) -> tuple[Tensor, Tensor]:
-    """Soft colours ``[H, W, C]`` of vertex colours ``[V, C]`` and alpha ``[H, W]`` (:func:`nmr.render_soft_rgb`)."""
+    """Soft colours ``[H, W, C]`` of vertex colours ``[V, C]`` and alpha ``[H, W]`` (:func:`nmr.render_soft`)."""
     height, width = raster_size
     units = torch.tensor([width, height], dtype=vertices.dtype) / min(height, width)
     x, y = torch.arange(width).to(vertices), torch.arange(height).to(vertices)
