@@ -35,7 +35,7 @@ class Picture:
     small: bool = False  # made to fit into 320 x 240 pixels
 
 
-_QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py")
+_QUICKSTART = ("tools/quickstart.sh", "learn3d/studio/tables/grids.py")
 _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
@@ -70,7 +70,7 @@ PICTURES = {
     "small-model.png": Picture(
         "python docs/examples/draw_small_model.py --output {folder}",
         "{folder}/small-model.png",
-        ("docs/examples/draw_small_model.py", "learn3d/models/small.safetensors"),
+        ("docs/examples/draw_small_model.py", "learn3d/studio/picture_to_mesh/small.safetensors"),
     ),
     "quickstart.png": Picture("bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART),
     **{
@@ -106,12 +106,12 @@ PICTURES = {
     "results-grid.png": Picture(
         f"learn3d figures grid --truth --images 3 --runs {_THREE} --output {{folder}}/grid.png",
         "{folder}/grid.png",
-        ("learn3d/figures/grids.py",),
+        ("learn3d/studio/tables/grids.py",),
     ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
         "{folder}/tsne.png",
-        ("learn3d/figures/tsne.py",),
+        ("learn3d/studio/tables/tsne.py",),
     ),
 }
 

@@ -19,9 +19,9 @@ import tyro
 
 from learn3d.commands import main
 from learn3d.data.readers import READERS
-from learn3d.experiments.tables import TABLES
 from learn3d.methods.optimization import LRSchedule
 from learn3d.presets import PRESETS
+from learn3d.studio.tables.tables import TABLES
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -158,7 +158,7 @@ def test_every_promise_has_a_test() -> None:
     lines = [line for line in page.splitlines() if line.startswith("|") and not line.startswith(("|---", "| fault"))]
     assert len(lines) > 20
     for line in lines:
-        named = re.findall(r"`((?:\w+/)?test_\w+\.py)::(\w+)`", line.split("|")[3])
+        named = re.findall(r"`((?:\w+/)*test_\w+\.py)::(\w+)`", line.split("|")[3])
         assert named, line
         for file, name in named:
             source = (ROOT / "tests" / "learn3d" / file).read_text()

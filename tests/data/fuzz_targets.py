@@ -23,12 +23,12 @@ import nmr.neural_renderer as nr
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_config
 from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
-from learn3d.experiments.experiment import read_result
 from learn3d.files import formats, sandbox
-from learn3d.make_data import meshes
-from learn3d.make_data.render import DatasetConfig, make_dataset
-from learn3d.pages.report import read_metrics
 from learn3d.runs import checkpoint, log
+from learn3d.studio.make_data import meshes
+from learn3d.studio.make_data.render import DatasetConfig, make_dataset
+from learn3d.studio.tables.experiment import read_result
+from learn3d.studio.tables.report import read_metrics
 
 ERRORS = (ValueError, FileNotFoundError, OSError)  # what a reader may raise
 

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from learn3d.config import config_to_dict
-from learn3d.experiments.measurement import ObjectMeans, Result
-from learn3d.experiments.plan import PlannedRun
 from learn3d.files.writing import write_json
 from learn3d.runs.folder import CONFIG
-from learn3d.runs.tasks import Task
+from learn3d.runs.measurement import ObjectMeans, Result
+from learn3d.studio.tables.plan import PlannedRun
+from learn3d.studio.tasks import Task
 from learn3d.terminal import stop_on_signal
 
 

@@ -21,8 +21,8 @@ from learn3d.data.readers.kar import KAR
 from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.data.readers.r2n2 import R2N2
 from learn3d.evaluation import NO_MMD, evaluate, mean_mmd, spread_samples
-from learn3d.experiments.measurement import class_means, evaluate_runs, format_table
 from learn3d.methods.method import Grids, Meshes
+from learn3d.runs.measurement import class_means, evaluate_runs, format_table
 from nmr.metrics import voxel_iou
 
 

@@ -18,8 +18,8 @@ from learn3d.data.conventions import mesh_to_object
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import LAYOUTS, load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
-from learn3d.make_data.render import DatasetConfig, make_dataset
-from learn3d.make_data.writers import WRITERS
+from learn3d.studio.make_data.render import DatasetConfig, make_dataset
+from learn3d.studio.make_data.writers import WRITERS
 
 
 @pytest.fixture(scope="module")

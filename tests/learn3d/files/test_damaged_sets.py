@@ -16,7 +16,7 @@ from reader_checks import at_most
 
 from learn3d.config import TrainConfig
 from learn3d.data.layouts import check_folder
-from learn3d.make_data.writers import WRITERS
+from learn3d.studio.make_data.writers import WRITERS
 from learn3d.training import train
 
 DAMAGED = {  # what is cut short, and a preset of the layout
