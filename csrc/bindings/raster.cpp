@@ -4,16 +4,22 @@
 namespace nmr {
 namespace {
 
-// A mesh without a vertex behind the plane stays as it is: its counts are left alone.
+// -1 if no mesh has a vertex behind the plane: all stay as they are.
 template <class T>
 void count_clipped(Call& call) {
   const T* vertices = nullptr;
   const T near = static_cast<T>(call.number("near"));
   const bool packed = call.has("starts");
   const Argument& points = call.read(packed ? "vertices [N, 3]" : "vertices [B, V, 3]", vertices);
-  if (!crosses_near(vertices, points.count() / 3, near)) return;
-  ClipCount<T> args{read_mesh<T>(call), near, nullptr, num_threads(call)};
-  call.read("counts [B, 2]", args.counts);
+  ClipCount<T> args{{}, near, nullptr, num_threads(call)};
+  const Argument& counts = call.read("counts [meshes, 2]", args.counts);
+  if (!crosses_near(vertices, points.count() / 3, near)) {
+    for (const char* name : {"faces", "starts"}) call.skip(name);
+    std::fill_n(args.counts, counts.count(), int64_t(-1));
+    return;
+  }
+  args.mesh = read_mesh<T>(call);
+  require(call["B"] == call["meshes"], "counts must have a row per mesh, got " + counts.shape_text());
   clip_count(args);
 }
 

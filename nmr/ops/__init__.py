@@ -1,6 +1,6 @@
 """The torch operators behind the public functions: each is declared once, by ``@kernel`` (``_kernel.py``).
 
-The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors on other devices are copied to the CPU, and
+Kernels read and write the memory of tensors on the CPU. Tensors on other devices are copied to the CPU, and
 the results are copied back. Arguments are checked in the public functions; kernels check shapes and indices again.
 
 A batch of meshes is ``vertices [B, V, 3]`` with ``faces [F, 3]`` or ``[B, F, 3]`` and ``starts=None``, or packed:

@@ -77,21 +77,21 @@ def kernel(
 def _operator(name: str, hints: dict, returned: type, allocate: Callable, results: list[str]) -> Callable:
     """Registers a kernel, its fake (``allocate``) and its vmap rule: one call per item."""
     several, compiled = get_origin(returned) is tuple, getattr(_C, name)
+    names, first = list(hints), next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
 
     def run(*args):
-        device = next(x.device for x in args if isinstance(x, Tensor))
-        on_host = device.type == "cpu"
-        if not on_host:
-            args = [x.cpu() if isinstance(x, Tensor) else x for x in args]
+        device = args[first].device
+        if device.type != "cpu":
+            outputs = run(*(x.cpu() if isinstance(x, Tensor) else x for x in args))
+            return tuple(x.to(device) for x in outputs) if several else outputs.to(device)
         outputs = allocate(*args)
-        given = dict(zip(hints, map(_as_array, args), strict=True))
-        wanted = given.pop("wanted", None) or (True,) * len(results)
-        for result, output, want in zip(results, outputs if several else (outputs,), wanted, strict=True):
-            given[result] = output.numpy() if want else None
+        given = dict(zip(names, args, strict=True))
+        wanted = given.pop("wanted", None)
+        given.update(zip(results, outputs if several else (outputs,), strict=True))
+        if wanted is not None:
+            given.update((result, None) for result, want in zip(results, wanted, strict=True) if not want)
         compiled(**given, num_threads=torch.get_num_threads())
-        if on_host:
-            return outputs
-        return tuple(x.to(device) for x in outputs) if several else outputs.to(device)
+        return outputs
 
     def call(*args):
         if torch.compiler.is_compiling() or not _PLAIN.issuperset(map(type, args)):
@@ -122,11 +122,6 @@ def _operator(name: str, hints: dict, returned: type, allocate: Callable, result
         torch.library.register_vmap(op, one_by_one, lib=_LIBRARY)
     call.op, call.run, call.vmap, call.direct, call.transformed = op, run, one_by_one, None, op
     return call
-
-
-def _as_array(value: object) -> object:
-    """A tensor as a C-contiguous NumPy array, without a copy if it is contiguous."""
-    return value.contiguous().numpy(force=True) if isinstance(value, Tensor) else value
 
 
 def _gradient_is_wanted(args) -> bool:

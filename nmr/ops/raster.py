@@ -34,7 +34,7 @@ def batch_size(vertices: Tensor, starts: Tensor | None) -> int:
 @kernel("counts")
 def clip_count(vertices: Tensor, faces: Tensor, starts: Tensor | None, near: float) -> Tensor:
     """Room that the clipped meshes need: int64 ``[B, 2]``, new vertices and drawn faces; -1 if nothing is cut."""
-    return vertices.new_full((batch_size(vertices, starts), 2), -1, dtype=torch.int64)
+    return vertices.new_empty((batch_size(vertices, starts), 2), dtype=torch.int64)
 
 
 @kernel("drawn_faces source corners ends")
