@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from . import ops
 from ._validate import check_faces, check_vertices, describe
 
 
@@ -174,8 +173,7 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     Tensor [B, F, 3], or [F, 3] for vertices [V, 3]
-        Of length 1; 0 for a face without area. Differentiable once in ``vertices`` (a face without area has no
-        gradient).
+        Of length 1; 0 for a face without area. Differentiable in ``vertices`` (a face without area has no gradient).
 
     Raises
     ------
@@ -188,7 +186,7 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     >>> nmr.face_normals(vertices, faces).shape
     torch.Size([1280, 3])
     """
-    return _normals(vertices, faces, smooth=False)
+    return _unit(_face_cross(face_vertices(vertices, faces)))
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -202,7 +200,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     Tensor like vertices
-        Of length 1; 0 at a vertex that no face with an area touches. Differentiable once in ``vertices``.
+        Of length 1; 0 at a vertex that no face with an area touches. Differentiable in ``vertices``.
 
     Raises
     ------
@@ -215,13 +213,10 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     >>> (nmr.vertex_normals(vertices, faces) * vertices).sum(-1).min() > 0.999
     tensor(True)
     """
-    return _normals(vertices, faces, smooth=True)
-
-
-def _normals(vertices: Tensor, faces: Tensor, smooth: bool) -> Tensor:
     batched = check_vertices(vertices)
     faces = check_faces(faces, batched.shape[0], batched.device)
-    normals = -ops.normals(batched, faces, None, smooth)  # the renderer's point to the other side
+    cross = _face_cross(face_vertices(batched, faces))  # twice the area long
+    normals = _unit(_scatter_sum(cross.repeat_interleave(3, dim=1), faces.flatten(-2), batched.shape[1]))
     return normals if vertices.ndim == 3 else normals.squeeze(0)
 
 
@@ -277,3 +272,9 @@ def _expanded(indices: Tensor, batch: int) -> Tensor:
 def _gather(rows: Tensor, indices: Tensor) -> Tensor:
     """Rows ``[B, N, 3]`` of ``[B, V, 3]``. On a CPU, torch.gather is the fastest way, forward and backward."""
     return torch.gather(rows, 1, _expanded(indices, rows.shape[0]))
+
+
+def _scatter_sum(rows: Tensor, indices: Tensor, count: int) -> Tensor:
+    """Sums ``[B, count, 3]`` of the rows ``[B, N, 3]`` that go to the same index."""
+    sums = rows.new_zeros(rows.shape[0], count, 3)
+    return sums.scatter_add(1, _expanded(indices, rows.shape[0]), rows)

@@ -36,7 +36,7 @@ MeshBatch<T> read_mesh(Call& call, const std::string& starts = "starts") {
   const bool packed = call.has(starts);
   call.read(packed ? "vertices [N, 3]" : "vertices [B, V, 3]", mesh.vertices);
   mesh.faces_per_image = call.read(packed ? "faces [M, 3]" : "faces [F, 3] or [B, F, 3]", mesh.faces).shape.size() == 3;
-  call.read(starts + "? [B + 1, 2]", mesh.starts);
+  if (packed) call.read(starts + " [B + 1, 2]", mesh.starts);
   mesh.batch = call["B"];
   mesh.num_vertices = call[packed ? "N" : "V"];
   mesh.num_faces = call[packed ? "M" : "F"];

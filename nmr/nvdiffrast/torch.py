@@ -198,7 +198,7 @@ def _in_front(pos: Tensor, tri: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, T
     largest = float(w[w.isfinite()].abs().max()) if bool(w.isfinite().any()) else 0.0
     plane = _NEAREST * largest
     counts = ops.clip_count(depths, tri, None, plane)
-    if not counts[:, 0].any():
+    if (counts[:, 0] <= 0).all():
         return pos, tri, None
     batch, vertices = pos.shape[:2]
     new_starts = F.pad(counts.cumsum(0), (0, 0, 1, 0))

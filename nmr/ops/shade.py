@@ -38,7 +38,7 @@ def interpolate(
     return attributes.new_empty((*face_index.shape, attributes.shape[-1]))
 
 
-@kernel("normals", gradients="vertices", used_by="a normal of a mesh")
+@kernel("normals", gradients="vertices", used_by="render_normals")
 def normals(vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool) -> Tensor:
     """Unit normals ``n((v0 - v1) x (v2 - v1))`` of faces, ``[B or 1, F, 3]`` or packed ``[M, 3]``.
 

@@ -159,7 +159,10 @@ VALUES = [
     ("eps must be positive in torch.float32", lambda: render(eps=1e-60)),
     ("gradient must be 'nmr' or 'local' or 'none', got ", lambda: render(gradient="soft")),
     ("gradient must be 'nmr'", lambda: fragments().resolve(torch.zeros(1, 4, 4, 3), gradient="soft")),
-    (r"outputs must be .*\('rgb', .*got 'silhouette'; the silhouette is \"alpha\"", lambda: render(outputs="silhouette")),
+    (
+        r"outputs must be .*\('rgb', .*got 'silhouette'; the silhouette is \"alpha\"",
+        lambda: render(outputs="silhouette"),
+    ),
     (r"got \('silhouette', 'rgb'\); the silhouette is \"alpha\"", lambda: render(outputs=("silhouette", "rgb"))),
     ("different names", lambda: render(outputs=("rgb", "rgb"))),
     (r"background must be a number, \[3\] or \[1, 3\], got .*\[2\]", lambda: rgb(None, background=[0.0, 1.0])),
