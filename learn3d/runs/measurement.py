@@ -11,8 +11,12 @@ from learn3d.config import command_line
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import Layout, require_folder
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, NO_MMD, SURFACE_POINTS, Evaluation, evaluate
+from learn3d.files import limits
+from learn3d.files.reading import read_bytes
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
+from learn3d.runs.folder import METRICS
+from learn3d.runs.log import read_records
 from learn3d.settings import MOST, Step, split_names
 from learn3d.terminal import align, note
 
@@ -56,6 +60,15 @@ class ObjectMeans(NamedTuple):
     voxel_iou_kato19: Number
 
 
+class CurvePoint(NamedTuple):
+    """One validation during a training."""
+
+    split: str
+    step: Amount
+    voxel_iou: Number
+    mmd: Number
+
+
 class Result(BaseModel, strict=True):
     """Measures of one checkpoint on one category and split; None if a measure has no value."""
 
@@ -82,6 +95,7 @@ class Result(BaseModel, strict=True):
     mmd: Number
     mmd_paper: Number
     objects: list[ObjectMeans]  # [] for data without voxels
+    curve: list[CurvePoint] = []  # the validations of the training, from an experiment; [] from `evaluate_runs`
 
     @property
     def commit(self) -> str:
@@ -132,6 +146,13 @@ def evaluate_runs(
             objects = _means_by_object(evaluation, dataset) if dataset.voxels is not None else []
             results.append(Result(**about, **means, objects=objects))
     return results
+
+
+def read_curve(folder: Path) -> list[CurvePoint]:
+    """The validations of a run, from its metrics.jsonl."""
+    content = read_bytes(folder / METRICS, limits.METRICS_BYTES, "the metrics of a run")
+    records = [record for _, record in read_records(content) if record["split"] != "train"]
+    return [CurvePoint(r["split"], r["step"], r.get("voxel_iou"), r.get("mmd")) for r in records]
 
 
 def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[ObjectMeans]:

@@ -66,21 +66,24 @@ def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
 def make_report(
     request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]
 ) -> tuple[dict[str, Cells], str]:
-    """The tables "main", "differences", "runs" and, if poses were estimated, "poses"; and the report as Markdown.
+    """The tables "main", "differences", "runs", "curves" and, if poses were estimated, "poses"; the report as Markdown.
 
+    "curves" has the validations of each run. The Markdown leaves them out.
     results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has no path of a machine.
     """
     table = TABLES[request.table]
     done = [run for run in runs if run.folder in results]
     measured: dict[tuple[str | None, str], dict[int, Result]] = {}
     trained = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
-    commands = {}
+    curves, commands = [["run", "split", "step", HEADERS[0], "MMD"]], {}
     for run in done:
         result, config = results[run.folder], run.config
         measured.setdefault((run.variant, config.category), {})[config.seed] = result
         counts = [f"step {result.step}", str(result.iterations), str(config.batch_size), str(result.images)]
         minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
         trained.append([run.name, *counts, *figures(vars(result)), minutes, result.commit])
+        for split, step, *values in result.curve:
+            curves.append([run.name, split, str(step), *("-" if v is None else f"{v:.4f}" for v in values)])
         words = {"data": "DATA", "category": "CATEGORY", "seed": "SEED", "poses": "OUTPUT/poses/CATEGORY-seedSEED.npz"}
         words["output"] = f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED"
         commands[command_line(config, **words)] = None
@@ -102,7 +105,7 @@ def make_report(
         if row.variant and row.variant != baseline:
             pairs = zip(ours, theirs, strict=True)
             differences.append([label, *(_compare(table.measure, *pair) for pair in pairs)])
-    tables = {"main": main, "differences": differences, "runs": trained}
+    tables = {"main": main, "differences": differences, "runs": trained, "curves": curves}
     missing = [run.name for run in runs if run not in done]
     parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
     parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]

@@ -15,7 +15,7 @@ from learn3d.files import limits, writing
 from learn3d.files.reading import read_bytes
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
-from learn3d.runs.measurement import Result, evaluate_runs
+from learn3d.runs.measurement import Result, evaluate_runs, read_curve
 from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import NEAR_DEG, PoseOptions
 from learn3d.studio.poses.views import CameraOptions, estimate_views, load_views
@@ -77,6 +77,7 @@ def train_and_test(run: PlannedRun) -> bool:
         _measure_updated_poses(config)
     which = VARIANTS[run.variant].checkpoint
     (result,) = evaluate_runs([run.folder], which=which, data=config.data, device=config.device)
+    result.curve = read_curve(run.folder)
     writing.write_json(run.folder / RESULT_FILE, result.model_dump())
     print(f"tested: voxel IoU {result.voxel_iou:.4f} (kato18)", flush=True)
     return True

@@ -58,6 +58,7 @@ def test_the_page_shows_our_figures_beside_the_papers(make, request_for, read_re
     assert str(tmp_path) not in text
     tables = json.loads((tmp_path / "out" / "kato.json").read_text())
     assert all(f"| {' | '.join(row)} |" in text for name in ("main", "differences", "runs") for row in tables[name])
+    assert ["airplane/proposed-seed2", "val", "3", "0.2000", "-"] in tables["curves"]
     header, *rows = [line for line in capsys.readouterr().out.splitlines() if line]
     starts = [match.start() for match in re.finditer(r"\S+", header)]
     assert len(rows) == 6

@@ -92,6 +92,7 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
                 assert 0 <= result[measure] <= (1 if "iou" in measure or "score" in measure else math.inf), label
             assert result["voxel_iou"] > 0, "even an untrained shape overlaps with an airplane"
             assert result["iterations"] == 2 * (BATCH_DIVISOR if VARIANTS[row.variant].small_batches_of else 1)
+            assert [point[1] for point in result["curve"]] == [result["iterations"]], "the last step is validated"
         mean = sum(result[table.measure] for result in results) / len(results)
         cell, mean_cell = cells["here (mmd)" if name == "mmd" else "here (kato18)"]
         assert cell == mean_cell and cell.startswith(f"{mean:.3f}"), label
