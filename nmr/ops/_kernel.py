@@ -169,7 +169,7 @@ def _add_gradient(
     def pull(ctx, *grads):
         grads, wanted = [grads[k] for k in upstream], [ctx.needs_input_grad[k] for k in of]
         found: list[Tensor | None] = [None] * count
-        if any(grad is not None for grad in grads):
+        if any(wanted) and any(grad is not None for grad in grads):
             arguments, saved = [None] * count, ctx.saved_tensors
             for k, value in zip((*tensors, *numbers), (*saved[: len(tensors)], *ctx.numbers), strict=True):
                 arguments[k] = value
