@@ -11,20 +11,19 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._validate import as_numbers, callers_level
+from .._validate import as_numbers, callers_level, holds_for_all
 from .projection import (
     Numbers,
     Projection,
     SquarePixels,
     as_parameter,
-    batched,
     common_batch,
     warn_if_not_finite,
 )
 
 Scalars = float | Sequence[float] | Tensor
 
-_SHORTEST = 1e-5  # a shorter up x forward is not stretched to a unit vector (look_at.cpp)
+_UNIT = 1 - 1e-6  # a vector whose squared length is smaller was shorter than 1e-5, and not stretched (look_at.cpp)
 _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 
@@ -71,30 +70,6 @@ def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> 
     return value
 
 
-def _warn_if_up_is_ahead(forward: Tensor, up: Tensor) -> None:
-    """Warns of cameras that look along their up vector, or at their own place, and so see nothing.
-
-    Not when compiled, traced or on a GPU.
-    """
-    if torch.compiler.is_compiling() or forward.device.type != "cpu" or up.device.type != "cpu":
-        return
-    forward, up = (batched(x.detach(), torch.float64, 3) for x in (forward, up))
-    forward = forward / forward.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-    sideways = torch.linalg.cross(*torch.broadcast_tensors(up, forward))
-    ahead = sideways.norm(dim=-1) < _SHORTEST  # False for NaN
-    try:
-        which = ahead.nonzero().flatten().tolist()
-    except RuntimeError:  # inside torch.func.vmap values cannot be read
-        return
-    if which:
-        warnings.warn(
-            f"camera {which[0]} of {len(ahead)} looks along its up vector, or at its own place ({len(which)} in all): "
-            "it has no left and right, and its image is empty. Give it another up, for example up=(0, 0, 1) to look "
-            "straight down, or another place.",
-            stacklevel=callers_level(),
-        )
-
-
 class _Placed(SquarePixels):
     """Base class of cameras given by an eye, a target or direction, an up vector and a field of view or scale."""
 
@@ -116,16 +91,36 @@ class _Placed(SquarePixels):
         scale = parameters[view]
         as_tensor = scale if isinstance(scale, Tensor) else torch.tensor(scale, dtype=torch.float64, device="cpu")
         object.__setattr__(self, "_view", as_tensor)
-        warn_if_not_finite(self, *names)
         common_batch(**{n: x for n, x in parameters.items() if isinstance(x, Tensor) and x.ndim == 1 + (n in names)})
-        place, eye = parameters[target], self.eye
-        if not self._along:
-            place = batched(place, torch.float64, 3) - batched(eye, torch.float64, 3)
-        _warn_if_up_is_ahead(place, self.up)
+        self._warn_if_it_sees_nothing(*names)
+
+    def _warn_if_it_sees_nothing(self, *names: str) -> None:
+        """Warns of a pose that is not finite, and of cameras that look along their up vector or at their own place.
+
+        Not when compiled, traced or on a GPU.
+        """
+        parameters = [x.detach() for x in self._parameters()]
+        if torch.compiler.is_compiling() or not all(x.is_cpu for x in parameters):
+            return
+        rows = ops.look_at(*(x.double() for x in parameters), self._along, False, self.perspective, True)
+        sideways = rows[:, :3].square().sum(1)  # 1, but less if up x forward is too short to be stretched
+        if holds_for_all(sideways > _UNIT):
+            return
+        warn_if_not_finite(self, *names)
+        which = (sideways <= _UNIT).nonzero().flatten().tolist()
+        if which:
+            warnings.warn(
+                f"camera {which[0]} of {len(rows)} looks along its up vector, or at its own place ({len(which)} in all)"
+                ": it has no left and right, and its image is empty. Give it another up, for example up=(0, 0, 1) to "
+                "look straight down, or another place.",
+                stacklevel=callers_level(),
+            )
+
+    def _parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.eye, getattr(self, self._names[0]), self.up, self._view
 
     def _rows(self, dtype: torch.dtype) -> tuple[Tensor, None, bool]:
-        parameters = self.eye, getattr(self, self._names[0]), self.up, self._view
-        parameters = (x.to("cpu", torch.float64) for x in parameters)
+        parameters = (x.to("cpu", torch.float64) for x in self._parameters())
         how = self._along, bool(self.right_handed), self.perspective, dtype == torch.float64
         return ops.look_at(*parameters, *how), None, self.perspective
 
