@@ -38,8 +38,7 @@ class DatasetConfig:
     layout: WrittenLayout = "kato"
     """Published data set whose file layout and viewpoints are used, see docs/data-sets.md."""
     views: Count | None = None
-    """Views of each object (default: 20 for kar, 24 for r2n2, 8 for pascal3d, 12 for photos and around; kato and dvr
-    always have 24)."""
+    """Views of each object (default: 20 for kar, 8 for pascal3d, 12 for photos and around; kato always has 24)."""
     source: FilePath | None = None
     """Folder of meshes, searched recursively, or a mesh pack .npz (default: shapes from --procedural)."""
     procedural: Amount = 0
@@ -48,8 +47,7 @@ class DatasetConfig:
     """Share (below 1, at least 4 meshes) or number of the meshes for the test split (default: 0.2; pascal3d has no test
     split)."""
     val: Weight | None = None
-    """Share or number of the meshes for the validation split, 0 for none (default: 0.1, for pascal3d 0.2; r2n2 has no
-    validation split)."""
+    """Share or number of the meshes for the validation split, 0 for none (default: 0.1, for pascal3d 0.2)."""
     augment: Amount = 0
     """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75 .. 1.25. With --source,
     shapes of --procedural get none."""

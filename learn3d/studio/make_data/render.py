@@ -85,10 +85,6 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
     bar = tqdm(items, desc=config.category, unit="mesh", disable=not is_watched(), dynamic_ncols=True)
     with publishing(config.output, [*paths, *writer.shared]) as folder:
         writer.write(render_meshes(config, bar, made, rows), config.category, folder, config.output)
-        if writer.fixed_splits:
-            used = [mesh for mesh in made if "objects" in mesh]
-            for number, mesh in enumerate(used):
-                mesh["split"] = "train" if number < len(used) * 8 // 10 else "test"
         report = DatasetReport(config, made)
         report.write(folder, rows)
     return report
@@ -137,8 +133,7 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
     rgb, alpha = photograph(vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights)
     if not alpha.any():
         raise ValueError("no view shows it: its faces have no area, or are smaller than a pixel")
-    side = float((vertices.amax(0) - vertices.amin(0)).max()) if writer.tight_grid else 1.0
-    voxels = writer.convention.voxelize(vertices / side, faces)[0].numpy()
+    voxels = writer.convention.voxelize(vertices, faces)[0].numpy()
     name = f"{item.name}-{copy}" if copy else item.name
     return RenderedObject(name, item.split, vertices, faces, poses, rgb, alpha, voxels, rng)
 

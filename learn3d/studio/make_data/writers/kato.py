@@ -1,4 +1,4 @@
-"""Writes Kato's renderings: in his files and in those of DVR's copy; also shards of views from all sides."""
+"""Writes Kato's renderings, in his files or in shards, and shards of views from all sides."""
 
 import dataclasses
 import functools
@@ -6,17 +6,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 import nmr
-from learn3d.data import conventions
-from learn3d.data.categories import SPLITS, synset_of
+from learn3d.data.categories import SPLITS
 from learn3d.data.dataset import ViewDataset, depth_levels
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import around, kato
-from learn3d.studio.make_data.writers.writer import WORLD_FROM_OBJECT, RenderedObject, Writer, random_views, write_png
-
-NUM_POINTS = 10_000
+from learn3d.studio.make_data.writers.writer import RenderedObject, Writer, random_views
 
 
 def _write_kato(objects: Iterable[RenderedObject], category: str, folder: Path, _: Path) -> None:
@@ -54,36 +50,6 @@ KATO = Writer(
     join=_join_kato,
     fixed=("views",),
 )
-
-
-def _write_dvr(objects: Iterable[RenderedObject], category: str, root: Path, _: Path) -> None:
-    """Write a folder for each object, and the lists `softras_{split}.lst`.
-
-    World coordinates are ShapeNet's: right-handed, y up, x towards the camera of view 0, longest side 1. The points of
-    `pointcloud.npz` are world coordinates. `world_mat_k` [4, 4], whose rotation has determinant 1, takes them to camera
-    axes (x right, y down, z away). `camera_mat_k` = diag(f, f, 1, 1), f = 1 / tan 15 deg, takes these to [-1, 1] across
-    the image.
-    """
-    root /= synset_of(category)
-    focal = 1 / np.tan(np.deg2rad(conventions.HALF_FOV_DEG))
-    camera, turn = np.diag([focal, focal, 1.0, 1.0]), WORLD_FROM_OBJECT.T.astype(np.float32)
-    for item in objects:
-        folder, cameras = root / item.name, {}
-        for k, (rgb, alpha, matrix) in enumerate(zip(item.rgb, item.alpha, item.world_to_camera(), strict=True)):
-            write_png(folder / "image" / f"{k:04d}.png", rgb)
-            write_png(folder / "mask" / f"{k:04d}.png", alpha)
-            world = np.vstack([matrix, [0, 0, 0, 1]])
-            cameras |= {f"world_mat_{k}": world, f"world_mat_inv_{k}": np.linalg.inv(world)}
-            cameras |= {f"camera_mat_{k}": camera, f"camera_mat_inv_{k}": np.linalg.inv(camera)}
-        np.savez(folder / "cameras.npz", **cameras)
-        generator = torch.Generator().manual_seed(int(item.rng.integers(2**62)))
-        points, normals, *_ = nmr.metrics.sample_surface(item.vertices, item.faces, NUM_POINTS, generator)
-        np.savez(folder / "pointcloud.npz", points=points.numpy() @ turn, normals=normals.numpy() @ turn)
-        with (root / f"softras_{item.split}.lst").open("a") as listing:
-            listing.write(f"{item.name}\n")
-
-
-DVR = Writer(paths=lambda category: (synset_of(category),), write=_write_dvr, fixed=("views",))
 
 
 def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:

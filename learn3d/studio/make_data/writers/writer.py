@@ -30,7 +30,7 @@ class RenderedObject:
     rgb: np.ndarray  # uint8 [n, S, S, 3], shaded, over white
     alpha: np.ndarray  # uint8 [n, S, S]: 255 * `nmr.render_silhouette`
     voxels: np.ndarray  # bool [32, 32, 32], in the axes of the layout
-    rng: np.random.Generator  # for backgrounds and surface points
+    rng: np.random.Generator  # for backgrounds
 
     def rgba(self) -> np.ndarray:
         """The images with straight alpha, uint8 [n, S, S, 4]; pixels with alpha 0 are black."""
@@ -65,12 +65,10 @@ class Writer:
     image_size: int = IMAGE_SIZE
     default_views: int = NUM_VIEWS  # per object
     default_test: float = 0.2  # share of the test split; 0 if the layout has none
-    default_val: float = 0.1  # share of the validation split; 0 if the layout has none
-    fixed: tuple[str, ...] = ()  # options (views, test, val, augment) that must have their default values
-    fixed_splits: bool = False  # True if readers train on the first 80 % of the objects and test on the rest
+    default_val: float = 0.1  # share of the validation split
+    fixed: tuple[str, ...] = ()  # options (views, test) that must have their default values
     shared: tuple[str, ...] = ()  # files with entries for all categories of the folder
     convention: VoxelConvention = KATO
-    tight_grid: bool = False  # True if the side of the voxel grid is the longest side of the bounding box
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))  # frame of `mesh_to_object` to layout's object frame
     diagonal: float | None = None  # diagonal of an object's bounding box; None if its longest side is 1
     natural: bool = False  # True for everyday colours and lights; else objects are light grey

@@ -134,11 +134,8 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
         ({"up": "z", "front": "-z"}, "two different axes"),
         ({"out": "bad/a.obj"}, "a.obj"),
         ({"layout": "kato", "views": 12}, "views is always 24 in the layout kato, got 12"),
-        ({"layout": "r2n2", "val": 1, "test": None}, "val is always 0"),
-        ({"layout": "r2n2", "augment": 2, "test": None}, "augment is always 0"),
-        ({"layout": "r2n2", "test": 0.5}, "test is always 0.2"),
+        ({"layout": "pascal3d", "test": 0.5}, "test is always 0"),
         ({"procedural": 1, "source": None, "layout": "pascal3d", "views": 1, "test": None}, "two pictures or more"),
-        ({"procedural": 1, "source": None, "layout": "r2n2", "views": 1, "test": None}, "give more meshes"),
         ({"layout": "kar", "shards": True}, "make the data set without --shards, and convert it"),
         ({"jobs": 2}, "add --shards"),
     ],
@@ -199,17 +196,6 @@ def test_categories_share_a_folder_and_are_replaced_one_by_one(tmp_path, folder)
     with pytest.raises(ValueError, match=r"splits\.json"):
         make(tmp_path, folder, "kar", overwrite=True)
     assert (tmp_path / "splits.json").read_text() == "{"
-
-
-def test_r2n2_moves_objects_between_splits_if_meshes_are_skipped(tmp_path):
-    for i in range(12):
-        trimesh.creation.box((1, 2, 1 + i)).export(tmp_path / f"{i}.ply")
-    for i in (1, 4):
-        (tmp_path / f"{i}.ply").write_text("damaged")
-    report = make(tmp_path / "out", tmp_path, "r2n2", views=1, test=None, val=None)
-    assert report.counts == {"train": 8, "test": 2} and len(report.skipped) == 2
-    names = sorted(path.name for path in (tmp_path / "out" / "ShapeNetRendering" / SYNSET).iterdir())
-    assert {name[6:] for name in names[8:]} == set(report.objects["test"])
 
 
 def test_names_of_objects_are_fit_for_files_and_differ_by_more_than_case() -> None:

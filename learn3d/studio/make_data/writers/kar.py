@@ -1,8 +1,7 @@
-"""Writes renderings in the layouts of Kar et al. 2017 and of 3D-R2N2, with a folder for each object."""
+"""Writes renderings in the layout of Kar et al. 2017, with a folder for each object."""
 
 import functools
 import io
-import itertools
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -13,13 +12,10 @@ from scipy.spatial.transform import Rotation
 import nmr
 from learn3d.data.categories import SPLITS, synset_of
 from learn3d.data.dataset import DEPTH_REACH
-from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers.kar import KAR as KAR_AXES
 from learn3d.data.readers.kar import read_splits
-from learn3d.data.readers.r2n2 import DISTANCE, HALF_FOV_DEG
-from learn3d.data.readers.r2n2 import R2N2 as R2N2_AXES
 from learn3d.files.writing import write_json
-from learn3d.studio.make_data.writers.writer import RenderedObject, Writer, random_views, uniform, write_png
+from learn3d.studio.make_data.writers.writer import RenderedObject, Writer, random_views, write_png
 
 KAR_HALF_FOV_DEG = 14.9314  # 60 mm lens, 32 mm sensor
 
@@ -71,53 +67,4 @@ KAR = Writer(
     default_views=20,
     convention=KAR_AXES,
     shared=("splits.json",),
-)
-
-
-def _write_r2n2(objects: Iterable[RenderedObject], category: str, root: Path, _: Path) -> None:
-    """Write a folder of renderings and a voxel grid for each object, in ShapeNet's coordinates.
-
-    Readers sort the ids and train on the first 80 %, so an id begins with a number in the order of the objects.
-    """
-    for number, item in enumerate(objects):
-        images, volumes = (root / path / f"{number:05d}_{item.name}" for path in R2N2.paths(category))
-        for k, rgba in enumerate(item.rgba()):
-            write_png(images / "rendering" / f"{k:02d}.png", rgba)
-        angles = zip(item.poses.azimuth_deg, item.poses.elevation_deg, item.poses.distance, strict=True)
-        rows = [f"{-azimuth:.4f} {elevation:.4f} 0 {d / DISTANCE:.4f} 25\n" for azimuth, elevation, d in angles]
-        (images / "rendering" / "rendering_metadata.txt").write_text("".join(rows))
-        volumes.mkdir(parents=True)
-        side = float((item.vertices.amax(0) - item.vertices.amin(0)).max())
-        (volumes / "model.binvox").write_bytes(binvox_bytes(item.voxels, side))
-
-
-def _r2n2_views(vertices: np.ndarray, count: int, rng: np.random.Generator) -> LookAtPoses:
-    """Azimuths in (-360, 0], elevations in [25, 30), distances 1.75 * [0.65, 0.95)."""
-    azimuth_deg, elevation_deg = -uniform(rng, (0.0, 360.0), count), uniform(rng, (25.0, 30.0), count)
-    distance = uniform(rng, (0.65, 0.95), count).astype(np.float64) * DISTANCE
-    return LookAtPoses(azimuth_deg, elevation_deg, distance.astype(np.float32), HALF_FOV_DEG)
-
-
-def binvox_bytes(voxels: np.ndarray, side: float) -> bytes:
-    """Encode a grid bool [D, D, D] (axes x, y, z) of a cube centred at 0 as binvox: y runs fastest, then z, then x."""
-    size, corner = " ".join(map(str, voxels.shape)), " ".join([f"{-side / 2:.9g}"] * 3)
-    header = f"#binvox 1\ndim {size}\ntranslate {corner}\nscale {side:.9g}\ndata\n"
-    runs = bytearray()
-    for cell, run in itertools.groupby(voxels.transpose(0, 2, 1).reshape(-1).tolist()):
-        full, rest = divmod(len(list(run)), 255)
-        runs += bytes([cell, 255]) * full + (bytes([cell, rest]) if rest else b"")
-    return header.encode() + bytes(runs)
-
-
-R2N2 = Writer(
-    paths=lambda category: (f"ShapeNetRendering/{synset_of(category)}", f"ShapeNetVox32/{synset_of(category)}"),
-    write=_write_r2n2,
-    views=_r2n2_views,
-    image_size=137,
-    default_val=0.0,
-    fixed=("test", "val", "augment"),
-    fixed_splits=True,
-    convention=R2N2_AXES,
-    tight_grid=True,
-    diagonal=1.0,
 )
