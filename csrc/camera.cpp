@@ -13,7 +13,7 @@ namespace {
 
 constexpr int kGroup = 16;  // vertices processed together, and partial sums per gradient; the same on every processor
 constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
-constexpr int kSums = 12 + 6 + 8;        // sums over vertices per camera: gradients of matrix, intrinsics, distortion
+constexpr int kSums = 12 + 6 + 8;        // sums over vertices per camera: gradients of [A | t], K, distortion
 constexpr int kTotals = kSums + 3 + 1;   // plus the gradients of origin and extent, which follow from the sums
 
 // Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small enough that sums
@@ -31,11 +31,13 @@ struct Lens {
 
   Lens(const Project<T>& args, int64_t b)
       : d{}, o{}, extent(1), reach2(std::numeric_limits<T>::infinity()), largest_a(1), largest_k(0), largest_d(1), usable(true) {
-    std::copy_n(args.matrix + 12 * b, 12, a);
-    std::copy_n(args.intrinsics + 6 * b, 6, k);
-    if (args.distortion) std::copy_n(args.distortion + args.coefficients * b, args.coefficients, d);
-    if (args.origin) std::copy_n(args.origin + 3 * b, 3, o);
-    if (args.extent) extent = args.extent[b];
+    const T* camera = args.camera + (args.camera_each ? kCamera * b : 0);
+    std::copy_n(camera, 12, a);
+    std::copy_n(camera + kIntrinsics, 6, k);
+    std::copy_n(camera + kOrigin, 3, o);
+    extent = camera[kExtent];
+    if (args.distortion)
+      std::copy_n(args.distortion + (args.distortion_each ? args.coefficients * b : 0), args.coefficients, d);
     inverse_extent = 1 / extent;
     for (T value : a) largest_a = std::max(largest_a, std::abs(value));
     for (T value : k) largest_k = std::max(largest_k, std::abs(value * inverse_extent));
@@ -86,9 +88,15 @@ const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch)
 }
 
 template <class T>
-void write(const double* sum, int count, T* grad, int64_t b) {
+void write(const double* sum, int count, T* grad, int64_t place) {
   const double largest = std::numeric_limits<T>::max();
-  for (int k = 0; k < count && grad; ++k) grad[count * b + k] = static_cast<T>(std::clamp(sum[k], -largest, largest));
+  for (int k = 0; k < count && grad; ++k) grad[place + k] = static_cast<T>(std::clamp(sum[k], -largest, largest));
+}
+
+template <class T>
+void write_camera(const double* sum, T* grad, int64_t b) {
+  write(sum, 18, grad, kCamera * b);
+  write(sum + kSums, 4, grad, kCamera * b + kOrigin);
 }
 
 }  // namespace
@@ -107,8 +115,7 @@ void project_backward(const Project<T>& args) {
   ProjectScratch& scratch = thread_scratch<ProjectScratch>();
   const std::vector<Run>& runs = runs_of(args, scratch);
   const int64_t num_runs = static_cast<int64_t>(runs.size());
-  const bool sum_camera =
-      args.grad_matrix || args.grad_intrinsics || args.grad_distortion || args.grad_origin || args.grad_extent;
+  const bool sum_camera = args.grad_camera || args.grad_distortion;
   double* totals = sum_camera ? reserve(scratch.totals, num_runs * kTotals) : nullptr;
 
   if (args.batch == 0 && args.grad_vertices)
@@ -128,17 +135,18 @@ void project_backward(const Project<T>& args) {
   });
   if (!sum_camera) return;
 
-  int64_t r = 0;
-  for (int64_t b = 0; b < args.batch; ++b) {
+  // One camera for all images gets the sum over them.
+  double of_all[kTotals] = {};
+  for (int64_t b = 0, r = 0; b < args.batch; ++b) {
     double sum[kTotals] = {};
     for (; r < num_runs && runs[r].image == b; ++r)
       for (int k = 0; k < kTotals; ++k) sum[k] += totals[r * kTotals + k];
-    write(sum, 12, args.grad_matrix, b);
-    write(sum + 12, 6, args.grad_intrinsics, b);
-    write(sum + 18, static_cast<int>(args.coefficients), args.grad_distortion, b);
-    write(sum + kSums, 3, args.grad_origin, b);
-    write(sum + kSums + 3, 1, args.grad_extent, b);
+    for (int k = 0; k < kTotals; ++k) of_all[k] += sum[k];
+    if (args.camera_each) write_camera(sum, args.grad_camera, b);
+    if (args.distortion_each) write(sum + 18, static_cast<int>(args.coefficients), args.grad_distortion, args.coefficients * b);
   }
+  if (!args.camera_each) write_camera(of_all, args.grad_camera, 0);
+  if (!args.distortion_each) write(of_all + 18, static_cast<int>(args.coefficients), args.grad_distortion, 0);
 }
 
 template void project_forward(const Project<float>&);

@@ -40,24 +40,37 @@ struct MeshBatch {
   const int64_t* image_faces(int64_t b) const { return faces + 3 * face_start(b); }
 };
 
-// The pose of a camera that looks along `forward` (pose.cpp): rows x, -y, z of A (camera axes: x right, y down, z
-// forward); z = n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5). If an input is not finite or
-// beyond 1e15, the whole pose is NaN and gets no gradient.
+// A camera as the kernels take it, a row of kCamera numbers: [A | t] (3 x 4, world to camera axes: x right, y down, z
+// forward), K (2 x 3, renderer-space x and y), the origin (3) and the extent.
+constexpr int64_t kCamera = 12 + 6 + 3 + 1, kIntrinsics = 12, kOrigin = 18, kExtent = 21;
+
+// Cameras at `eye` that look at a point or along a direction (look_at.cpp): rows x, -y, z of A; z = n(forward), x = n(up
+// x z), y = n(z x x), n(v) = v / max(|v|, 1e-5); t = 0, the origin is the eye. If forward or up is not finite or beyond
+// 1e15, A and t are NaN and get no gradient. Parameters are doubles, one for all images or one each; the difference at -
+// eye and the angle are rounded to T before anything is computed from them, as published.
 template <class T>
-struct Pose {
-  const T* forward;      // [B, 3]
-  const T* up;           // [B, 3]
-  int64_t batch;
-  T* matrix;             // forward out [B, 3, 4]: [A | 0]
-  const T* grad_matrix;  // backward in [B, 3, 4]
-  T* grad_forward;       // backward out [B, 3]
-  T* grad_up;            // backward out [B, 3]
+struct LookAt {
+  int64_t batch;          // B
+  const double* eye;      // [3] or [B, 3]
+  const double* at;       // [3] or [B, 3]: the point, or the direction
+  const double* up;       // [3] or [B, 3]
+  const double* view;     // [] or [B]: perspective: half of the field of view in degrees, else the scale
+  bool eye_each, at_each, up_each, view_each;  // one for each image
+  bool along;             // `at` is a direction
+  bool right_handed;      // x points to the other side
+  bool perspective;       // extent = tan(view), else K is multiplied by the scale
+  T* camera;              // forward out [B, kCamera]
+  const T* grad_camera;   // backward in
+  double* grad_eye;       // backward out, like the parameters (summed over images), or nullptr
+  double* grad_at;
+  double* grad_up;
+  double* grad_view;
 };
 
-// World space to renderer space (camera.cpp). Per image b: u = A (v - origin) + t with [A | t] = matrix; then
+// World space to renderer space (camera.cpp). Per image b: u = A (v - origin) + t; then
 //   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does (distortion.h); q = p / extent;
 //                  out = (K00 q_x + K01 q_y + K02, K10 q_x + ...,
-//                  u_z), K = intrinsics
+//                  u_z)
 //   orthographic:  the same with p = (u_x, u_y), without distortion.
 // Origin and extent are separate arguments so that look-at cameras round as the published ones: images and gradients
 // then have the same bits. A vertex has no finite image if it is not finite itself, if it is in the plane of the
@@ -70,21 +83,17 @@ struct Project {
   int64_t batch;         // B, of the output
   int64_t vertex_batch;  // 1 or B when not packed
   int64_t num_vertices;  // V
-  const T* matrix;       // [B, 3, 4]
-  const T* intrinsics;   // [B, 2, 3]: renderer-space x and y from q
-  const T* distortion;   // [B, coefficients], or nullptr
+  const T* camera;       // [B or 1, kCamera]
+  bool camera_each;      // B, else 1
+  const T* distortion;   // [B or 1, coefficients], or nullptr
+  bool distortion_each;
   int64_t coefficients;  // 5: k1 k2 p1 p2 k3; 8: also k4 k5 k6; 4: k1 k2 k3 k4 of a fisheye
-  const T* origin;       // [B, 3], or nullptr (0)
-  const T* extent;       // [B], or nullptr (1)
   bool perspective;
   T* points;             // forward out [B, V, 3] or [N, 3]
   const T* grad_points;  // backward in
   T* grad_vertices;      // backward out, like vertices (summed over images when vertex_batch is 1), or nullptr
-  T* grad_matrix;        // backward out [B, 3, 4], or nullptr
-  T* grad_intrinsics;    // backward out [B, 2, 3], or nullptr
-  T* grad_distortion;    // backward out [B, coefficients], or nullptr
-  T* grad_origin;        // backward out [B, 3], or nullptr
-  T* grad_extent;        // backward out [B], or nullptr
+  T* grad_camera;        // backward out, like camera (summed over images when there is one), or nullptr
+  T* grad_distortion;    // backward out, like distortion, or nullptr
   int num_threads;
 };
 
@@ -507,8 +516,8 @@ struct SoftIou {
   int num_threads;
 };
 
-template <class T> void pose_forward(const Pose<T>& args);
-template <class T> void pose_backward(const Pose<T>& args);
+template <class T> void look_at_forward(const LookAt<T>& args);
+template <class T> void look_at_backward(const LookAt<T>& args);
 template <class T> void project_forward(const Project<T>& args);
 template <class T> void project_backward(const Project<T>& args);
 template <class T> bool crosses_near(const T* vertices, int64_t count, T near);  // some depth is smaller

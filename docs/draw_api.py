@@ -12,7 +12,7 @@ import tyro
 from torch import Tensor
 
 import nmr
-from learn3d.shapes import make_shape
+from learn3d.studio.shapes import make_shape
 
 SIZE = 160
 
@@ -82,7 +82,7 @@ def main(output: Path = Path("output")) -> None:
     pictures = {
         "render_silhouette": gray(1 - nmr.render_silhouette(*mesh, **square)),
         "render_soft_silhouette": gray(1 - nmr.render_soft_silhouette(*mesh, sigma=1e-3, **square)),
-        "render_soft_rgb": nmr.render_soft_rgb(*mesh, sigma=1e-3, **look).rgb,
+        "render_soft": nmr.render_soft(*mesh, sigma=1e-3, **look).rgb,
         "render_transparent": nmr.render_transparent(*mesh, opacity=0.4, **look).rgb,
         "render_rgb": nmr.render_rgb(*mesh, **look),
         "render_depth": gray((nmr.render_depth(*mesh, near=near, far=far, **square) - near) / (far - near)),

@@ -35,12 +35,12 @@ class Picture:
     small: bool = False  # made to fit into 320 x 240 pixels
 
 
-_QUICKSTART = ("tools/quickstart.sh", "learn3d/figures/grids.py")
+_QUICKSTART = ("tools/quickstart.sh", "learn3d/studio/tables/grids.py")
 _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
-_FUNCTIONS = ("silhouette", "rgb", "depth", "normals", "face_index", "soft_silhouette", "soft_rgb", "transparent")
+_FUNCTIONS = ("silhouette", "rgb", "depth", "normals", "face_index", "soft_silhouette", "soft", "transparent")
 _FUNCTIONS = (*(f"render_{name}" for name in _FUNCTIONS), "icosphere", "voxelize", "colors", "lights", "look_at")
 _NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
 _SCRIPTS = {  # picture that a script draws, and the part of it that the gallery shows
@@ -70,7 +70,7 @@ PICTURES = {
     "small-model.png": Picture(
         "python docs/examples/draw_small_model.py --output {folder}",
         "{folder}/small-model.png",
-        ("docs/examples/draw_small_model.py", "learn3d/models/small.safetensors"),
+        ("docs/examples/draw_small_model.py", "learn3d/studio/picture_to_mesh/small.safetensors"),
     ),
     "quickstart.png": Picture("bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART),
     **{
@@ -106,12 +106,12 @@ PICTURES = {
     "results-grid.png": Picture(
         f"learn3d figures grid --truth --images 3 --runs {_THREE} --output {{folder}}/grid.png",
         "{folder}/grid.png",
-        ("learn3d/figures/grids.py",),
+        ("learn3d/studio/tables/grids.py",),
     ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
         "{folder}/tsne.png",
-        ("learn3d/figures/tsne.py",),
+        ("learn3d/studio/tables/tsne.py",),
     ),
 }
 

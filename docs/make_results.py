@@ -3,8 +3,9 @@
 python docs/make_results.py            # write the page
 python docs/make_results.py --check    # end with status 1 if the page differs from the files
 
-A file holds tables as rows of cells, the header first: "main", "differences", and "runs" with settings and commit of
-each run. `learn3d experiment TABLE` writes such a file beside its report; copy it here.
+A file holds tables as rows of cells, the header first: "main", "differences", "runs" with settings and commit of
+each run, and "curves" with its validations, which draw_curves.py draws. `learn3d experiment TABLE` writes such a file
+beside its report; copy it here.
 """
 
 import json

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 import typing
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -19,6 +20,8 @@ from learn3d.settings import Count, FilePath, Items, Rare, Step, checked
 
 DEFAULT_PRESET = "plus-kato"
 
+#: Options of every command line that `command_line` makes.
+USUAL_OPTIONS = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")
 #: Options whose default is the preset's.
 FROM_PRESET = tuple(field.name for field in dataclasses.fields(Preset) if field.name not in ("label", "source"))
 
@@ -186,3 +189,21 @@ def all_options(config: TrainConfig) -> dict[str, Any]:
     """All options by name, with those of the method in place of `settings`."""
     values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
     return values | dataclasses.asdict(values.pop("settings"))
+
+
+def command_line(config: TrainConfig, **placeholders: str) -> str:
+    """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of options' values."""
+    values = all_options(config)
+    usual = all_options(TrainConfig(config.data, config.category, config.output, config.preset))
+    names = [n for n in values if n not in (*USUAL_OPTIONS, "device", "threads") and values[n] != usual[n]]
+    words = ["learn3d", "train"]
+    for name in (*USUAL_OPTIONS, *names):
+        option, value = name.replace("_", "-"), values[name]
+        if name in placeholders:
+            words += [f"--{option}", placeholders[name]]
+        elif isinstance(value, bool):
+            words.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            items = value if isinstance(value, tuple) else (value,)
+            words += [f"--{option}", *(shlex.quote(str(item)) for item in items)]
+    return " ".join(words)

@@ -22,7 +22,7 @@ CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
 F_SCORE_DISTANCE = 0.05  # units of the object frame: objects are 1 long (Pascal3D+: up to 2)
 
-#: Metrics of each image; learn3d.experiments.measurement.MEASURES defines them. IoUs are NaN if both shapes are empty,
+#: Metrics of each image; learn3d.runs.measurement.MEASURES defines them. IoUs are NaN if both shapes are empty,
 #: chamfer_l1 if one is. f_score is 0 if only the prediction is empty. precision, recall and voxel_iou are kato18's.
 #: hollow is 1 if a mesh exceeds the grid: kato18 then leaves its inside empty.
 MEASURED = ("voxel_iou", "voxel_iou_kato19", "precision", "recall", "hollow", "chamfer_l1", "f_score", "silhouette_iou")

@@ -9,12 +9,12 @@ from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.evaluation import NO_MMD, evaluate, spread_samples
-from learn3d.figures.grids import picture_grid
 from learn3d.methods import create_method
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Method
+from learn3d.methods.pose_updates import update_poses, update_steps
+from learn3d.pictures.grid import picture_grid
 from learn3d.pictures.sheets import save_png
-from learn3d.poses.views import update_poses, update_steps
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress, load_data
 from learn3d.runs.log import RunLog, check_log

@@ -8,7 +8,7 @@ render_soft_silhouette    meshes -> the soft silhouettes of SoftRas, with their 
 render_rgb          meshes -> colour images, with the same gradient
 render_depth        meshes -> depth images, with their true derivative
 render_normals      meshes -> normals in world or camera space
-render_soft_rgb     meshes -> the soft colours of SoftRas and PyTorch3D, with their true derivative
+render_soft     meshes -> the soft colours of SoftRas and PyTorch3D, with their true derivative
 render_transparent  meshes -> colour images of transparent surfaces
 render_fragments    meshes -> Fragments: face, weights and depth at each pixel, for shading of your own
 render_face_index   meshes -> which face is nearest at each pixel
@@ -35,7 +35,7 @@ from . import cameras, losses, metrics
 from .cameras import Camera, Look, LookAt, Orthographic, Pinhole
 from .fragments import Fragments
 from .images import Images
-from .layers import render_soft_rgb, render_transparent
+from .layers import render_soft, render_transparent
 from .lights import Lights
 from .mesh import edge_table, face_normals, icosphere, unique_edges, vertex_normals
 from .render import (
@@ -81,7 +81,7 @@ __all__ = [
     "render_normals",
     "render_rgb",
     "render_silhouette",
-    "render_soft_rgb",
+    "render_soft",
     "render_soft_silhouette",
     "render_transparent",
     "sample_texture",

@@ -13,15 +13,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from . import ops
-from ._packing import MeshBatch, packed_starts
+from ._packing import LARGEST_COORDINATE, MeshBatch, packed_starts
 from .cameras import Camera
 from .cameras.projection import ProjectingCamera
 
 # Faces are cut at these shares of far: the first with near = 0 (the image of a point in the plane of the eye is
 # infinitely large), the second with a positive near below it (nearer new vertices are too large for float32).
 _NEAREST, _SMALLEST = 1e-5, 1e-8
-# Beyond this a new vertex counts as not finite: products with gradients could overflow.
-_LARGEST = 1e12
 
 
 class Clipped(NamedTuple):
@@ -88,14 +86,10 @@ def _room(mesh: MeshBatch, plane: float) -> list[tuple[int, int]] | None:
 
     Meshes whose values are not known yet (torch.compile, torch.func.vmap) get room for every face to be cut.
     """
-    counts = mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch
-    if not torch.compiler.is_compiling():
-        try:
-            room = ops.clip_count(*mesh[:3], plane).tolist()
-            return room if any(new or drawn != n for (new, drawn), n in zip(room, counts, strict=True)) else None
-        except RuntimeError:
-            pass
-    return [(2 * n, 2 * n) for n in counts]
+    if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active():
+        room = ops.clip_count(*mesh[:3], plane).tolist()
+        return room if room and room[0][0] >= 0 else None
+    return [(2 * n, 2 * n) for n in mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch]
 
 
 def _new_vertices(
@@ -133,7 +127,7 @@ def _new_vertices(
 
 def _moderate(ends: Tensor) -> Tensor:
     """Whether both ends ``[P, 2, C]`` of an edge are finite and not huge: ``[P, 1]``."""
-    return (ends.abs() < _LARGEST).flatten(1).all(1, keepdim=True)
+    return (ends.abs() < LARGEST_COORDINATE).flatten(1).all(1, keepdim=True)
 
 
 def _transform_padded(points: Tensor, world: Tensor, batch: int, camera: Camera, starts: Tensor) -> Tensor:

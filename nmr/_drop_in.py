@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import types
+from itertools import accumulate
 
 
 def alias_package(here: str, name: object, replace: bool, example: str, remedy: str) -> None:
@@ -15,6 +17,7 @@ def alias_package(here: str, name: object, replace: bool, example: str, remedy: 
     if not isinstance(name, str) or not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(f"name must be one of a module, like {example!r}, got {name!r}")
     if sys.modules.get(name) is not sys.modules[here]:
+        _make_parents(name)
         if not replace and (found := _find(name)):
             raise ImportError(
                 f"there is another package {name}, {found}; uninstall it ({remedy}), or call install_as(replace=True)"
@@ -25,6 +28,14 @@ def alias_package(here: str, name: object, replace: bool, example: str, remedy: 
     for key, module in list(sys.modules.items()):
         if key == here or key.startswith(f"{here}."):
             sys.modules[name + key.removeprefix(here)] = module
+
+
+def _make_parents(name: str) -> None:
+    """Empty packages in place of those that do not exist, so that Python reaches a name with dots."""
+    for parent in [*accumulate(name.split("."), "{}.{}".format)][:-1]:
+        if parent not in sys.modules and importlib.util.find_spec(parent) is None:
+            sys.modules[parent] = types.ModuleType(parent)
+            sys.modules[parent].__path__ = []
 
 
 def _find(name: str) -> str | None:

@@ -11,6 +11,9 @@ from torch import Tensor
 
 from ._validate import cast_under_autocast, check_faces, check_vertices, describe
 
+# A farther point counts as not finite: products of three coordinates, and with gradients, could overflow in float32.
+LARGEST_COORDINATE = 1e12
+
 Values = Tensor | tuple[Tensor, ...]  # result of check_values: a tensor with a batch axis, or one tensor per mesh
 
 

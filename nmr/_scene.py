@@ -32,7 +32,6 @@ from .cameras import Camera
 from .cameras.projection import ProjectingCamera, has_perspective
 from .fragments import Fragments
 from .lights import Lights
-from .ops.raster import RasterSettings
 from .textures import Colors
 
 LARGEST_IMAGE = 8192
@@ -50,7 +49,7 @@ class Scene(NamedTuple):
     world: Tensor
     mesh: MeshBatch
     camera: Camera | None
-    settings: RasterSettings
+    settings: ops.RasterSettings
     clipped: Clipped | None = None
 
     @property
@@ -72,7 +71,7 @@ class Scene(NamedTuple):
 
     def soft_silhouette(self, sigma: Tensor, dist_eps: float) -> Tensor:
         settings, reach = self.settings, math.log(1 / dist_eps - 1)
-        clear = ops.soft_silhouette(*self.drawn[:3], *settings.raster, sigma, *settings[3:6], reach)
+        clear = ops.soft_silhouette(*self.drawn[:3], *settings.raster, sigma.double(), *settings[3:6], reach)
         return 1 - average(clear.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
     def depth(self, face_index: Tensor) -> Tensor:
@@ -97,7 +96,7 @@ class Scene(NamedTuple):
         """The nearest faces whose border is at a squared distance of less than ``sigma * reach``."""
         settings = self.settings
         how = *settings[3:6], settings.perspective
-        drawn_index = ops.soft_layers(*self.drawn[:3], *settings.raster, layers, sigma.detach(), *how, reach)
+        drawn_index = ops.soft_layers(*self.drawn[:3], *settings.raster, layers, sigma.detach().double(), *how, reach)
         of_drawn = ops.soft_fragments(*self.drawn[:3], drawn_index, settings.far, settings.perspective)
         face_index, (weights, depth, distances) = drawn_index, of_drawn
         if self.clipped is not None:
@@ -158,7 +157,7 @@ def make_scene(
                 stacklevel=callers_level(),
             )
     how = check_flag(anti_aliasing, "anti_aliasing"), check_flag(fill_back, "fill_back"), near, float(far), float(eps)
-    settings = RasterSettings(height, width, *how, has_perspective(camera))
+    settings = ops.RasterSettings(height, width, *how, has_perspective(camera))
     return Scene(world, mesh, camera, settings, clipped)
 
 
@@ -183,9 +182,10 @@ def shade(
         image = fragments.weights.new_ones(1).expand(*shape, 3)
     elif colors is not None:
         if not callable(getattr(colors, "sample", None)):
+            remedy = "; nmr.VertexColors(x) makes colours of a tensor x [V, C]" if isinstance(colors, Tensor) else ""
             raise TypeError(
                 "colors must be nmr.VertexColors, FaceColors, TextureCubes, UVTexture or have sample(fragments), "
-                f"got {describe(colors)}"
+                f"got {describe(colors)}{remedy}"
             )
         image = colors.sample(fragments)
         if not isinstance(image, Tensor) or image.shape[:-1] != shape or not image.shape[-1]:

@@ -10,16 +10,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from . import ops
-from ._packing import MeshBatch
+from ._packing import LARGEST_COORDINATE, MeshBatch
 from ._validate import GRADIENTS, as_floats, cast_under_autocast, check_choice, check_values, describe
 from .cameras.projection import ProjectingCamera, has_perspective
 from .mesh import _unit
 
 if TYPE_CHECKING:
     from .cameras import Camera
-
-# Products of three coordinates up to this size are finite in float32.
-_LARGEST = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,15 +239,13 @@ class Fragments:
         return self.sided_face_index, self.weights, self.mesh.starts
 
     def _viewer(self, needs_eye: bool) -> Tensor:
-        """Viewers of the images, ``[B, 5]``: see :func:`nmr.ops.viewer_of`."""
+        """Viewers of the images, ``[B, 5]``: see :func:`nmr.ops.lit`."""
         batch = self.mesh.batch
         if self.camera is None:  # renderer space itself, seen along z
             return self.weights.new_tensor([0.0, 0.0, -1.0, 0.0, 1.0]).expand(batch, 5)
         if isinstance(self.camera, ProjectingCamera):
-            projection = self.camera.projection(self.weights.dtype)
-            matrix, intrinsics, _, origin, _ = (x if x is None else x.detach() for x in projection.parameters())
-            viewer = ops.viewer_of(matrix, intrinsics, origin, projection.perspective)
-            return viewer.to(self.weights).expand(batch, 5)
+            viewer = self.camera.projection(self.weights.dtype).viewer().to(self.weights)
+            return viewer.nan_to_num(0, 0, 0).expand(batch, 5)
         eye = getattr(self.camera, "eye", None)
         if eye is None and needs_eye:
             raise ValueError(
@@ -309,4 +304,4 @@ def _image_axes(intrinsics: Tensor) -> Tensor:
 
 def usable(points: Tensor) -> Tensor:
     """Puts points that are not finite, or so large that a product overflows, at the origin, without gradient."""
-    return torch.where((points.abs() < _LARGEST).all(-1, keepdim=True), points, torch.zeros_like(points))
+    return torch.where((points.abs() < LARGEST_COORDINATE).all(-1, keepdim=True), points, torch.zeros_like(points))

@@ -44,6 +44,8 @@ class Images:
             raise AttributeError(f"Images has no attribute {name!r}")
         if name in OUTPUTS:
             raise AttributeError(f"{name} was not rendered; request it with outputs={(*self._names, name)}")
+        if name == "silhouette":
+            raise AttributeError("Images has no attribute 'silhouette': it is the output alpha")
         raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self._names)}")
 
     def __setattr__(self, name: str, value: object) -> None:

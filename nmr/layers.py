@@ -19,7 +19,7 @@ from .render import check_dist_eps
 from .textures import Colors
 
 
-def render_soft_rgb(
+def render_soft(
     vertices: Meshes,
     faces: Meshes,
     camera: Camera | None = None,
@@ -27,7 +27,7 @@ def render_soft_rgb(
     colors: Colors | None = None,
     lights: Lights | None = None,
     background: float | Sequence[float] | Tensor = 0.0,
-    sigma: float | Tensor = 1e-4,
+    sigma: float | Tensor = 1e-5,
     gamma: float | Tensor = 1e-4,
     faces_per_pixel: int = 16,
     dist_eps: float = 1e-4,
@@ -35,16 +35,26 @@ def render_soft_rgb(
     image_size: int | tuple[int, int] = 256,
     anti_aliasing: bool = False,
     fill_back: bool = True,
-    near: float = 1.0,
+    near: float = 0.1,
     far: float = 100.0,
     clip: bool = True,
 ) -> Images:
     """The soft colours of SoftRas (Liu et al. 2019), as PyTorch3D's softmax_rgb_blend blends them, and their alpha.
 
-    Other arguments are those of :func:`render` and :func:`render_silhouette`; ``near`` is 1 by default, as in SoftRas.
-
     Parameters
     ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
+        Without them the meshes are white.
+    lights : Lights, optional
+        Colours are multiplied by the light. Without lights they are drawn unchanged.
+    background : number, [C], or Tensor [B, C]
+        Colour of pixels without a face.
     sigma : float or Tensor []
         Blur beyond the border of faces, as in :func:`render_soft_silhouette`: ``D = sigmoid(+-d^2 / sigma)``, + inside.
     gamma : float or Tensor []
@@ -55,11 +65,21 @@ def render_soft_rgb(
         Faces for which D would be less than this at a pixel outside are left out there. In (0, 0.5).
     background_eps : float
         Closeness e of the background: 1e-3 in SoftRas, 1e-10 in PyTorch3D.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
 
     Returns
     -------
     Images
-        ``rgb, alpha = render_soft_rgb(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With C_j the colour of face j at the
+        ``rgb, alpha = render_soft(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With C_j the colour of face j at the
         pixel, lit, and ``c_j = (far - z_j) / (far - near)`` the closeness of its depth::
 
             rgb = (sum_j w_j C_j + w_b background) / (sum_j w_j + w_b)
@@ -70,8 +90,9 @@ def render_soft_rgb(
 
     Notes
     -----
-    Source: Liu et al. 2019, equations 2 and 3, and the published code. There colours are interpolated on the screen,
-    here in space. PyTorch3D also keeps ``w_b`` above 1e-10 of the nearest ``exp(c_j / gamma)``.
+    Source: Liu et al. 2019, equations 2 and 3, and the published code, in which ``near`` is 1 by default. There colours
+    are interpolated on the screen, here in space. PyTorch3D also keeps ``w_b`` above 1e-10 of the nearest
+    ``exp(c_j / gamma)``.
 
     Differentiable in all three coordinates of the vertices, in colours, lights, background, sigma and gamma: the true
     derivative of the image, up to the jumps where faces come within reach or leave the K nearest. The memory is that of
@@ -80,14 +101,14 @@ def render_soft_rgb(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render`; for a sigma or gamma that is not positive, a dist_eps outside (0, 0.5), and a
-        faces_per_pixel that is not an integer in 1..1024.
+        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit, a sigma or gamma that
+        is not positive, a dist_eps outside (0, 0.5), and a faces_per_pixel that is not an integer in 1..1024.
 
     Examples
     --------
     >>> vertices, faces = nmr.icosphere(2)
     >>> camera, colors = nmr.LookAt([0.0, 0.0, -3.0]), nmr.VertexColors((vertices + 1) / 2)
-    >>> rgb, alpha = nmr.render_soft_rgb(vertices, faces, camera, colors=colors, sigma=1e-3, image_size=32)
+    >>> rgb, alpha = nmr.render_soft(vertices, faces, camera, colors=colors, sigma=1e-3, image_size=32)
     """
     scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
     dtype, layers = scene.mesh.vertices.dtype, check_size(faces_per_pixel, "faces_per_pixel", 1024)
@@ -110,7 +131,7 @@ def _blend(
     near: float,
     far: float,
 ) -> tuple[Tensor, Tensor]:
-    """The formula of :func:`render_soft_rgb` for colours ``[B, H, W, K, C]`` on a background ``[B | 1, C]``."""
+    """The formula of :func:`render_soft` for colours ``[B, H, W, K, C]`` on a background ``[B | 1, C]``."""
     sigma, gamma, zero = sigma.to(colors), gamma.to(colors), colors.new_zeros(())
     covers = torch.where(fragments.covered, torch.sigmoid(-fragments.distances / sigma), zero)
     closeness = (far - fragments.depth) / (far - near)
@@ -143,14 +164,40 @@ def render_transparent(
 ) -> Images:
     """Colour images of transparent surfaces: the K nearest of each pixel are shaded and composited front to back.
 
-    Other arguments are those of :func:`render`.
-
     Parameters
     ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
+        Without them the meshes are white.
+    lights : Lights, optional
+        Colours are multiplied by the light. Without lights they are drawn unchanged.
+    background : number, [C], or Tensor [B, C]
+        Colour of pixels without a face.
     opacity : number in [0, 1], Tensor [] or [B], or colours of one channel
         How much of the light from behind a surface is held back. For instance ``nmr.FaceColors`` of ``[F, 1]``.
     faces_per_pixel : int
         K in 1..1024. Surfaces behind the K nearest are left out.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
+    eps : float
+        In NMR's gradient, added to the distance between an edge and a pixel.
+    interpolation_gradient : bool
+        Adds the true derivative of interpolated colours with respect to the position of a pixel on its face, so that
+        vertices also move to shift colours under the pixels. The published renderer does not have this: there colours
+        move vertices only through edges.
 
     Returns
     -------
@@ -169,8 +216,8 @@ def render_transparent(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render`; for an opacity outside [0, 1] or of several channels, and a faces_per_pixel that is not an
-        integer in 1..1024.
+        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit, an opacity outside
+        [0, 1] or of several channels, and a faces_per_pixel that is not an integer in 1..1024.
 
     Examples
     --------

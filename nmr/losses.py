@@ -64,34 +64,13 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
             "prediction and target must have the same shape [B, ...] with B >= 1, "
             f"got {describe(prediction)} and {describe(target)}"
         )
-    _check_mask(target)
     dtype = torch.float64 if prediction.dtype == torch.float64 else torch.float32
-    prediction, target = prediction.flatten(1).to(dtype), target.flatten(1).to(dtype)
+    prediction, target = prediction.to(dtype), target.to(dtype)
     compiling = torch.compiler.is_compiling()
     forward_mode = not compiling and any(unpack_dual(x).tangent is not None for x in (prediction, target))
     if prediction.is_cpu and target.is_cpu and not forward_mode:
-        iou, _ = ops.soft_iou(prediction, target)
-    else:
-        iou = _soft_iou(prediction, target)
-    return 1 - iou.mean()
-
-
-def _check_mask(target: Tensor) -> None:
-    """Raises ValueError for a target such as a mask of 0 and 255.
-
-    Values a little outside of [0, 1], as resampling makes them, are allowed. Nothing is checked when compiled, traced
-    or on a GPU.
-    """
-    if torch.compiler.is_compiling() or not target.is_cpu or target.numel() == 0 or target.dtype == torch.bool:
-        return
-    try:
-        low, high = (x.item() for x in target.detach().aminmax())
-    except RuntimeError:  # inside torch.func.vmap values cannot be read
-        return
-    if low < -0.5 or high > 1.5:
-        raise ValueError(
-            f"target must lie in [0, 1], got values from {low:.4g} to {high:.4g}; divide a mask of 0..255 by 255"
-        )
+        return ops.soft_iou_loss(prediction, target)[0]
+    return 1 - _soft_iou(prediction.flatten(1), target.flatten(1)).mean()
 
 
 def _soft_iou(prediction: Tensor, target: Tensor) -> Tensor:

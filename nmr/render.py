@@ -23,7 +23,7 @@ def render(
     faces: Meshes,
     camera: Camera | None = None,
     *,
-    outputs: Sequence[str] = ("rgb", "alpha", "depth"),
+    outputs: str | Sequence[str] = ("rgb", "alpha", "depth"),
     colors: Colors | None = None,
     lights: Lights | None = None,
     background: float | Sequence[float] | Tensor = 0.0,
@@ -35,36 +35,59 @@ def render(
     clip: bool = True,
     eps: float = 1e-4,
     gradient: str = "nmr",
-    smooth_normals: bool = False,
+    smooth: bool = False,
+    space: str = "world",
     interpolation_gradient: bool = False,
 ) -> Images:
     """Several images of meshes in one pass: the meshes are transformed and rasterized once.
 
     Parameters
     ----------
-    vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps, gradient
-        As :func:`render_silhouette`; the notes say what the gradients of edges are for colours.
-    outputs : sequence of "rgb", "alpha", "depth", "normals", "fragments"
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+    outputs : "rgb", "alpha", "depth", "normals", "fragments", or a sequence of these
         What to draw. These are also the names of the attributes of the result.
     colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
-        For rgb. Without them the meshes are white.
+        Without them the meshes are white.
     lights : Lights, optional
         Colours are multiplied by the light. Without lights they are drawn unchanged.
     background : number, [C], or Tensor [B, C]
         Colour of pixels without a face.
-    smooth_normals : bool
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
+    eps : float
+        In NMR's gradient, added to the distance between an edge and a pixel; in the local one the least difference of
+        two rates.
+    gradient : "nmr", "local" or "none"
+        The definition of the gradient at edges. The images are the same.
+    smooth : bool
         For the output "normals": interpolated normals of the vertices instead of normals of the faces.
+    space : "world" or "camera"
+        For the output "normals": "camera" means x to the right of the image, y up, z away from the viewer.
     interpolation_gradient : bool
-        For rgb, adds the true derivative of interpolated colours with respect to the position of a pixel on its face,
-        so that vertices also move to shift colours under the pixels. The published renderer does not have this: there
-        colours move vertices only through edges.
+        Adds the true derivative of interpolated colours with respect to the position of a pixel on its face, so that
+        vertices also move to shift colours under the pixels. The published renderer does not have this: there colours
+        move vertices only through edges.
 
     Returns
     -------
     Images
         ``images.rgb[b, y, x]`` is the colour [C] of the pixel in row y from the top, mean of 2x2 with anti-aliasing
-        (background mixed in at edges); alpha, depth, normals as in :func:`render_silhouette`, :func:`render_depth` and
-        :func:`render_normals`; fragments at the resolution of the raster (2h x 2w with anti-aliasing).
+        (background mixed in at edges). alpha ``[B, h, w]`` is the covered part of the pixel; depth ``[B, h, w]`` is z
+        of the nearest face, ``far`` on background; normals ``[B, h, w, 3]`` are those of the side that is seen;
+        fragments have the resolution of the raster (2h x 2w with anti-aliasing).
 
     Notes
     -----
@@ -88,7 +111,8 @@ def render(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`; for unknown outputs; for colours, lights and backgrounds that do not fit.
+        For wrong types, shapes and ranges, for faces that refer to missing vertices, for unknown outputs, and for
+        colours, lights and backgrounds that do not fit.
 
     Examples
     --------
@@ -96,16 +120,14 @@ def render(
     >>> camera = nmr.LookAt.from_angles(2.732, 30.0, [0.0, 90.0])
     >>> rgb, depth = nmr.render(vertices, faces, camera, outputs=("rgb", "depth"), lights=nmr.Lights(), image_size=64)
     """
-    listed = is_list(outputs) and all(name in OUTPUTS for name in outputs)
-    if not listed or not outputs or len(set(outputs)) != len(outputs):
-        raise ValueError(f"outputs must be a tuple of one or more different names out of {OUTPUTS}, got {outputs!r}")
+    outputs = _check_outputs(outputs)
     check_choice(gradient, "gradient", GRADIENTS)
 
     def scene_of(vertices, faces, camera, *shading):
         return make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
 
     def draw(vertices, faces, camera, background, colors, lights, face_index=None):
-        how = interpolation_gradient, gradient, smooth_normals
+        how = interpolation_gradient, gradient, smooth, space
         return _draw(scene_of(vertices, faces, camera), face_index, outputs, background, colors, lights, *how)
 
     arguments, chunks = (vertices, faces, camera, background, colors, lights), None
@@ -117,6 +139,15 @@ def render(
     return Images(draw_chunks(chunks, lambda *some: scene_of(*some).rasterize(), draw))
 
 
+def _check_outputs(outputs: object) -> tuple[str, ...]:
+    names = (outputs,) if isinstance(outputs, str) else outputs
+    listed = is_list(names) and all(name in OUTPUTS for name in names)
+    if not listed or not names or len(set(names)) != len(names):
+        hint = '; the silhouette is "alpha"' if is_list(names) and "silhouette" in names else ""
+        raise ValueError(f"outputs must be one or more different names out of {OUTPUTS}, got {outputs!r}{hint}")
+    return tuple(names)
+
+
 def _draw(
     scene: Scene,
     face_index: Tensor | None,
@@ -126,7 +157,8 @@ def _draw(
     lights: Lights | None,
     interpolation_gradient: bool,
     gradient: str,
-    smooth_normals: bool,
+    smooth: bool,
+    space: str,
 ) -> dict[str, Tensor | Fragments]:
     """The outputs of :func:`render`. If the face index map is known, it is not drawn again."""
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
@@ -162,7 +194,7 @@ def _draw(
         if "depth" in images and local:
             images["depth"] = fragments._resolve(fragments.depth.unsqueeze(-1), None, gradient).squeeze(-1)
         if "normals" in images:
-            normals = fragments.normals(smooth_normals)
+            normals = fragments.normals(smooth, space)
             images["normals"] = (
                 fragments._resolve(normals, None, gradient) if local else average(normals, anti_aliasing)
             )
@@ -199,12 +231,52 @@ def render_rgb(
     gradient: str = "nmr",
     interpolation_gradient: bool = False,
 ) -> Tensor:
-    """Colour images of meshes; the arguments, gradients and errors are those of :func:`render`.
+    """Colour images of meshes: the output rgb of :func:`render`, with its gradients.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
+        Without them the meshes are white.
+    lights : Lights, optional
+        Colours are multiplied by the light. Without lights they are drawn unchanged.
+    background : number, [C], or Tensor [B, C]
+        Colour of pixels without a face.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
+    eps : float
+        In NMR's gradient, added to the distance between an edge and a pixel; in the local one the least difference of
+        two rates.
+    gradient : "nmr", "local" or "none"
+        The definition of the gradient at edges. The images are the same.
+    interpolation_gradient : bool
+        Adds the true derivative of interpolated colours with respect to the position of a pixel on its face, so that
+        vertices also move to shift colours under the pixels. The published renderer does not have this: there colours
+        move vertices only through edges.
 
     Returns
     -------
     Tensor [B, h, w, C]
         ``rgb[b, y, x]`` is the colour of the pixel in row y from the top, with as many channels as ``colors`` have.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For wrong types, shapes and ranges, for faces that refer to missing vertices, and for colours, lights and
+        backgrounds that do not fit.
 
     Examples
     --------
@@ -348,16 +420,32 @@ def render_soft_silhouette(
     far: float = 100.0,
     clip: bool = True,
 ) -> Tensor:
-    """The soft silhouettes of SoftRas (Liu et al. 2019); other arguments as in :func:`render_silhouette`.
+    """The soft silhouettes of SoftRas (Liu et al. 2019).
 
     Parameters
     ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
     sigma : float or Tensor []
         How soft the image is. A pixel at the distance d from the border of a face is covered by it with probability
         ``D = sigmoid(d^2 / sigma)`` if it is inside, else ``sigmoid(-d^2 / sigma)``. d is in units of half the shorter
         side of the image: at sqrt(sigma) from the border D is 0.27 or 0.73.
     dist_eps : float
         Faces for which D would be less than this at a pixel outside are left out there. In (0, 0.5).
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
 
     Returns
     -------
@@ -374,7 +462,8 @@ def render_soft_silhouette(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`; for a sigma that is not positive, and a dist_eps outside (0, 0.5).
+        For wrong types, shapes and ranges, for faces that refer to missing vertices, for a sigma that is not positive,
+        and a dist_eps outside (0, 0.5).
 
     Examples
     --------
@@ -406,7 +495,26 @@ def render_depth(
     far: float = 100.0,
     clip: bool = True,
 ) -> Tensor:
-    """Depth images of meshes; the arguments are those of :func:`render_silhouette`.
+    """Depth images of meshes.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
 
     Returns
     -------
@@ -422,7 +530,7 @@ def render_depth(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`.
+        For wrong types, shapes and ranges, and for faces that refer to missing vertices.
 
     Examples
     --------
@@ -448,14 +556,30 @@ def render_normals(
     far: float = 100.0,
     clip: bool = True,
 ) -> Tensor:
-    """Normals of meshes in world or camera space; other arguments as in :func:`render_silhouette`.
+    """Normals of meshes in world or camera space.
 
     Parameters
     ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
     smooth : bool
         Interpolated normals of the vertices instead of normals of the faces.
     space : "world" or "camera"
         "camera": x to the right of the image, y up, z away from the viewer.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
 
     Returns
     -------
@@ -472,7 +596,7 @@ def render_normals(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`.
+        For wrong types, shapes and ranges, and for faces that refer to missing vertices.
 
     Examples
     --------
@@ -500,10 +624,28 @@ def render_fragments(
     faces_per_pixel: int = 1,
     blur_radius: float = 0.0,
 ) -> Fragments:
-    """Face, weights and depth at each pixel, for shading of your own; arguments as in :func:`render_silhouette`.
+    """Face, weights and depth at each pixel, for shading of your own.
 
     Parameters
     ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    anti_aliasing : bool
+        Render 2h x 2w pixels and average 2x2 of them.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
+    eps : float
+        That of NMR's gradient in :meth:`Fragments.resolve`.
     faces_per_pixel : int
         K in 1..1024: how many surfaces to return, one behind the other. 1 means the nearest, without an axis for K.
     blur_radius : float
@@ -525,7 +667,8 @@ def render_fragments(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`; for a faces_per_pixel that is not an integer in 1..1024.
+        For wrong types, shapes and ranges, for faces that refer to missing vertices, and for a faces_per_pixel that is
+        not an integer in 1..1024.
 
     Examples
     --------
@@ -559,7 +702,24 @@ def render_face_index(
     far: float = 100.0,
     clip: bool = True,
 ) -> Tensor:
-    """Which face is nearest at each pixel centre; the arguments are those of :func:`render_silhouette`.
+    """Which face is nearest at each pixel centre.
+
+    Parameters
+    ----------
+    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+    faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
+        Vertex indices.
+    camera : Camera, optional
+        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+    image_size : int or (height, width)
+        Pixels: h and w; an int means a square.
+    fill_back : bool
+        Also draw faces that are seen from behind (clockwise on the screen).
+    near, far : float
+        A pixel is covered only if near < depth < far.
+    clip : bool
+        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
 
     Returns
     -------
@@ -570,7 +730,7 @@ def render_face_index(
     Raises
     ------
     TypeError, ValueError
-        As :func:`render_silhouette`.
+        For wrong types, shapes and ranges, and for faces that refer to missing vertices.
 
     Examples
     --------

@@ -144,7 +144,7 @@ class TextureCubes:
             return fragments._each_layer(self.sample(fragments._wide()))
         textures = check_values(self.textures, "textures", "F, ts, ts, ts, C")
         textures = fragments.mesh.values(textures, "textures", "face")
-        return ops.sample_texture_cubes(
+        return ops.texture_cubes(
             textures, fragments.sided_face_index, fragments.weights, fragments.mesh.starts, fragments.eps
         )
 
@@ -233,7 +233,8 @@ class UVTexture:
             vertices = fragments.vertices
             if not has_perspective(fragments.camera):  # as at one depth
                 vertices = torch.cat([vertices[..., :2], torch.ones_like(vertices[..., 2:])], dim=-1)
-            level = ops.uv_levels(vertices, *fragments.mesh[1:3], *at, grids)
+            values = (x if x is None else x.detach() for x in (vertices, *fragments.mesh[1:3], *at, grids))
+            level = ops.uv_levels(*values)
         return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(self.wrap))
 
     def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, int]:

@@ -4,11 +4,13 @@ Our own code is in blocks marked ``python``. Code of other libraries is not run;
 """
 
 import importlib.util
+import json
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import get_args
 
 import imageio.v3 as imageio
@@ -19,9 +21,9 @@ import tyro
 
 from learn3d.commands import main
 from learn3d.data.readers import READERS
-from learn3d.experiments.tables import TABLES
 from learn3d.methods.optimization import LRSchedule
 from learn3d.presets import PRESETS
+from learn3d.studio.tables.tables import TABLES
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -158,7 +160,7 @@ def test_every_promise_has_a_test() -> None:
     lines = [line for line in page.splitlines() if line.startswith("|") and not line.startswith(("|---", "| fault"))]
     assert len(lines) > 20
     for line in lines:
-        named = re.findall(r"`((?:\w+/)?test_\w+\.py)::(\w+)`", line.split("|")[3])
+        named = re.findall(r"`((?:\w+/)*test_\w+\.py)::(\w+)`", line.split("|")[3])
         assert named, line
         for file, name in named:
             source = (ROOT / "tests" / "learn3d" / file).read_text()
@@ -181,9 +183,15 @@ def test_the_results_in_the_pages_are_in_the_files() -> None:
         assert len(figures) >= 9 and not set(figures) - known
 
 
-_spec = importlib.util.spec_from_file_location("make_pictures", ROOT / "docs" / "make_pictures.py")
-make_pictures = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(make_pictures)
+def _load(script: str) -> ModuleType:
+    """A script of docs/ as a module."""
+    spec = importlib.util.spec_from_file_location(script, ROOT / "docs" / f"{script}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+make_pictures, draw_curves = _load("make_pictures"), _load("draw_curves")
 
 
 def test_every_picture_has_a_command_and_a_record() -> None:
@@ -212,3 +220,23 @@ def test_a_changed_source_is_noticed(monkeypatch, tmp_path) -> None:
     assert make_pictures.out_of_date() == []
     source.write_text("2")
     assert make_pictures.out_of_date() == ["a.png"]
+
+
+def test_curves_are_drawn_by_images_and_as_the_mean_of_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = {"airplane/vanilla-seed0": "128", "airplane/vanilla-seed1": "128", "airplane/plus-seed0": "32"}
+    tables = {"runs": [["run", "networks", "iterations", "batch"]], "curves": [["run", "split", "step", "IoU", "MMD"]]}
+    for number, (run, batch) in enumerate(runs.items()):
+        tables["runs"].append([run, "step 1000", "1000", batch])
+        tables["curves"] += [[run, "test", step, f"0.{number + 1}", "-"] for step in ("500", "1000")]
+    (tmp_path / "short.json").write_text(json.dumps(tables))
+    longer = tables["curves"][-1][:2] + ["1500", "0.5", "0.1"]
+    (tmp_path / "long.json").write_text(json.dumps(tables | {"curves": [*tables["curves"], longer]}))
+    monkeypatch.setattr(draw_curves, "RESULTS", tmp_path)
+    curves = draw_curves.read_curves(["short", "long", "short=generated"])
+    assert list(curves) == ["airplane", "generated airplane"]
+    assert curves["airplane"]["plus"]["0"][:, 0].tolist() == [125, 250, 375], "steps of 32 images count a quarter"
+    lines = draw_curves.draw(curves).axes[0].get_lines()
+    assert {line.get_label(): line.get_ydata().tolist() for line in lines} == {
+        "Vanilla-AE": [pytest.approx(0.15)] * 2,
+        "Plus": [0.3, 0.3, 0.5],
+    }

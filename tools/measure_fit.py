@@ -12,11 +12,11 @@ import tyro
 import nmr
 from learn3d.data.conventions import KATO, mesh_to_object, view_poses
 from learn3d.data.poses import wrap_deg
-from learn3d.fitting.fit import fit, predict
-from learn3d.fitting.templates import fit_template
-from learn3d.make_data.meshes import check, fit_to_box, mesh_sources
-from learn3d.pictures.studio import natural_look, photograph
-from learn3d.reconstruction import frame, load_model, recognize, reduce_mask
+from learn3d.pictures.photograph import natural_look, photograph
+from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
+from learn3d.studio.picture_to_mesh.fit import fit, predict
+from learn3d.studio.picture_to_mesh.reconstruction import frame, load_model, recognize, reduce_mask
+from learn3d.studio.picture_to_mesh.templates import fit_template
 
 COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,azimuth,kind,warned".split(",")
 

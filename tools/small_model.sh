@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes the model that comes with the package, learn3d/models/small.safetensors: one network for six categories. It learns from
+# Makes the model that comes with the package, learn3d/studio/picture_to_mesh/small.safetensors: one network for six categories. It learns from
 # 2,000 generated objects of each, and from the models of Debian's furniture packages that are in the public domain or under
 # CC BY, 12 stretched forms of each; 12 random views per form. Its encoder scales every object to one size, because nobody
 # knows how far away the camera of a picture was. The first 1,000 generated objects of each category become templates. A stopped
@@ -31,4 +31,4 @@ again=$([ -e "$out/run" ] && echo --resume || true)
     --iterations "${STEPS:-36000}" --validate-every 5000 --max-val-images 720 --output "$out/run" $again
 "$bin/learn3d" evaluate "$out/run" --data "$out/data" --json "$out/evaluation.json"
 mkdir -p learn3d/models
-"$bin/learn3d" export --run "$out/run" --output learn3d/models/small.safetensors ${OTHERS:+--others "$OTHERS"}
+"$bin/learn3d" export --run "$out/run" --output learn3d/studio/picture_to_mesh/small.safetensors ${OTHERS:+--others "$OTHERS"}

@@ -1,128 +1,79 @@
 // Images of any channels: the mean of 2x2 pixels, and the gradients of edges.
-#include "arrays.h"
+#include "read.h"
 
 namespace nmr {
 namespace {
 
-// The colour of pixels without a face.
-template <class T>
-struct Background {
-  const T* values = nullptr;
-  int64_t batch = 0;
+// The colour of pixels without a face, in both structs.
+template <class T, class Args>
+void read_background(Call& call, Args& args) {
+  const Argument& background = call.read("background? [1|B, C]", args.background);
+  args.background_batch = args.background ? background.shape[0] : 0;
+}
 
-  Background(const std::optional<Array<T>>& background, int64_t images, int64_t channels) {
-    if (!background) return;
-    require(background->ndim() == 2 && (background->shape(0) == 1 || background->shape(0) == images) &&
-                background->shape(1) == channels,
-            "background must have shape [1 or " + std::to_string(images) + ", " + std::to_string(channels) + "], got " +
-                shape_of(*background));
-    values = background->data();
-    batch = background->shape(0);
-  }
-};
-
-// `pixels` is [B, H, W, C], `resolved` [B, h, w, C]; the face index map belongs to the pixels.
 template <class T>
-Resolve<T> resolve_args(const Array<int32_t>& face_index, const Array<T>& resolved,
-                        const std::optional<Array<T>>& background, bool anti_aliasing, int num_threads) {
-  require(resolved.ndim() == 4, "a resolved image must have shape [B, h, w, C], got " + shape_of(resolved));
-  const int64_t batch = resolved.shape(0), channels = resolved.shape(3);
-  const Size image{resolved.shape(1), resolved.shape(2)}, raster = raster_of(image, anti_aliasing);
-  require(image.height >= 1 && image.width >= 1 && channels >= 1,
-          "an image must have pixels and channels, got " + shape_of(resolved));
-  require_shape(face_index, "face_index", {batch, raster.height, raster.width});
-  const Background<T> behind(background, batch, channels);
+Resolve<T> read_resolve(Call& call) {
   Resolve<T> args{};
-  args.batch = batch;
-  args.image = image;
-  args.anti_aliasing = anti_aliasing;
-  args.channels = channels;
-  args.face_index = face_index.data();
-  args.background = behind.values;
-  args.background_batch = behind.batch;
-  args.num_threads = num_threads;
+  call.read("face_index [B, H, W]", args.face_index);
+  args.anti_aliasing = call.flag("anti_aliasing");
+  args.image = image_size(call, args.anti_aliasing);
+  call.read("image [B, H, W, C]", args.pixels);
+  args.batch = call["B"];
+  args.channels = call["C"];
+  require(args.channels >= 1, "image must have at least one channel, got " + call("image").shape_text());
+  read_background<T>(call, args);
+  args.num_threads = num_threads(call);
+  call.result("resolved [B, h, w, C]", args.resolved, args.grad_resolved);
+  call.gradient("image", args.grad_pixels);
+  call.gradient("background", args.grad_background);
   return args;
 }
 
+// The gradient of the edges; the arguments of the mean have been read.
 template <class T>
-void require_pixels(const Array<T>& pixels, const char* name, const Resolve<T>& args) {
-  const Size raster = raster_of(args.image, args.anti_aliasing);
-  require_shape(pixels, name, {args.batch, raster.height, raster.width, args.channels});
+void pull_edges(Call& call, const Resolve<T>& mean) {
+  EdgesBackward<T> args{};
+  args.mesh = read_mesh<T>(call);
+  args.num_threads = mean.num_threads;
+  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh, args.num_threads);
+  args.image = mean.image;
+  args.anti_aliasing = mean.anti_aliasing;
+  args.eps = static_cast<T>(call.number("eps"));
+  args.pixels = mean.pixels;
+  args.channels = mean.channels;
+  args.background = mean.background;
+  args.background_batch = mean.background_batch;
+  args.grad_resolved = mean.grad_resolved;
+  args.perspective = call.flag("perspective");
+  call.gradient("vertices", args.grad_vertices);
+  if (!args.grad_vertices) return;
+  call.flag("local") ? local_edges_backward(args) : edges_backward(args);
 }
 
+// One background for all images gets the sum of their gradients.
 template <class T>
-void resolve_forward_py(const Array<T>& image, const std::optional<Array<T>>& background,
-                        const Array<int32_t>& face_index, Array<T>& resolved, bool anti_aliasing, int num_threads) {
-  Resolve<T> args = resolve_args(face_index, resolved, background, anti_aliasing, num_threads);
-  require_pixels(image, "image", args);
-  args.pixels = image.data();
-  args.resolved = resolved.mutable_data();
-  py::gil_scoped_release release;
-  resolve_forward(args);
-}
-
-template <class T>
-void resolve_backward_py(const Array<T>& grad_resolved, const std::optional<Array<T>>& background,
-                         const Array<int32_t>& face_index, std::optional<Array<T>>& grad_image,
-                         std::optional<Array<T>>& grad_background, bool anti_aliasing, int num_threads) {
-  Resolve<T> args = resolve_args(face_index, grad_resolved, background, anti_aliasing, num_threads);
-  args.grad_resolved = grad_resolved.data();
-  if (grad_image) {
-    require_pixels(*grad_image, "grad_image", args);
-    args.grad_pixels = grad_image->mutable_data();
+void resolve_gradients(Call& call) {
+  Resolve<T> args = read_resolve<T>(call);
+  T* of_shared = args.background_batch == 1 ? args.grad_background : nullptr;
+  std::vector<T> rows(of_shared ? args.batch * args.channels : 0);
+  if (of_shared) args.grad_background = rows.data();
+  if (args.grad_pixels || args.grad_background) resolve_backward(args);
+  for (int64_t c = 0; of_shared && c < args.channels; ++c) {
+    of_shared[c] = 0;
+    for (int64_t b = 0; b < args.batch; ++b) of_shared[c] += rows[b * args.channels + c];
   }
-  args.grad_background = optional_out(grad_background, "grad_background", {args.batch, args.channels});
-  py::gil_scoped_release release;
-  resolve_backward(args);
-}
-
-template <class T>
-void edges_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                       const Array<int32_t>& face_index, const Array<T>& image,
-                       const std::optional<Array<T>>& background, const Array<T>& grad_resolved,
-                       Array<T>& grad_vertices, bool anti_aliasing, double eps, bool local, bool perspective,
-                       int num_threads) {
-  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const Size raster = require_face_index(face_index, mesh, num_threads),
-             size = require_image(face_index, raster, anti_aliasing);
-  require(image.ndim() == 4 && image.shape(3) >= 1, "image must have shape [B, H, W, C], got " + shape_of(image));
-  require_shape(image, "image", {mesh.batch, raster.height, raster.width, image.shape(3)});
-  require_shape(grad_resolved, "grad_resolved", {mesh.batch, size.height, size.width, image.shape(3)});
-  require_like(grad_vertices, "grad_vertices", vertices);
-  const Background<T> behind(background, mesh.batch, image.shape(3));
-  const EdgesBackward<T> args{mesh,
-                              size,
-                              anti_aliasing,
-                              static_cast<T>(eps),
-                              face_index.data(),
-                              image.data(),
-                              image.shape(3),
-                              behind.values,
-                              behind.batch,
-                              grad_resolved.data(),
-                              grad_vertices.mutable_data(),
-                              num_threads,
-                              perspective};
-  py::gil_scoped_release release;
-  local ? local_edges_backward(args) : edges_backward(args);
-}
-
-template <class T>
-void define_edges(py::module_& m) {
-  m.def("resolve_forward", &resolve_forward_py<T>, array("image"), array("background"), array("face_index"),
-        array("resolved"), py::arg("anti_aliasing"), py::arg("num_threads"));
-  m.def("resolve_backward", &resolve_backward_py<T>, array("grad_resolved"), array("background"), array("face_index"),
-        array("grad_image"), array("grad_background"), py::arg("anti_aliasing"), py::arg("num_threads"));
-  m.def("edges_backward", &edges_backward_py<T>, array("vertices"), array("faces"), array("starts"),
-        array("face_index"), array("image"), array("background"), array("grad_resolved"), array("grad_vertices"),
-        py::arg("anti_aliasing"), py::arg("eps"), py::arg("local"), py::arg("perspective"), py::arg("num_threads"));
+  pull_edges(call, args);
 }
 
 }  // namespace
 
-void bind_edges(py::module_& m) {
-  define_edges<float>(m);
-  define_edges<double>(m);
+void add_edges(Kernels& kernels) {
+  kernels.add_with_backward("resolve", [](auto zero, Call& call) {
+    using T = decltype(zero);
+    if (call.backward) return resolve_gradients<T>(call);
+    for (const char* name : {"vertices", "faces", "starts"}) call.skip(name);
+    resolve_forward(read_resolve<T>(call));
+  });
 }
 
 }  // namespace nmr

@@ -1,20 +1,125 @@
-// nmr._C: the stages as functions of NumPy arrays.
+// nmr._C: the kernels as functions of tensors (or NumPy arrays) and numbers, given by name. The only file that knows Python.
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+
 #include "../scratch.h"
-#include "arrays.h"
+#include "call.h"
+
+namespace py = pybind11;
+
+namespace nmr {
+namespace {
+
+Type type_of(const py::dtype& dtype) {
+  const auto size = dtype.itemsize();
+  switch (dtype.kind()) {
+    case 'f': return size == 4 ? Type::float32 : size == 8 ? Type::float64 : Type::other;
+    case 'i': return size == 4 ? Type::int32 : size == 8 ? Type::int64 : Type::other;
+    case 'b': return Type::boolean;
+    default: return Type::other;
+  }
+}
+
+// What is asked of tensors. They belong to the interpreter, and are never freed.
+struct Torch {
+  py::handle tensor = of_torch("Tensor");
+  std::vector<std::pair<py::handle, Type>> dtypes;
+  py::handle is_cpu = name("is_cpu"), is_contiguous = name("is_contiguous"), is_neg = name("is_neg"),
+             data_ptr = name("data_ptr"), shape = name("shape"), dtype = name("dtype");
+
+  Torch() {
+    const std::pair<const char*, Type> names[] = {{"float32", Type::float32}, {"float64", Type::float64},
+                                                  {"int32", Type::int32},     {"int64", Type::int64},
+                                                  {"bool", Type::boolean}};
+    for (const auto& [name, type] : names) dtypes.emplace_back(of_torch(name), type);
+  }
+  static py::handle of_torch(const char* name) { return py::object(py::module_::import("torch").attr(name)).release(); }
+  static py::handle name(const char* text) { return PyUnicode_InternFromString(text); }
+  static const Torch& get() {
+    static const Torch* torch = new Torch;
+    return *torch;
+  }
+};
+
+py::object ask(const py::handle& value, const py::handle& method) {
+  PyObject* answer = PyObject_CallMethodNoArgs(value.ptr(), method.ptr());
+  if (!answer) throw py::error_already_set();
+  return py::reinterpret_steal<py::object>(answer);
+}
+
+// A tensor in host memory. One with gaps is copied; `kept` holds the copy during the call.
+void read_tensor(py::object tensor, Argument& argument, py::list& kept) {
+  const Torch& torch = Torch::get();
+  if (!py::getattr(tensor, torch.is_cpu).cast<bool>()) throw py::type_error(argument.name + " must be in host memory");
+  if (ask(tensor, torch.is_neg).cast<bool>()) tensor = tensor.attr("resolve_neg")();
+  if (!ask(tensor, torch.is_contiguous).cast<bool>()) tensor = tensor.attr("contiguous")();
+  kept.append(tensor);
+  argument.data = reinterpret_cast<void*>(ask(tensor, torch.data_ptr).cast<uintptr_t>());
+  for (const py::handle& size : py::getattr(tensor, torch.shape)) argument.shape.push_back(size.cast<int64_t>());
+  argument.type = Type::other;
+  const py::object dtype = py::getattr(tensor, torch.dtype);
+  for (const auto& [known, type] : torch.dtypes)
+    if (dtype.is(known)) argument.type = type;
+}
+
+Argument argument_of(const py::handle& name, const py::handle& value, py::list& kept) {
+  Argument argument;
+  argument.name = py::cast<std::string>(name);
+  if (value.is_none()) return argument;
+  if (PyObject_TypeCheck(value.ptr(), reinterpret_cast<PyTypeObject*>(Torch::get().tensor.ptr()))) {
+    read_tensor(py::reinterpret_borrow<py::object>(value), argument, kept);
+  } else if (py::isinstance<py::array>(value)) {
+    const auto array = py::reinterpret_borrow<py::array>(value);
+    argument.type = type_of(array.dtype());
+    argument.data = const_cast<void*>(array.data());
+    argument.contiguous = array.flags() & py::array::c_style;
+    argument.shape.assign(array.shape(), array.shape() + array.ndim());
+  } else if (PyFloat_Check(value.ptr()) || PyLong_Check(value.ptr())) {
+    argument.type = Type::number;
+    argument.number = value.cast<double>();
+  } else {
+    argument.type = Type::other;
+  }
+  return argument;
+}
+
+void define(py::module_& m, const std::string& name, const Kernel& kernel, bool backward) {
+  m.def(name.c_str(), [run = kernel.run, backward](const py::kwargs& given) {
+    py::list kept;
+    std::vector<Argument> arguments;
+    arguments.reserve(given.size());
+    for (const auto& [key, value] : given) arguments.push_back(argument_of(key, value, kept));
+    Call call(std::move(arguments), backward);
+    try {
+      const py::gil_scoped_release release;
+      run(call);
+      call.require_all_read();
+    } catch (const WrongType& error) {
+      throw py::type_error(error.what());
+    }
+  });
+}
+
+}  // namespace
+}  // namespace nmr
 
 PYBIND11_MODULE(_C, m) {
   m.doc() = "Compiled kernels of nmr. Use the functions of the package nmr, which validate and document.";
   m.def("free_scratch", &nmr::ThreadScratch::free_all, py::call_guard<py::gil_scoped_release>(),
         "Frees the memory that threads keep between calls, except that of threads at work.");
-  nmr::bind_camera(m);
-  nmr::bind_clip(m);
-  nmr::bind_raster(m);
-  nmr::bind_soft(m);
-  nmr::bind_fragments(m);
-  nmr::bind_edges(m);
-  nmr::bind_shade(m);
-  nmr::bind_texture(m);
-  nmr::bind_clip_space(m);
-  nmr::bind_lights(m);
-  nmr::bind_mesh(m);
+  nmr::Kernels kernels;
+  nmr::add_camera(kernels);
+  nmr::add_raster(kernels);
+  nmr::add_soft(kernels);
+  nmr::add_fragments(kernels);
+  nmr::add_edges(kernels);
+  nmr::add_shade(kernels);
+  nmr::add_texture(kernels);
+  nmr::add_clip_space(kernels);
+  nmr::add_lights(kernels);
+  nmr::add_mesh(kernels);
+  for (const nmr::Kernel& kernel : kernels) {
+    nmr::define(m, kernel.name, kernel, false);
+    if (kernel.has_backward) nmr::define(m, kernel.name + "_backward", kernel, true);
+  }
 }

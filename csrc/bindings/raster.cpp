@@ -1,93 +1,110 @@
-// The rasterizer and the silhouette, with its two gradients.
-#include "arrays.h"
+// Near-plane clipping, the rasterizer, and the silhouette with its two gradients.
+#include "read.h"
 
 namespace nmr {
 namespace {
 
+// -1 if no mesh has a vertex behind the plane: all stay as they are.
 template <class T>
-void rasterize_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                  Array<int32_t>& face_index, bool fill_back, double near, double far, bool perspective, int num_threads) {
-  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  require(face_index.ndim() == 3 && face_index.shape(0) == mesh.batch && face_index.shape(1) >= 1 &&
-              face_index.shape(1) <= 16384 && face_index.shape(2) >= 1 && face_index.shape(2) <= 16384,
-          "face_index must have shape [" + std::to_string(mesh.batch) + ", H, W] with H and W in 1..16384, got " +
-              shape_of(face_index));
-  const Size raster{face_index.shape(1), face_index.shape(2)};
-  const Rasterize<T> args{
-      mesh, {raster, fill_back, static_cast<T>(near), static_cast<T>(far), perspective}, face_index.mutable_data(),
-      num_threads};
-  py::gil_scoped_release release;
-  rasterize(args);
+void count_clipped(Call& call) {
+  const T* vertices = nullptr;
+  const T near = static_cast<T>(call.number("near"));
+  const bool packed = call.has("starts");
+  const Argument& points = call.read(packed ? "vertices [N, 3]" : "vertices [B, V, 3]", vertices);
+  ClipCount<T> args{{}, near, nullptr, num_threads(call)};
+  const Argument& counts = call.read("counts [meshes, 2]", args.counts);
+  if (!crosses_near(vertices, points.count() / 3, near)) {
+    for (const char* name : {"faces", "starts"}) call.skip(name);
+    std::fill_n(args.counts, counts.count(), int64_t(-1));
+    return;
+  }
+  args.mesh = read_mesh<T>(call);
+  require(call["B"] == call["meshes"], "counts must have a row per mesh, got " + counts.shape_text());
+  clip_count(args);
 }
 
 template <class T>
-void rasterize_layers_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                         Array<int32_t>& face_index, bool fill_back, double near, double far, bool perspective, int num_threads) {
-  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  require(face_index.ndim() == 4 && face_index.shape(0) == mesh.batch && face_index.shape(1) >= 1 &&
-              face_index.shape(1) <= 16384 && face_index.shape(2) >= 1 && face_index.shape(2) <= 16384 &&
-              face_index.shape(3) >= 1,
-          "face_index must have shape [" + std::to_string(mesh.batch) + ", H, W, K] with H and W in 1..16384, got " +
-              shape_of(face_index));
-  const RasterSettings<T> settings{
-      {face_index.shape(1), face_index.shape(2)}, fill_back, static_cast<T>(near), static_cast<T>(far), perspective};
-  const RasterizeLayers<T> args{mesh, settings, face_index.shape(3), face_index.mutable_data(), num_threads};
-  py::gil_scoped_release release;
-  rasterize_layers(args);
+ClipFaces<T> read_clip(Call& call) {
+  ClipFaces<T> args{};
+  args.mesh = read_mesh<T>(call);
+  args.near = static_cast<T>(call.number("near"));
+  args.num_threads = num_threads(call);
+  call.read("new_starts [B + 1, 2]", args.starts);
+  call.read("drawn_faces [D, 3]", args.faces);
+  call.read("source [D]", args.source);
+  call.read("corners [D, 3]", args.corners);
+  call.read("ends [P, 4]", args.ends);
+  const int64_t batch = args.mesh.batch;
+  require_starts(args.starts, batch, call["P"], call["D"]);
+  std::vector<int64_t> counts(2 * batch);
+  clip_count(ClipCount<T>{args.mesh, args.near, counts.data(), args.num_threads});
+  for (int64_t n = 0; n < 2 * batch; ++n)
+    require(args.starts[n + 2] - args.starts[n] >= counts[n],
+            "new_starts leave too little room for the clipped meshes");
+  for (int64_t b = 0; b < batch; ++b)
+    require(args.mesh.vertex_count(b) > 0 || args.starts[2 * b + 3] == args.starts[2 * b + 1],
+            "a mesh without vertices has no faces");
+  return args;
 }
 
 template <class T>
-void silhouette_forward_py(const Array<int32_t>& face_index, Array<T>& alpha, bool anti_aliasing, int num_threads) {
-  require(alpha.ndim() == 3, "alpha must have shape [B, h, w], got " + shape_of(alpha));
-  const Size image{alpha.shape(1), alpha.shape(2)}, raster = raster_of(image, anti_aliasing);
-  require_shape(face_index, "face_index", {alpha.shape(0), raster.height, raster.width});
-  const SilhouetteForward<T> args{face_index.data(), alpha.shape(0),       image,
-                                  anti_aliasing,     alpha.mutable_data(), num_threads};
-  py::gil_scoped_release release;
+Rasterize<T> read_rasterize(Call& call) {
+  Rasterize<T> args{};
+  args.mesh = read_mesh<T>(call);
+  call.read("face_index [B, H, W]", args.face_index);
+  args.settings = raster_settings<T>(call, drawn_size(call, "face_index"), call.flag("perspective"));
+  args.num_threads = num_threads(call);
+  return args;
+}
+
+template <class T>
+RasterizeLayers<T> read_layers(Call& call) {
+  RasterizeLayers<T> args{};
+  args.mesh = read_mesh<T>(call);
+  call.read("face_index [B, H, W, K]", args.face_index);
+  args.settings = raster_settings<T>(call, drawn_size(call, "face_index"), call.flag("perspective"));
+  args.layers = num_layers(call);
+  args.num_threads = num_threads(call);
+  return args;
+}
+
+// The silhouette draws the face index map first.
+template <class T>
+void draw_silhouette(Call& call) {
+  const Rasterize<T> drawn = read_rasterize<T>(call);
+  SilhouetteForward<T> args{drawn.face_index, drawn.mesh.batch, {}, call.flag("anti_aliasing"), nullptr,
+                            drawn.num_threads};
+  args.image = image_size(call, args.anti_aliasing);
+  call.read("alpha [B, h, w]", args.alpha);
+  rasterize(drawn);
   silhouette_forward(args);
 }
 
-template <class T, void backward(const SilhouetteBackward<T>&)>
-void silhouette_backward_py(const Array<T>& vertices, const Indices& faces, const std::optional<Indices>& starts,
-                            const Array<int32_t>& face_index, const Array<T>& grad_alpha, Array<T>& grad_vertices,
-                            bool anti_aliasing, double eps, int num_threads) {
-  const MeshBatch<T> mesh = mesh_batch(vertices, faces, starts);
-  const Size image = require_image(face_index, require_face_index(face_index, mesh, num_threads), anti_aliasing);
-  require_shape(grad_alpha, "grad_alpha", {mesh.batch, image.height, image.width});
-  require_like(grad_vertices, "grad_vertices", vertices);
-  const SilhouetteBackward<T> args{mesh,
-                                   image,
-                                   anti_aliasing,
-                                   static_cast<T>(eps),
-                                   face_index.data(),
-                                   grad_alpha.data(),
-                                   grad_vertices.mutable_data(),
-                                   num_threads};
-  py::gil_scoped_release release;
-  backward(args);
-}
-
 template <class T>
-void define_raster(py::module_& m) {
-  m.def("rasterize", &rasterize_py<T>, array("vertices"), array("faces"), array("starts"), array("face_index"),
-        py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("perspective"), py::arg("num_threads"));
-  m.def("rasterize_layers", &rasterize_layers_py<T>, array("vertices"), array("faces"), array("starts"),
-        array("face_index"), py::arg("fill_back"), py::arg("near"), py::arg("far"), py::arg("perspective"), py::arg("num_threads"));
-  m.def("silhouette_forward", &silhouette_forward_py<T>, array("face_index"), array("alpha"), py::arg("anti_aliasing"),
-        py::arg("num_threads"));
-  const auto define_backward = [&m](const char* name, auto* function) {
-    m.def(name, function, array("vertices"), array("faces"), array("starts"), array("face_index"), array("grad_alpha"),
-          array("grad_vertices"), py::arg("anti_aliasing"), py::arg("eps"), py::arg("num_threads"));
-  };
-  define_backward("silhouette_backward", &silhouette_backward_py<T, silhouette_backward<T>>);
-  define_backward("local_gradient", &silhouette_backward_py<T, local_gradient<T>>);
+void pull_silhouette(Call& call) {
+  SilhouetteBackward<T> args{};
+  args.mesh = read_mesh<T>(call);
+  args.num_threads = num_threads(call);
+  args.anti_aliasing = call.flag("anti_aliasing");
+  args.eps = static_cast<T>(call.number("eps"));
+  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh, args.num_threads);
+  args.image = image_size(call, args.anti_aliasing);
+  call.read("grad_alpha [B, h, w]", args.grad_alpha);
+  call.only_gradient("vertices", args.grad_vertices);
+  call.flag("local") ? local_gradient(args) : silhouette_backward(args);
 }
 
 }  // namespace
 
-void bind_raster(py::module_& m) {
-  define_raster<float>(m);
-  define_raster<double>(m);
+void add_raster(Kernels& kernels) {
+  kernels.add("clip_count", [](auto zero, Call& call) { count_clipped<decltype(zero)>(call); });
+  kernels.add("clip_faces", [](auto zero, Call& call) { clip_faces(read_clip<decltype(zero)>(call)); });
+  kernels.add("rasterize", [](auto zero, Call& call) { rasterize(read_rasterize<decltype(zero)>(call)); });
+  kernels.add("rasterize_layers", [](auto zero, Call& call) { rasterize_layers(read_layers<decltype(zero)>(call)); });
+  kernels.add_with_backward("silhouette", [](auto zero, Call& call) {
+    using T = decltype(zero);
+    call.backward ? pull_silhouette<T>(call) : draw_silhouette<T>(call);
+  });
 }
 
 }  // namespace nmr

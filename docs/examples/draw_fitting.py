@@ -12,7 +12,7 @@ import tyro
 import nmr
 from learn3d.pictures.sheets import save_gif, tile
 from learn3d.pictures.surfaces import Surface, draw_surface
-from learn3d.shapes import make_shape
+from learn3d.studio.shapes import make_shape
 
 OBJECTS = {"airplane": 3, "car": 3, "chair": 6, "lamp": 3, "sofa": 3, "table": 3}  # category: seed of the generator
 

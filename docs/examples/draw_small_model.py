@@ -11,11 +11,11 @@ import tyro
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
+from learn3d.pictures.photograph import PALETTES, natural_look, photograph
 from learn3d.pictures.sheets import save_png, tile
-from learn3d.pictures.studio import PALETTES, natural_look, photograph
 from learn3d.pictures.surfaces import Surface, draw_around
-from learn3d.reconstruction import export_mesh, load_model, reconstruct_picture
-from learn3d.shapes import CATEGORIES, make_shape
+from learn3d.studio.picture_to_mesh.reconstruction import export_mesh, load_model, reconstruct_picture
+from learn3d.studio.shapes import CATEGORIES, make_shape
 
 SIDE = 140  # of each small picture, in pixels
 TURNS = (0, 60, 120)  # degrees from the camera's side

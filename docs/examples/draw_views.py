@@ -62,7 +62,7 @@ def main(output: Path = Path("output"), views: int = 4, image_size: int = 180) -
         image_size=image_size,
         near=near,
         far=far,
-        smooth_normals=True,
+        smooth=True,
     )
     alpha = images.alpha[..., None]
     depth = ((images.depth - near) / (far - near))[..., None].expand_as(images.rgb)  # background: white

@@ -12,7 +12,7 @@ import tyro
 from torch import Tensor
 
 import nmr
-from learn3d.shapes import make_shape
+from learn3d.studio.shapes import make_shape
 
 
 def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160, seed: int = 2) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import tyro
 from torch import Tensor
 
 import nmr
-from learn3d.shapes import make_shape
+from learn3d.studio.shapes import make_shape
 
 VIEWS = 8
 SHAPES = (("car", 3), ("lamp", 3))  # category, seed

@@ -12,7 +12,7 @@ import tyro
 from torch import Tensor
 
 import nmr
-from learn3d.shapes import make_shape
+from learn3d.studio.shapes import make_shape
 
 LIGHTS = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, -0.4], [-0.7, -0.1, -0.6]])
 

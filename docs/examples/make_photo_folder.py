@@ -12,8 +12,8 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.pictures.studio import photograph
-from learn3d.shapes import make_shape
+from learn3d.pictures.photograph import photograph
+from learn3d.studio.shapes import make_shape
 
 WIDTH, HEIGHT = 320, 240
 FOV_DEG = 40.0  # across the width

@@ -11,21 +11,25 @@ from typing import Annotated, Any, Union
 
 from learn3d.terminal import note, say, unknown_name, without_traceback
 
-#: For each command: its module and class, the extra that installs its packages, and a description.
+#: For each command: its module below learn3d and its class, the extra that installs its packages, and a description.
 COMMANDS = {
-    "train": ("train:Train", "train", "train a model that turns one image into a 3D shape"),
-    "evaluate": ("models:Evaluate", "train", "measure trained models on a test set"),
-    "reconstruct": ("models:Reconstruct", "train", "turn images into meshes with a trained model"),
-    "export": ("models:Export", "train", "write a trained model into one small file"),
-    "demo": ("models:Demo", "demo", "open a page that turns pictures into meshes"),
-    "make-dataset": ("data:MakeDataset", "train", "render a data set from meshes"),
-    "convert-dataset": ("data:ConvertDataset", "train", "convert a data set into shards, for data larger than memory"),
-    "check-dataset": ("data:CheckDataset", "train", "list everything that is wrong with a data set"),
-    "estimate-poses": ("data:EstimatePoses", "train", "find the poses of images from their masks"),
-    "experiment": ("train:Experiment", "train", "make a table of the paper: train, measure, report"),
-    "figures": ("models:Figures", "figures", "draw the paper's figures from trained models"),
-    "report": ("models:Report", "report", "write a page about trained models, with shapes to turn"),
-    "fetch-debian-models": ("data:FetchDebianModels", "train", "get meshes out of Debian packages"),
+    "train": ("commands.train:Train", "train", "train a model that turns one image into a 3D shape"),
+    "evaluate": ("commands.train:Evaluate", "train", "measure trained models on a test set"),
+    "reconstruct": ("studio.commands:Reconstruct", "train", "turn images into meshes with a trained model"),
+    "export": ("studio.commands:Export", "train", "write a trained model into one small file"),
+    "demo": ("studio.commands:Demo", "demo", "open a page that turns pictures into meshes"),
+    "make-dataset": ("studio.commands:MakeDataset", "train", "render a data set from meshes"),
+    "convert-dataset": (
+        "commands.data:ConvertDataset",
+        "train",
+        "convert a data set larger than memory into shards",
+    ),
+    "check-dataset": ("commands.data:CheckDataset", "train", "list everything that is wrong with a data set"),
+    "estimate-poses": ("studio.commands:EstimatePoses", "train", "find the poses of images from their masks"),
+    "experiment": ("studio.commands:Experiment", "train", "make a table of the paper: train, measure, report"),
+    "figures": ("studio.commands:Figures", "figures", "draw the paper's figures from trained models"),
+    "report": ("studio.commands:Report", "report", "write a page about trained models, with shapes to turn"),
+    "fetch-debian-models": ("studio.commands:FetchDebianModels", "train", "get meshes out of Debian packages"),
 }
 HELP = """usage: learn3d COMMAND [OPTIONS]
 
@@ -68,7 +72,7 @@ def main(*given: str) -> int:
 def _load(name: str) -> Any:
     """The class of a command."""
     module, _, kind = COMMANDS[name][0].partition(":")
-    return getattr(importlib.import_module(f"learn3d.commands.{module}"), kind)
+    return getattr(importlib.import_module(f"learn3d.{module}"), kind)
 
 
 def print_completion(shell: str = "bash") -> None:

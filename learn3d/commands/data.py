@@ -1,4 +1,4 @@
-"""Commands on data sets: fetch meshes, make, convert and check a data set, estimate its poses."""
+"""Commands on data sets: check and convert."""
 
 import dataclasses
 from pathlib import Path
@@ -10,48 +10,8 @@ from learn3d.data.conventions import IMAGE_SIZE
 from learn3d.data.layouts import Layout, check_folder, load_dataset
 from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
-from learn3d.make_data.debian.models import fetch_debian_models
-from learn3d.make_data.render import DatasetConfig, make_dataset, make_shards
-from learn3d.pictures.sheets import save_png
-from learn3d.poses.estimate import PoseOptions
-from learn3d.poses.views import MIN_CONFIDENCE, CameraOptions, compare, draw_sheet, estimate_views, load_views
 from learn3d.settings import Count, split_names
-from learn3d.terminal import align, note, say
-
-
-class MakeDataset(Command):
-    """Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of a published one.
-
-    Examples:
-      learn3d make-dataset --output data --category chair --source my_chairs --augment 5
-      learn3d make-dataset --output data --category airplane --procedural 300
-      learn3d make-dataset --output big --category chair --source my_chairs --shards --jobs 8
-    """
-
-    config: DatasetConfig
-
-    def run(self) -> int:
-        if self.config.shards:
-            return make_shards(self.config)
-        say(make_dataset(self.config).text())
-        return 0
-
-
-class FetchDebianModels(Command):
-    """Extract airplanes, chairs, tables, cabinets, sofas and lamps from Debian packages into a folder of PLY meshes.
-
-    Example:
-      learn3d fetch-debian-models --output models
-    """
-
-    output: Path
-    """Folder to write; it must not exist."""
-    packages_dir: Path | None = None
-    """Folder for the .deb files; missing ones are downloaded into it (default: a temporary folder)."""
-
-    def run(self) -> None:
-        say(fetch_debian_models(self.output, self.packages_dir).summary())
-        say(f"written to {self.output}")
+from learn3d.terminal import align, say
 
 
 class CheckDataset(Command):
@@ -133,50 +93,3 @@ class ConvertDataset(Command):
                 shards.remove(folder)  # an unfinished conversion
                 count = shards.write_set(folder, self.layout, dataset)
                 say(f"{folder}: {len(dataset)} images of {dataset.num_objects} objects in {count} shards")
-
-
-class EstimatePoses(Command):
-    """Estimate the pose of each image of a data set from the masks alone, for `learn3d train --poses`.
-
-    Examples:
-      learn3d estimate-poses photos --layout photos --category mug --elevation 20 --output mug-poses.npz
-      learn3d estimate-poses DATA --category airplane --output poses.npz --compare
-
-    It also writes a sheet (poses.png). Look at it: all images below an azimuth must show the object from there.
-    Azimuth 0 is a side that the estimate chooses.
-    """
-
-    data: DataFolder
-    """Folder of the data set."""
-    category: str
-    """Categories, separated by commas, which share the prototypes."""
-    output: Path
-    """File of the table (.npz)."""
-    layout: Layout = "kato"
-    """Arrangement of the files of the data set, see docs/data-sets.md."""
-    options: PoseOptions
-    cameras: CameraOptions
-    compare: bool = False
-    """Compare with the known azimuths, and turn the table into their frame, so that voxel IoU can be measured."""
-    views_per_object: Count | None = None
-    """Number of training images of each object (default: the layout's protocol, one for kar, else all)."""
-
-    def run(self) -> None:
-        check_target(self.output, "--output")
-        datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
-        views = estimate_views(datasets, self.cameras, self.options)
-        table, offset_deg = views.table, 0.0
-        doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
-        say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}")
-        if self.compare:
-            comparison = compare(views)
-            say(comparison.text())
-            offset_deg = comparison.offset_deg
-            table = table.turned(offset_deg)
-        for warning in views.warnings:
-            note(f"warning: {warning}")
-        table.write(self.output)
-        sheet = self.output.with_suffix(".png")
-        save_png(sheet, draw_sheet(views, offset_deg))
-        rows = "first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
-        say(f"written to {self.output}; sheet {sheet}: columns: azimuths; {rows}")

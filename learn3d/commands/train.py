@@ -1,19 +1,16 @@
-"""`learn3d train` and `learn3d experiment`."""
+"""Commands on runs: train a model, and measure trained ones."""
 
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
-import tyro
-
-from learn3d.commands.command import Command
+from learn3d.commands.command import Command, OnDataset, Runs
 from learn3d.config import DEFAULT_PRESET, FROM_PRESET, TrainConfig, load_config
-from learn3d.experiments.experiment import describe_tables, run_experiment
-from learn3d.experiments.plan import Request
-from learn3d.experiments.tables import TABLES
+from learn3d.files.writing import check_target, write_json
 from learn3d.presets import PRESETS, SHORT_NAMES, full_name
-from learn3d.terminal import INTERRUPTED, say
+from learn3d.runs.measurement import MEASURES, class_means, evaluate_runs, format_table
+from learn3d.terminal import INTERRUPTED, align, say
 from learn3d.training import train
 
 
@@ -67,29 +64,34 @@ class Train(Command):
         return 0 if summary.finished else INTERRUPTED
 
 
-class Experiment(Request, Command):
-    """Make a table of the paper: train its runs, measure them, and report the paper's values beside ours.
+class Evaluate(OnDataset):
+    """Measure trained models on a test set: voxel IoU of each category and its mean, and more.
 
-    Examples:
-      learn3d experiment --list
-      learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair --iterations 5000 --jobs 2
-      learn3d experiment ablation --data DATA --output OUTPUT --category chair --set precision=fp32
-      learn3d experiment mmd --data DATA --output OUTPUT --category airplane,chair --iterations 5000 --report-only
-
-    Tables share their runs in OUTPUT/runs/<category>/<method>-seed<k>, with those that `learn3d train` made there:
-    complete runs are skipped, interrupted ones continue. Ctrl-C stops all of them; the same command continues.
+    Example:
+      learn3d evaluate runs/airplane runs/chair --json table.json
     """
 
-    table: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="TABLE")]]
-    list: bool = False
-    """Show the tables and their methods, and exit."""
+    runs: Runs
+    """Run folders, or checkpoint files."""
+    layout: str | None = None
+    """Arrangement of the files of the data set (default: from the run)."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Device on which the networks run."""
+    json: Path | None = None
+    """JSON file for the results, with protocol and versions (default: none)."""
 
     @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> Mapping[str, Any]:
-        return {"table": next(iter(TABLES)), "data": Path(), "output": Path()} if "--list" in arguments else {}
+    def about(cls, everything: bool) -> str:
+        columns = "Columns of the table (means over the images, then over the categories; - if there is no value):"
+        measures = align([("", *measure) for measure in MEASURES.values()])
+        return f"{super().about(everything)}\n\n{columns}\n{measures}"
 
-    def run(self) -> int:
-        if self.list:
-            say(describe_tables())
-            return 0
-        return run_experiment(self)
+    def run(self) -> None:
+        if self.json is not None:
+            check_target(self.json, "--json")
+        results = evaluate_runs(self.runs, **self.pick("layout", "device"))
+        say(format_table(results))
+        if self.json is not None:
+            protocol = {"split": self.split, "checkpoint": self.which}
+            values = [result.model_dump() for result in results]
+            write_json(self.json, {"protocol": protocol, "results": values, "means": class_means(results)})

@@ -78,21 +78,6 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
     return array != 0
 
 
-def read_binvox(path: Path, size: int) -> tuple[np.ndarray, float]:
-    """Read a grid bool [size, size, size] with the mesh's axes x, y, z, and its side in the mesh's units.
-
-    The file has a text header, then runs of (value, count) bytes; y runs fastest, then z, then x.
-    """
-    head, _, runs = read_bytes(path, limits.VOLUME_BYTES, "a binvox file").partition(b"\ndata\n")
-    header = {words[0]: words[1:] for line in head.split(b"\n") if (words := line.split())}
-    scale, (low, high) = float(header[b"scale"][0]), limits.DISTANCE
-    if header[b"dim"] != [b"%d" % size] * 3 or not low <= scale <= high:
-        raise ValueError(f"it has dim {header[b'dim']} and scale {scale}, wanted {size} and {low:g} .. {high:g}")
-    pairs = np.frombuffer(runs, np.uint8)[: len(runs) // 2 * 2].reshape(-1, 2)
-    grid = np.repeat(pairs[:, 0] != 0, pairs[:, 1]).reshape(size, size, size)  # axes x, z, y
-    return np.ascontiguousarray(grid.transpose(0, 2, 1)), scale
-
-
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:
     """Read the tensors of a state dict (.safetensors or from torch.save); half precision becomes float32.
 

@@ -19,7 +19,7 @@ ARRAY_BYTES = 16 * GIB  # array; the images of Kato's largest category: 2.4 GiB
 OBJECT_BYTES = 64 * MIB  # array of one object (cameras, points); 100,000 points with normals: 5 MB
 EXPANSION = 300  # unpacked over packed size of an array above SMALL_BYTES; images: 20
 SMALL_BYTES = 64 * MIB  # EXPANSION does not apply to smaller arrays
-VOLUME_BYTES = 4 * MIB  # voxel file (.mat, .binvox); 32^3 cells: 0.3 MB as float64, 0.07 MB as runs of length 1
+VOLUME_BYTES = 4 * MIB  # voxel file (.mat); 32^3 cells: 0.3 MB as float64
 
 # Images
 IMAGE_FILE_BYTES = 256 * MIB

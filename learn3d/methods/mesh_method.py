@@ -109,14 +109,14 @@ class MeshMethod(Method):
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = ENCODERS[self.settings.encoder](self.info.inverted)
         generator = GENERATORS[self.settings.generator](symmetry=self.settings.symmetry)
-        return {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
+        return {"encoder": encoder.to(memory_format=self.memory_format), "generator": generator}
 
     def create_view_classifier(self) -> dict[str, nn.Module]:
         """The network "view_classifier", if `lambda_view` is above 0."""
         if self.settings.lambda_view == 0:
             return {}
         classifier = ViewClassifier(math.prod(AZIMUTHS.shape), self.info.inverted)
-        return {"view_classifier": classifier.to(memory_format=torch.channels_last)}
+        return {"view_classifier": classifier.to(memory_format=self.memory_format)}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Adam for each network that has weights."""
@@ -154,7 +154,7 @@ class MeshMethod(Method):
     def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's device."""
         with self.autocast():
-            codes = self.encoder(network_input(images, self.device, self.image_size))
+            codes = self.encoder(self._pixels(images))
             vertices = self.generator(codes)
         return codes.float(), vertices
 
@@ -167,9 +167,18 @@ class MeshMethod(Method):
         logits = self._apply(self.view_classifier, images)
         return pose_classification_loss(logits, AZIMUTHS.ids(poses).to(self.device, non_blocking=True))
 
+    @property
+    def memory_format(self) -> torch.memory_format:
+        """Layout of the convolutions: channels last is faster in bf16, and 7 % of a step slower in fp32 (AVX2)."""
+        return torch.channels_last if self.precision == "bf16" else torch.contiguous_format
+
+    def _pixels(self, images: Tensor) -> Tensor:
+        """Stored images as the input of the convolutions."""
+        return network_input(images, self.device, self.image_size, self.memory_format)
+
     def _apply(self, network: nn.Module, images: Tensor) -> Tensor:
         with self.autocast():
-            return network(network_input(images, self.device, self.image_size)).float()
+            return network(self._pixels(images)).float()
 
     def flip_every_second(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Flip every second image if shapes are symmetric: the images, and bool [B], whether each is flipped.

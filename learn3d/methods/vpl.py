@@ -118,7 +118,7 @@ class VPL(MeshMethod):
         if settings.generator.startswith("cube"):
             scales = {"scale": settings.vertex_scale, "object_scale": settings.object_scale}
         generator = GENERATORS[settings.generator](symmetry=settings.symmetry, **scales)
-        networks = {"encoder": encoder.to(memory_format=torch.channels_last), "generator": generator}
+        networks = {"encoder": encoder.to(memory_format=self.memory_format), "generator": generator}
         if settings.lambda_discriminator == 0:
             return networks
         channels = settings.discriminator_channels

@@ -152,17 +152,22 @@ ENCODERS: dict[str, type[ConvEncoder] | type[ResNet18Encoder]] = {
 }
 
 
-def network_input(images: Tensor, device: torch.device | str, size: int = 64) -> Tensor:
-    """Stored images uint8 [B,4,size,size] -> float32 in [0,1] on `device`, channels last."""
+def network_input(
+    images: Tensor,
+    device: torch.device | str,
+    size: int = 64,
+    memory_format: torch.memory_format = torch.channels_last,
+) -> Tensor:
+    """Stored images uint8 [B,4,size,size] -> float32 in [0,1] on `device`, in this layout."""
     if images.dtype != torch.uint8 or images.ndim != 4 or images.shape[1:] != (4, size, size):
         raise ValueError(
             f"images must be uint8 [B, 4, {size}, {size}] (RGB and mask), got {images.dtype} {list(images.shape)}"
         )
     images = images.to(device, non_blocking=True)
-    pixels = torch.empty((len(images), size, size, 4), device=images.device)
+    pixels = torch.empty(images.shape, device=images.device, memory_format=memory_format)
     for channel in range(4):  # one pass converts and copies; torch's own change of layout is slower
-        pixels[..., channel].copy_(images[:, channel])
-    return pixels.div_(255).permute(0, 3, 1, 2)
+        pixels[:, channel].copy_(images[:, channel])
+    return pixels.div_(255)
 
 
 class PreactResNet18(nn.Module):

@@ -12,7 +12,7 @@ from torch import Tensor
 import nmr
 from learn3d.data.conventions import DISTANCE
 from learn3d.data.poses import LookAtPoses, Poses
-from learn3d.pictures.studio import photograph, studio_lights
+from learn3d.pictures.photograph import photograph, studio_lights
 
 CLAY = (0.62, 0.68, 0.78)
 _LIGHT = (-0.5, -0.45, -0.75)  # towards the light: left of, above and behind the camera, in its axes (y is down)

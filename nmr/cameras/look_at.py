@@ -11,24 +11,19 @@ import torch
 from torch import Tensor
 
 from .. import ops
-from .._validate import as_numbers, callers_level
+from .._validate import as_numbers, callers_level, holds_for_all
 from .projection import (
     Numbers,
-    ProjectingCamera,
     Projection,
     SquarePixels,
     as_parameter,
-    batched,
     common_batch,
     warn_if_not_finite,
 )
 
 Scalars = float | Sequence[float] | Tensor
 
-# Camera axes have y down, renderer space has y up.
-_Y_UP = torch.tensor([[[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]], device="cpu")
-_OTHER_RIGHT = torch.tensor([[-1.0], [1.0], [1.0]], device="cpu")
-_SHORTEST = 1e-5  # a shorter up x forward is not stretched to a unit vector (pose.cpp)
+_UNIT = 1 - 1e-6  # a vector whose squared length is smaller was shorter than 1e-5, and not stretched (look_at.cpp)
 _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 
@@ -75,73 +70,72 @@ def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> 
     return value
 
 
-def _fov(half_fov_deg: Scalars) -> float | Tensor:
-    return _scalar(half_fov_deg, "half_fov_deg", _NARROWEST_DEG, 90, "between 0 and 90 degrees")
+class _Placed(SquarePixels):
+    """Base class of cameras given by an eye, a target or direction, an up vector and a field of view or scale."""
+
+    eye: Tensor
+    up: Tensor
+    right_handed: bool
+    perspective = True
+    _names = ("at", "half_fov_deg")  # the fields of the target and of the view
+    _along = False  # the target is a direction
+
+    def _check(self, low: float, high: float, wanted: str) -> None:
+        """Stores the vectors as tensors, and the view; their batch sizes must agree."""
+        target, view = self._names
+        names = ("eye", target, "up")
+        parameters = {name: as_parameter(getattr(self, name), name, 3) for name in names}
+        parameters[view] = _scalar(getattr(self, view), view, low, high, wanted)
+        for name, value in parameters.items():
+            object.__setattr__(self, name, value)
+        scale = parameters[view]
+        as_tensor = scale if isinstance(scale, Tensor) else torch.tensor(scale, dtype=torch.float64, device="cpu")
+        object.__setattr__(self, "_view", as_tensor)
+        common_batch(**{n: x for n, x in parameters.items() if isinstance(x, Tensor) and x.ndim == 1 + (n in names)})
+        self._warn_if_it_sees_nothing(*names)
+
+    def _warn_if_it_sees_nothing(self, *names: str) -> None:
+        """Warns of a pose that is not finite, and of cameras that look along their up vector or at their own place.
+
+        Not when compiled, traced or on a GPU.
+        """
+        parameters = [x.detach() for x in self._parameters()]
+        if torch.compiler.is_compiling() or not all(x.is_cpu for x in parameters):
+            return
+        rows = ops.look_at(*(x.double() for x in parameters), self._along, False, self.perspective, True)
+        sideways = rows[:, :3].square().sum(1)  # 1, but less if up x forward is too short to be stretched
+        if holds_for_all(sideways > _UNIT):
+            return
+        warn_if_not_finite(self, *names)
+        which = (sideways <= _UNIT).nonzero().flatten().tolist()
+        if which:
+            warnings.warn(
+                f"camera {which[0]} of {len(rows)} looks along its up vector, or at its own place ({len(which)} in all)"
+                ": it has no left and right, and its image is empty. Give it another up, for example up=(0, 0, 1) to "
+                "look straight down, or another place.",
+                stacklevel=callers_level(),
+            )
+
+    def _parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.eye, getattr(self, self._names[0]), self.up, self._view
+
+    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, None, bool]:
+        parameters = (x.to("cpu", torch.float64) for x in self._parameters())
+        how = self._along, bool(self.right_handed), self.perspective, dtype == torch.float64
+        return ops.look_at(*parameters, *how), None, self.perspective
+
+    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
+        rows, *_ = self._rows(dtype)
+        matrix, intrinsics, origin, extent = rows.split([12, 6, 3, 1], dim=1)
+        matrix, intrinsics = matrix.reshape(-1, 3, 4), intrinsics.reshape(-1, 2, 3)
+        return Projection(matrix, intrinsics, None, self.perspective, origin, extent.squeeze(1))
 
 
-def _check_pose(camera: ProjectingCamera, *names: str, **scalar: float | Tensor) -> None:
-    """Stores the vectors of a camera as tensors, and a scalar; their batch sizes must agree."""
-    vectors = {name: as_parameter(getattr(camera, name), name, 3) for name in names}
-    for name, value in (vectors | scalar).items():
-        object.__setattr__(camera, name, value)
-    warn_if_not_finite(camera, *vectors)
-    common_batch(
-        **{name: x for name, x in vectors.items() if x.ndim == 2},
-        **{name: x for name, x in scalar.items() if isinstance(x, Tensor) and x.ndim == 1},
-    )
-
-
-def _warn_if_up_is_ahead(forward: Tensor, up: Tensor) -> None:
-    """Warns of cameras that look along their up vector, or at their own place, and so see nothing.
-
-    Not when compiled, traced or on a GPU.
-    """
-    if torch.compiler.is_compiling() or forward.device.type != "cpu" or up.device.type != "cpu":
-        return
-    forward, up = (batched(x.detach(), torch.float64, 3) for x in (forward, up))
-    forward = forward / forward.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-    sideways = torch.linalg.cross(*torch.broadcast_tensors(up, forward))
-    ahead = sideways.norm(dim=-1) < _SHORTEST  # False for NaN
-    try:
-        which = ahead.nonzero().flatten().tolist()
-    except RuntimeError:  # inside torch.func.vmap values cannot be read
-        return
-    if which:
-        warnings.warn(
-            f"camera {which[0]} of {len(ahead)} looks along its up vector, or at its own place ({len(which)} in all): "
-            "it has no left and right, and its image is empty. Give it another up, for example up=(0, 0, 1) to look "
-            "straight down, or another place.",
-            stacklevel=callers_level(),
-        )
-
-
-def _between(eye: Tensor, at: Tensor) -> Tensor:
-    return batched(at, torch.float64, 3) - batched(eye, torch.float64, 3)
-
-
-def _posed(
-    eye: Tensor, forward: Tensor, up: Tensor, right_handed: bool, dtype: torch.dtype, **rest: Tensor | bool | None
-) -> Projection:
-    """The projection of a camera at ``eye`` with the axes of :class:`LookAt`; NaN if they are not finite."""
-    eye, forward, up = (batched(x, dtype, 3) for x in (eye, forward, up))
-    batch = common_batch(forward=forward, up=up)
-    matrix = ops.pose(forward.expand(batch, 3), up.expand(batch, 3))
-    if right_handed:
-        matrix = matrix * _OTHER_RIGHT.to(matrix)
-    return Projection(matrix, origin=eye, **rest)
-
-
-def _perspective(half_fov_deg: float | Tensor, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Intrinsics and extent. The angle is rounded to ``dtype``, as published; its tangent is computed in float64."""
-    if isinstance(half_fov_deg, Tensor):
-        angle = half_fov_deg.to("cpu", torch.float64).reshape(-1) * (math.pi / 180)
-    else:
-        angle = torch.tensor([math.radians(half_fov_deg)], dtype=torch.float64, device="cpu")
-    return {"intrinsics": _Y_UP.to(dtype), "extent": torch.tan(angle.to(dtype).double()).to(dtype)}
+_FOV = _NARROWEST_DEG, 90.0, "between 0 and 90 degrees"
 
 
 @dataclass(frozen=True, eq=False)
-class LookAt(SquarePixels):
+class LookAt(_Placed):
     """A perspective camera at ``eye`` that looks at ``at``.
 
     A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
@@ -180,8 +174,7 @@ class LookAt(SquarePixels):
     right_handed: bool = False
 
     def __post_init__(self) -> None:
-        _check_pose(self, "eye", "at", "up", half_fov_deg=_fov(self.half_fov_deg))
-        _warn_if_up_is_ahead(_between(self.eye, self.at), self.up)
+        self._check(*_FOV)
 
     @classmethod
     def from_angles(
@@ -198,13 +191,9 @@ class LookAt(SquarePixels):
         eye = points_from_angles(distance, elevation_deg, azimuth_deg)
         return cls(eye=eye, up=up, half_fov_deg=half_fov_deg, right_handed=right_handed)
 
-    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        forward = _between(self.eye, self.at)
-        return _posed(self.eye, forward, self.up, self.right_handed, dtype, **_perspective(self.half_fov_deg, dtype))
-
 
 @dataclass(frozen=True, eq=False)
-class Look(SquarePixels):
+class Look(_Placed):
     """A perspective camera at ``eye`` that looks along ``direction`` (of any length).
 
     ``z = n(direction)``; everything else is as in :class:`LookAt`.
@@ -226,18 +215,15 @@ class Look(SquarePixels):
     up: Numbers = (0.0, 1.0, 0.0)
     half_fov_deg: Scalars = 30.0
     right_handed: bool = False
+    _names = ("direction", "half_fov_deg")
+    _along = True
 
     def __post_init__(self) -> None:
-        _check_pose(self, "eye", "direction", "up", half_fov_deg=_fov(self.half_fov_deg))
-        _warn_if_up_is_ahead(self.direction, self.up)
-
-    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        rest = _perspective(self.half_fov_deg, dtype)
-        return _posed(self.eye, self.direction, self.up, self.right_handed, dtype, **rest)
+        self._check(*_FOV)
 
 
 @dataclass(frozen=True, eq=False)
-class Orthographic(SquarePixels):
+class Orthographic(_Placed):
     """A camera without perspective, posed as :class:`LookAt`: ``(scale u_x, scale u_y, u_z)``.
 
     ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the extent of the view across the shorter
@@ -262,14 +248,7 @@ class Orthographic(SquarePixels):
     scale: Scalars = 1.0
     right_handed: bool = False
     perspective = False
+    _names = ("at", "scale")
 
     def __post_init__(self) -> None:
-        scale = _scalar(self.scale, "scale", 0, math.inf, "between 0 and infinity")
-        _check_pose(self, "eye", "at", "up", scale=scale)
-        _warn_if_up_is_ahead(_between(self.eye, self.at), self.up)
-
-    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        scale = batched(self.scale, dtype, 1, 1) if isinstance(self.scale, Tensor) else self.scale
-        intrinsics = scale * _Y_UP.to(dtype)
-        forward, rest = _between(self.eye, self.at), {"intrinsics": intrinsics, "perspective": False}
-        return _posed(self.eye, forward, self.up, self.right_handed, dtype, **rest)
+        self._check(0, math.inf, "between 0 and infinity")

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from .. import ops
@@ -55,6 +56,10 @@ class ProjectingCamera:
         """The camera in its general form, computed in ``dtype`` in host memory; differentiable in its parameters."""
         raise NotImplementedError
 
+    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None, bool]:
+        """For :func:`nmr.ops.project`, in host memory: camera ``[B, 22]``, distortion, and whether in perspective."""
+        return self.projection(dtype)._rows(dtype)
+
     def for_image(self, height: int, width: int) -> ProjectingCamera:
         """The camera for an image of height x width pixels.
 
@@ -91,16 +96,15 @@ class ProjectingCamera:
             For wrong types and shapes, or a camera with another batch size than the vertices.
         """
         vertices, meshes = _check_batch(vertices, starts)
-        camera = self.projection(vertices.dtype)
-        batch = camera.batch
+        rows, distortion, perspective = self._rows(vertices.dtype)
+        rows, distortion = rows.to(vertices), None if distortion is None else distortion.to(vertices)
+        batch = len(rows) if distortion is None or len(distortion) == 1 else len(distortion)
         if batch != meshes and batch != 1 and (meshes != 1 or starts is not None):
             raise ValueError(
                 f"vertices and camera must have one batch size (or 1), got {meshes} meshes and {batch} poses"
                 + ("" if starts is None else "; packed meshes need one pose each, or one for all")
             )
-        size = meshes if batch == 1 else batch
-        parameters = (None if x is None else x.to(vertices).expand(size, *x.shape[1:]) for x in camera.parameters())
-        return ops.project(vertices, *parameters, starts, camera.perspective)
+        return ops.project(vertices, rows, distortion, starts, perspective)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +182,16 @@ class Projection(ProjectingCamera):
         """The camera itself."""
         return self
 
+    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None, bool]:
+        matrix, intrinsics, distortion, origin, extent = (
+            None if x is None else x.to("cpu", dtype) for x in self.parameters()
+        )
+        origin = matrix.new_zeros(1, 3) if origin is None else origin
+        extent = matrix.new_ones(1) if extent is None else extent
+        parts, batch = (matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)), self.batch
+        rows = torch.cat([part if len(part) == batch else part.expand(batch, -1) for part in parts], dim=1)
+        return rows, distortion, self.perspective
+
     def plain(self) -> Projection:
         """The same camera in float64, without origin and extent."""
         matrix, intrinsics, distortion, origin, extent = (
@@ -191,6 +205,31 @@ class Projection(ProjectingCamera):
             ones = torch.ones_like(extent)
             intrinsics = intrinsics / torch.stack([extent, extent, ones], dim=-1).unsqueeze(1)
         return Projection(matrix, intrinsics, distortion, self.perspective)
+
+    def viewer(self) -> Tensor:
+        """Where an image is seen from: float64 ``[B, 5]`` in host memory, without gradient.
+
+        Three numbers and 1: the place of the eye; or three numbers and 0: the direction towards the viewer. Then -1 if
+        the camera sees a right-handed world, else 1. In single operations, which round alike on every processor.
+        """
+        matrix, intrinsics, _, origin, _ = (
+            None if x is None else x.detach().to("cpu", torch.float64) for x in self.parameters()
+        )
+        x, y, z = matrix[:, :, :3].unbind(1)
+        products = _cross(y, z), _cross(z, x), _cross(x, y)
+        determinant = _sum_of_three(products[2] * z)
+        columns = [product / determinant for product in products]  # of the inverse
+        flip = intrinsics[:, 0, 0] * intrinsics[:, 1, 1] - intrinsics[:, 0, 1] * intrinsics[:, 1, 0]
+        if self.perspective:
+            terms = [column * matrix[:, k, 3:] for k, column in enumerate(columns)]
+            place = -(terms[0] + terms[1] + terms[2])
+            place = place if origin is None else place + origin
+        else:
+            place = -columns[2]
+        side = torch.where(determinant.sign() * flip.sign()[:, None] < 0, -1.0, 1.0)
+        rest = torch.cat([torch.full_like(side, float(self.perspective)), side], dim=1)
+        batch = self.batch
+        return torch.cat([place.expand(batch, 3), rest.expand(batch, 2)], dim=1)
 
 
 class SquarePixels(ProjectingCamera):
@@ -213,9 +252,27 @@ class _Shaped(ProjectingCamera):
         return self.camera.perspective
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        square, short = self.camera.projection(dtype), min(self.height, self.width)
-        scale = square.intrinsics.new_tensor([[short / self.width], [short / self.height]])
-        return replace(square, intrinsics=square.intrinsics * scale)
+        square = self.camera.projection(dtype)
+        return replace(square, intrinsics=square.intrinsics * self._stretch(dtype).view(2, 3))
+
+    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None, bool]:
+        rows, *rest = self.camera._rows(dtype)
+        return rows * F.pad(self._stretch(dtype), (12, 4), value=1.0), *rest
+
+    def _stretch(self, dtype: torch.dtype) -> Tensor:
+        """The factors ``[6]`` of the intrinsics."""
+        short = min(self.height, self.width)
+        across, down = short / self.width, short / self.height
+        return torch.tensor([across] * 3 + [down] * 3, dtype=dtype, device="cpu")
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a.roll(-1, 1) * b.roll(-2, 1) - a.roll(-2, 1) * b.roll(-1, 1)
+
+
+def _sum_of_three(terms: Tensor) -> Tensor:
+    """``[B, 1]`` of ``[B, 3]``, from left to right."""
+    return (terms[:, :1] + terms[:, 1:2]) + terms[:, 2:]
 
 
 def has_perspective(camera: Camera | None) -> bool:

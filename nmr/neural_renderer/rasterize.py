@@ -33,7 +33,7 @@ class _Cubes:
             raise ValueError("RGB images need textures [B, F, ts, ts, ts, 3], got None")
         face_index, weights, batch = fragments.sided_face_index, fragments.weights, fragments.mesh.batch
         textures = check_textures(self.textures, batch, fragments.faces.shape[-2]).to(weights)
-        colors = ops.sample_texture_cubes(textures, face_index, weights, None, fragments.eps)
+        colors = ops.texture_cubes(textures, face_index, weights, None, fragments.eps)
         if self.light is None:
             return colors
         if self.light.shape[0] not in (1, batch):

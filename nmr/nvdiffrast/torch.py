@@ -37,38 +37,28 @@ __all__ = [
 _LARGEST = 16384  # pixels per side
 # Faces are cut at this part of the largest |w|: nearer points have no finite image in float32.
 _NEAREST = 1e-6
-_log_level = 1
 
 
 def get_log_level() -> int:
-    """The number given to :func:`set_log_level`, 1 at first."""
-    return _log_level
+    """1, whatever was set."""
+    return 1
 
 
 def set_log_level(level: int) -> None:
-    """Keeps the number, for code that sets it; nothing is printed at any level."""
-    global _log_level
-    _log_level = level
+    """Accepted, without effect: nothing is printed at any level."""
 
 
 class RasterizeCudaContext:
-    """Holds nothing but the depth peeler that is active; ``device`` is ignored."""
+    """Accepted in place of a context; its arguments have no effect. It knows the depth peeler that is active."""
 
-    def __init__(self, device: object = None) -> None:
+    def __init__(self, *args: object, **kwargs: object) -> None:
         self.active_depth_peeler = None
 
 
 class RasterizeGLContext(RasterizeCudaContext):
-    """The same under its older name; all arguments are ignored."""
+    """The same under its older name."""
 
-    def __init__(self, output_db: bool = True, mode: str = "automatic", device: object = None) -> None:
-        super().__init__(device)
-
-    def set_context(self) -> None:
-        """Does nothing."""
-
-    def release_context(self) -> None:
-        """Does nothing."""
+    set_context = release_context = lambda self: None
 
 
 # --- rasterize
@@ -208,7 +198,7 @@ def _in_front(pos: Tensor, tri: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, T
     largest = float(w[w.isfinite()].abs().max()) if bool(w.isfinite().any()) else 0.0
     plane = _NEAREST * largest
     counts = ops.clip_count(depths, tri, None, plane)
-    if not counts[:, 0].any():
+    if (counts[:, 0] <= 0).all():
         return pos, tri, None
     batch, vertices = pos.shape[:2]
     new_starts = F.pad(counts.cumsum(0), (0, 0, 1, 0))

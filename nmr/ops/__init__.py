@@ -1,7 +1,7 @@
-"""The torch operators behind the public functions: forward, fake, set-up and backward of each stand together.
+"""The torch operators behind the public functions: each is declared once, by ``@kernel`` (``_kernel.py``).
 
-The kernels take NumPy views of the tensors (zero-copy on the CPU). Tensors on other devices are copied to the CPU, and
-the results are copied back. Arguments are not checked here, but in the public functions.
+Kernels read and write the memory of tensors on the CPU. Tensors on other devices are copied to the CPU, and
+the results are copied back. Arguments are checked in the public functions; kernels check shapes and indices again.
 
 A batch of meshes is ``vertices [B, V, 3]`` with ``faces [F, 3]`` or ``[B, F, 3]`` and ``starts=None``, or packed:
 ``vertices [N, 3]``, ``faces [M, 3]`` (vertex numbers count from the mesh's own first vertex) and ``starts`` int64
@@ -12,71 +12,43 @@ face index map is int32:
 -1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
 """
 
-from .camera import pose, pose_backward, project, project_backward
-from .clip import clip_count, clip_faces
-from .clip_space import antialias, antialias_backward, clip_weights, clip_weights_backward
-from .edges import edges_backward, resolve, resolve_backward
-from .fragments import depth_backward, depth_image, fragments, fragments_backward
-from .lights import lit, lit_backward, normals, normals_backward, viewer_of
-from .losses import soft_iou, soft_iou_backward
-from .mesh import smoothness, smoothness_backward, voxels
-from .raster import local_gradient, rasterize, rasterize_layers, silhouette, silhouette_backward
-from .shade import interpolate, interpolate_backward, sample_texture_cubes, texture_cubes_backward
-from .soft import (
-    soft_fragments,
-    soft_fragments_backward,
-    soft_layers,
-    soft_silhouette,
-    soft_silhouette_backward,
-)
-from .texture import WRAPS, mipmaps, mipmaps_backward, sample_uv, sample_uv_backward, uv_levels
+from .camera import look_at, project
+from .clip_space import antialias, clip_weights
+from .edges import resolve
+from .fragments import depth_image, fragments
+from .losses import soft_iou_loss
+from .mesh import smoothness, voxels
+from .raster import RasterSettings, clip_count, clip_faces, rasterize, rasterize_layers, silhouette
+from .shade import interpolate, lit, normals, texture_cubes
+from .soft import soft_fragments, soft_layers, soft_silhouette
+from .texture import WRAPS, mipmaps, sample_uv, uv_levels
 
 __all__ = [
     "WRAPS",
+    "RasterSettings",
     "antialias",
-    "antialias_backward",
     "clip_count",
     "clip_faces",
     "clip_weights",
-    "clip_weights_backward",
-    "depth_backward",
     "depth_image",
-    "edges_backward",
     "fragments",
-    "fragments_backward",
     "interpolate",
-    "interpolate_backward",
     "lit",
-    "lit_backward",
-    "local_gradient",
+    "look_at",
     "mipmaps",
-    "mipmaps_backward",
     "normals",
-    "normals_backward",
-    "pose",
-    "pose_backward",
     "project",
-    "project_backward",
     "rasterize",
     "rasterize_layers",
     "resolve",
-    "resolve_backward",
-    "sample_texture_cubes",
     "sample_uv",
-    "sample_uv_backward",
     "silhouette",
-    "silhouette_backward",
     "smoothness",
-    "smoothness_backward",
     "soft_fragments",
-    "soft_fragments_backward",
-    "soft_iou",
-    "soft_iou_backward",
+    "soft_iou_loss",
     "soft_layers",
     "soft_silhouette",
-    "soft_silhouette_backward",
-    "texture_cubes_backward",
+    "texture_cubes",
     "uv_levels",
-    "viewer_of",
     "voxels",
 ]

@@ -1,12 +1,11 @@
-"""Operators: which face is nearest at each pixel, and silhouettes with NMR's gradient or the local one."""
+"""Operators: faces cut at the near plane, the nearest face at each pixel, silhouettes with their gradients."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ._host import _C, batch_size, host_array, host_empty, no_second_derivative, num_threads
-from ._register import operator, register_autograd
+from ._kernel import kernel
 
 
 class RasterSettings(NamedTuple):
@@ -27,17 +26,42 @@ class RasterSettings(NamedTuple):
         return scale * self.height, scale * self.width
 
 
-def _face_index_map(vertices, faces, starts, height, width, fill_back, near, far, perspective) -> Tensor:
-    face_index = host_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
-    arrays = host_array(vertices), host_array(faces), host_array(starts)
-    _C.rasterize(*arrays, face_index.numpy(), fill_back, near, far, perspective, num_threads())
-    return face_index
+def batch_size(vertices: Tensor, starts: Tensor | None) -> int:
+    """B of vertices ``[B, V, 3]``, or of packed vertices ``[N, 3]`` with starts ``[B + 1, 2]``."""
+    return vertices.shape[0] if starts is None else starts.shape[0] - 1
 
 
-# --- rasterize
+@kernel("counts")
+def clip_count(vertices: Tensor, faces: Tensor, starts: Tensor | None, near: float) -> Tensor:
+    """Room that the clipped meshes need: int64 ``[B, 2]``, new vertices and drawn faces; -1 if nothing is cut."""
+    return vertices.new_empty((batch_size(vertices, starts), 2), dtype=torch.int64)
 
 
-@operator
+@kernel("drawn_faces source corners ends")
+def clip_faces(
+    vertices: Tensor,
+    faces: Tensor,
+    starts: Tensor | None,
+    near: float,
+    new_starts: Tensor,
+    num_new: int,
+    num_drawn: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The faces to draw, packed: ``faces [M, 3]``, ``source [M]`` (int32), ``corners [M, 3]``, ``ends [P, 4]`` (int64).
+
+    Only the topology; no gradients pass through here. ``new_starts [B + 1, 2]`` in host memory are first new vertex and
+    first drawn face of each mesh, then P = num_new and M = num_drawn. New vertices are numbered after the V of their
+    mesh. ``source`` is the face that a drawn face is part of; ``corners`` says which of its corners are those of the
+    source (0, 1, 2) or new vertices (3 + number); ``ends`` are the two rows of ``vertices.reshape(-1, 3)`` that a new
+    vertex is between, and which corners of the source these are. Room that is left over is filled with faces without
+    area.
+    """
+    shapes = (num_drawn, 3), (num_drawn,), (num_drawn, 3), (num_new, 4)
+    types = torch.int64, torch.int32, torch.int64, torch.int64
+    return tuple(vertices.new_empty(shape, dtype=dtype) for shape, dtype in zip(shapes, types, strict=True))
+
+
+@kernel("face_index")
 def rasterize(
     vertices: Tensor,
     faces: Tensor,
@@ -50,20 +74,10 @@ def rasterize(
     perspective: bool,
 ) -> Tensor:
     """Face index map ``[B, height, width]`` of meshes in renderer space; not differentiable."""
-    return _face_index_map(vertices, faces, starts, height, width, fill_back, near, far, perspective).to(
-        vertices.device
-    )
-
-
-@torch.library.register_fake(rasterize.op)
-def _(vertices, faces, starts, height, width, fill_back, near, far, perspective):
     return vertices.new_empty((batch_size(vertices, starts), height, width), dtype=torch.int32)
 
 
-# --- rasterize_layers
-
-
-@operator
+@kernel("face_index")
 def rasterize_layers(
     vertices: Tensor,
     faces: Tensor,
@@ -77,21 +91,10 @@ def rasterize_layers(
     perspective: bool,
 ) -> Tensor:
     """Face indices of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest first, then -1."""
-    face_index = host_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
-    arrays = host_array(vertices), host_array(faces), host_array(starts)
-    _C.rasterize_layers(*arrays, face_index.numpy(), fill_back, near, far, perspective, num_threads())
-    return face_index.to(vertices.device)
-
-
-@torch.library.register_fake(rasterize_layers.op)
-def _(vertices, faces, starts, height, width, layers, fill_back, near, far, perspective):
     return vertices.new_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
 
 
-# --- silhouette
-
-
-@operator
+@kernel("alpha face_index", gradients="vertices", constant="face_index", used_by="render_silhouette")
 def silhouette(
     vertices: Tensor,
     faces: Tensor,
@@ -108,89 +111,8 @@ def silhouette(
 ) -> tuple[Tensor, Tensor]:
     """Silhouettes ``alpha [B, height, width]`` and the face index map ``[B, H, W]`` of meshes in renderer space.
 
-    Its gradient is :func:`silhouette_backward` or, if ``local``, :func:`local_gradient`.
+    The gradient is NMR's silhouette gradient or, if ``local``, Kato and Harada's, which reaches one pixel. Zero in z.
     """
-    scale = 2 if anti_aliasing else 1
-    raster = scale * height, scale * width
-    face_index = _face_index_map(vertices, faces, starts, *raster, fill_back, near, far, perspective)
-    alpha = host_empty((face_index.shape[0], height, width), dtype=vertices.dtype)
-    _C.silhouette_forward(face_index.numpy(), alpha.numpy(), anti_aliasing, num_threads())
-    return alpha.to(vertices.device), face_index.to(vertices.device)
-
-
-@torch.library.register_fake(silhouette.op)
-def _(vertices, faces, starts, height, width, anti_aliasing, fill_back, near, far, eps, perspective, local):
     batch, scale = batch_size(vertices, starts), 2 if anti_aliasing else 1
     alpha = vertices.new_empty((batch, height, width))
     return alpha, vertices.new_empty((batch, scale * height, scale * width), dtype=torch.int32)
-
-
-def _silhouette_setup(ctx, inputs, output):
-    vertices, faces, starts, *settings, ctx.local = inputs
-    face_index = output[1]
-    ctx.mark_non_differentiable(face_index)
-    ctx.set_materialize_grads(False)  # no zeros in the shape of the face index map
-    ctx.save_for_backward(vertices, faces, starts, face_index)
-    ctx.settings = RasterSettings(*settings)
-
-
-def _silhouette_backward(ctx, grad_alpha, _grad_face_index):
-    if grad_alpha is None:
-        return (None,) * 12
-    gradient = local_gradient if ctx.local else silhouette_backward
-    settings = ctx.settings
-    return gradient(*ctx.saved_tensors, grad_alpha, settings.anti_aliasing, settings.eps), *(None,) * 11
-
-
-register_autograd(silhouette, _silhouette_backward, _silhouette_setup)
-
-
-@operator
-def silhouette_backward(
-    vertices: Tensor,
-    faces: Tensor,
-    starts: Tensor | None,
-    face_index: Tensor,
-    grad_alpha: Tensor,
-    anti_aliasing: bool,
-    eps: float,
-) -> Tensor:
-    """NMR's silhouette gradient, per vertex, of the shape of ``vertices``; zero in z."""
-    return _gradient(_C.silhouette_backward, vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps)
-
-
-def _gradient(kernel, vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps) -> Tensor:
-    grad_vertices = host_empty(vertices.shape, dtype=vertices.dtype)
-    arrays = map(host_array, (vertices, faces, starts, face_index, grad_alpha))
-    kernel(*arrays, grad_vertices.numpy(), anti_aliasing, eps, num_threads())
-    return grad_vertices.to(vertices.device)
-
-
-@torch.library.register_fake(silhouette_backward.op)
-def _(vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps):
-    return vertices.new_empty(vertices.shape)
-
-
-register_autograd(silhouette_backward, no_second_derivative("render_silhouette"))
-
-
-@operator
-def local_gradient(
-    vertices: Tensor,
-    faces: Tensor,
-    starts: Tensor | None,
-    face_index: Tensor,
-    grad_alpha: Tensor,
-    anti_aliasing: bool,
-    eps: float,
-) -> Tensor:
-    """Kato and Harada's silhouette gradient, which reaches one pixel; of the shape of ``vertices``, zero in z."""
-    return _gradient(_C.local_gradient, vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps)
-
-
-@torch.library.register_fake(local_gradient.op)
-def _(vertices, faces, starts, face_index, grad_alpha, anti_aliasing, eps):
-    return vertices.new_empty(vertices.shape)
-
-
-register_autograd(local_gradient, no_second_derivative("render_silhouette"))

@@ -1,16 +1,12 @@
-"""Operators: colours from texture cubes, and interpolation of values given at the corners of faces."""
+"""Operators: colours from texture cubes, values given at the corners of faces, normals, and lit colours."""
 
-import torch
 from torch import Tensor
 
-from ._host import _C, host_array, host_empty, no_second_derivative, num_threads
-from ._register import operator, register_autograd
-
-# --- texture cubes
+from ._kernel import kernel
 
 
-@operator
-def sample_texture_cubes(
+@kernel("colors", gradients="textures", used_by="render_rgb")
+def texture_cubes(
     textures: Tensor,
     face_index: Tensor,
     weights: Tensor,
@@ -23,61 +19,10 @@ def sample_texture_cubes(
     Axis k of a cube is the weight of the face's vertex k: sampled trilinearly at ``weights * (ts - 1)``, clamped to
     ``[0, ts - 1 - eps]``. Differentiable in ``textures`` only, as published.
     """
-    colors = host_empty((*face_index.shape, textures.shape[-1]), dtype=textures.dtype)
-    arrays = host_array(textures), host_array(face_index), host_array(weights), host_array(starts)
-    _C.texture_cubes_forward(*arrays, colors.numpy(), eps, num_threads())
-    return colors.to(textures.device)
-
-
-@torch.library.register_fake(sample_texture_cubes.op)
-def _(textures, face_index, weights, starts, eps):
     return textures.new_empty((*face_index.shape, textures.shape[-1]))
 
 
-def _texture_cubes_setup(ctx, inputs, output):
-    textures, face_index, weights, starts, eps = inputs
-    ctx.save_for_backward(face_index, weights, starts)
-    ctx.shape, ctx.eps = textures.shape, eps
-
-
-def _texture_cubes_backward(ctx, grad_colors):
-    grad_textures = None
-    if ctx.needs_input_grad[0]:
-        grad_textures = texture_cubes_backward(*ctx.saved_tensors, grad_colors, ctx.shape, ctx.eps)
-    return grad_textures, None, None, None, None
-
-
-register_autograd(sample_texture_cubes, _texture_cubes_backward, _texture_cubes_setup)
-
-
-@operator
-def texture_cubes_backward(
-    face_index: Tensor,
-    weights: Tensor,
-    starts: Tensor | None,
-    grad_colors: Tensor,
-    shape: list[int],
-    eps: float,
-) -> Tensor:
-    """Gradient of :func:`sample_texture_cubes` in its textures, of the given shape; shared ones sum over images."""
-    grad_textures = host_empty(shape, dtype=grad_colors.dtype)
-    arrays = face_index, weights, starts, grad_colors
-    _C.texture_cubes_backward(*map(host_array, arrays), grad_textures.numpy(), eps, num_threads())
-    return grad_textures.to(grad_colors.device)
-
-
-@torch.library.register_fake(texture_cubes_backward.op)
-def _(face_index, weights, starts, grad_colors, shape, eps):
-    return grad_colors.new_empty(shape)
-
-
-register_autograd(texture_cubes_backward, no_second_derivative("render_rgb"))
-
-
-# --- interpolate
-
-
-@operator
+@kernel("values", gradients="attributes weights", used_by="render_rgb")
 def interpolate(
     attributes: Tensor,
     corners: Tensor,
@@ -90,60 +35,37 @@ def interpolate(
     attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are
     rows of them, counted from the first of the mesh; ``starts`` (packed) are first row and first face of each mesh.
     """
-    values = host_empty((*face_index.shape, attributes.shape[-1]), dtype=attributes.dtype)
-    arrays = attributes, corners, face_index, weights, starts
-    _C.interpolate_forward(*map(host_array, arrays), values.numpy(), num_threads())
-    return values.to(attributes.device)
-
-
-@torch.library.register_fake(interpolate.op)
-def _(attributes, corners, face_index, weights, starts):
     return attributes.new_empty((*face_index.shape, attributes.shape[-1]))
 
 
-def _interpolate_setup(ctx, inputs, output):
-    ctx.save_for_backward(*inputs)
+@kernel("normals", gradients="vertices", used_by="render_normals")
+def normals(vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool) -> Tensor:
+    """Unit normals ``n((v0 - v1) x (v2 - v1))`` of faces, ``[B or 1, F, 3]`` or packed ``[M, 3]``.
+
+    smooth: normals of vertices, like ``vertices``: the direction of the sum of these products. 0 without an area.
+    """
+    return vertices.new_empty(vertices.shape if smooth else (*vertices.shape[:-2], *faces.shape[-2:]))
 
 
-def _interpolate_backward(ctx, grad_values):
-    of_attributes, _, _, of_weights, _ = ctx.needs_input_grad
-    grads = interpolate_backward(*ctx.saved_tensors, grad_values, of_attributes, of_weights)
-    return grads[0] if of_attributes else None, None, None, grads[1] if of_weights else None, None
-
-
-register_autograd(interpolate, _interpolate_backward, _interpolate_setup)
-
-
-@operator
-def interpolate_backward(
-    attributes: Tensor,
-    corners: Tensor,
+@kernel("lit", gradients="colors normals parameters vertices weights", used_by="render_rgb with lights")
+def lit(
+    colors: Tensor | None,
+    normals: Tensor,
+    parameters: Tensor | None,
+    layout: Tensor,
+    viewer: Tensor,
+    vertices: Tensor,
+    faces: Tensor,
     face_index: Tensor,
     weights: Tensor,
     starts: Tensor | None,
-    grad_values: Tensor,
-    of_attributes: bool,
-    of_weights: bool,
-) -> tuple[Tensor, Tensor]:
-    """Gradients of :func:`interpolate` in attributes and weights; a gradient that is not requested is empty."""
-    grad_attributes = host_empty(attributes.shape if of_attributes else 0, dtype=attributes.dtype)
-    grad_weights = host_empty(weights.shape if of_weights else 0, dtype=attributes.dtype)
-    arrays = attributes, corners, face_index, weights, starts, grad_values
-    _C.interpolate_backward(
-        *map(host_array, arrays),
-        grad_attributes.numpy() if of_attributes else None,
-        grad_weights.numpy() if of_weights else None,
-        num_threads(),
-    )
-    return grad_attributes.to(attributes.device), grad_weights.to(attributes.device)
+    smooth: bool,
+) -> Tensor:
+    """Lit colours ``[B, H, W, 3]``; 0 on background. Without parameters, the normals.
 
-
-@torch.library.register_fake(interpolate_backward.op)
-def _(attributes, corners, face_index, weights, starts, grad_values, of_attributes, of_weights):
-    return (
-        attributes.new_empty(attributes.shape if of_attributes else 0),
-        attributes.new_empty(weights.shape if of_weights else 0),
-    )
-
-
-register_autograd(interpolate_backward, no_second_derivative("render_rgb"))
+    colors are ``[B, H, W, 1 or 3]``, None is white; normals those of :func:`normals`; parameters ``[P]`` all values of
+    lights, and layout int64 ``[11, 3]`` the place of each: first value, rows (1 or B), lights; viewer ``[B, 5]``: the
+    place of the eye and 1, or the direction towards the viewer and 0, then -1 if the camera sees a right-handed world,
+    else 1; vertices and faces the meshes in world space.
+    """
+    return weights.new_empty((*face_index.shape, 3))

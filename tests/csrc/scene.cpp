@@ -292,28 +292,35 @@ struct Run {
   void camera() {
     const bool distorted = s.distorted && s.perspective, placed = !s.distorted;
     const int64_t B = s.batch, D = seed % 4 == 1 ? 4 : seed % 4 == 2 ? 8 : 5;  // coefficients of the distortion
-    T *matrix = in("matrix", 12 * B), *intrinsics = in("intrinsics", 6 * B), *distortion = in("distortion", D * B);
-    T *origin = in("origin", 3 * B), *extent = in("extent", B);
-    for (int64_t n = 0; n < 12 * B; ++n) matrix[n] = matrix[n] / 8 + T(n % 12 % 5 == 0) + T(n % 12 == 11 ? 2 : 0);
-    for (int64_t n = 0; n < 6 * B; ++n) intrinsics[n] = intrinsics[n] / 8 + T(n % 6 % 4 == 0);
+    T *camera = in("camera", kCamera * B), *distortion = in("distortion", D * B);
+    for (int64_t b = 0; b < B; ++b) {
+      T* row = camera + kCamera * b;
+      for (int64_t n = 0; n < 12; ++n) row[n] = row[n] / 8 + T(n % 5 == 0) + T(n == 11 ? 2 : 0);
+      for (int64_t n = 0; n < 6; ++n) row[kIntrinsics + n] = row[kIntrinsics + n] / 8 + T(n % 4 == 0);
+      for (int64_t n = 0; n < 3 && !placed; ++n) row[kOrigin + n] = 0;
+      row[kExtent] = placed ? T(0.25) + row[kExtent] * row[kExtent] : T(1);
+    }
     for (int64_t n = 0; n < D * B; ++n) distortion[n] /= 16;
-    for (int64_t b = 0; b < B; ++b) extent[b] = T(0.25) + extent[b] * extent[b];
-    const Project<T> args{s.vertices.data(), mesh.starts, B, B, s.num_vertices, matrix, intrinsics, distorted ? distortion : nullptr, D,
-                          placed ? origin : nullptr, placed ? extent : nullptr, s.perspective, out("points", 3 * rows),
-                          in("grad_points", 3 * rows), out("grad_world", 3 * rows), out("grad_matrix", 12 * B),
-                          out("grad_intrinsics", 6 * B), out_if(distorted, "grad_distortion", D * B),
-                          out_if(placed, "grad_origin", 3 * B), out_if(placed, "grad_extent", B), threads};
+    const Project<T> args{s.vertices.data(), mesh.starts, B, B, s.num_vertices, camera, true, distorted ? distortion : nullptr, true, D,
+                          s.perspective, out("points", 3 * rows), in("grad_points", 3 * rows), out("grad_world", 3 * rows),
+                          out("grad_camera", kCamera * B), out_if(distorted, "grad_distortion", D * B), threads};
     project_forward(args);
     project_backward(args);
   }
 
-  // Directions from the vertices, with whatever they hold; a pose for each pair of them.
+  // Directions from the vertices, with whatever they hold; a camera for each pair of them, at the origin.
   void poses() {
     const int64_t count = rows / 2;
-    const Pose<T> args{s.vertices.data(), s.vertices.data() + 3 * count, count, out("pose", 12 * count),
-                       in("grad_pose", 12 * count), out("grad_forward", 3 * count), out("grad_up", 3 * count)};
-    pose_forward(args);
-    pose_backward(args);
+    const std::vector<double> points(s.vertices.begin(), s.vertices.begin() + 3 * rows);
+    const double eye[3] = {}, view = 30;
+    std::vector<double> grads(6 * count);
+    const LookAt<T> args{count, eye, points.data(), points.data() + 3 * count, &view, false, true, true, false, true,
+                         false, s.perspective, out("pose", kCamera * count), in("grad_pose", kCamera * count), nullptr,
+                         grads.data(), grads.data() + 3 * count, nullptr};
+    look_at_forward(args);
+    look_at_backward(args);
+    std::copy_n(grads.data(), 3 * count, out("grad_forward", 3 * count));
+    std::copy_n(grads.data() + 3 * count, 3 * count, out("grad_up", 3 * count));
   }
 
   // The edges are made up: corners of consecutive faces of the first mesh. Packed vertices count as one mesh.
@@ -546,7 +553,8 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   for (size_t n = 0; n < points.size(); ++n)
     check(n % 3 == 2 ? std::isfinite(points[n]) : !std::isnan(points[n]), "a projected vertex has a depth and a place, or is at infinity");
   for (size_t n = 0; n < pose.size(); ++n)
-    check(std::isfinite(pose[n]) == std::isfinite(pose[n - n % 12]) && !std::isinf(pose[n]), "a pose is finite or all NaN");
+    check(n % kCamera >= kIntrinsics || (std::isfinite(pose[n]) == std::isfinite(pose[n - n % kCamera]) && !std::isinf(pose[n])),
+          "a pose is finite or all NaN");
   for (const char* name : {"grad_silhouette", "grad_local", "grad_edges", "grad_local_edges", "grad_soft"}) {
     const std::vector<T>& grad = r.get(name);
     for (size_t n = 2; n < grad.size(); n += 3) check(grad[n] == 0, "the gradients of silhouettes and edges have no z");
@@ -570,7 +578,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   if (scene.hostile_upstream) return broken;
 
   const auto finite = [](T x) { return std::isfinite(x); };
-  check_all({"grad_local", "grad_world", "grad_matrix", "grad_intrinsics", "grad_distortion", "grad_origin", "grad_extent",
+  check_all({"grad_local", "grad_world", "grad_camera", "grad_distortion",
              "grad_soft", "grad_sigma", "grad_forward", "grad_up", "iou", "grad_prediction", "grad_target"},
             finite, "a gradient is finite");
   if (!foreign) check_all({"grad_silhouette", "grad_edges"}, finite, "a gradient of edges is finite");

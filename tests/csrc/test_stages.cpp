@@ -163,7 +163,7 @@ TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
       {"grad_normals", {"grad_normals_vertices"}},
       {"grad_lit", {"grad_lit_colors", "grad_lit_normals", "grad_lit_vertices", "grad_lit_weights"}},
       {"grad_resolved", {"grad_edges", "grad_local_edges", "grad_image", "grad_background"}},
-      {"grad_points", {"grad_world", "grad_matrix", "grad_intrinsics", "grad_distortion"}},
+      {"grad_points", {"grad_world", "grad_camera", "grad_distortion"}},
       {"grad_pose", {"grad_forward", "grad_up"}},
       {"grad_loss", {"grad_loss_vertices"}},
       {"grad_iou", {"grad_prediction", "grad_target"}},

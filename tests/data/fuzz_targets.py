@@ -18,17 +18,18 @@ from lopsided_meshes import write_meshes
 from PIL import Image
 from reader_checks import problems
 from runs import metadata
+from shapenet_files import write_dvr
 
 import nmr.neural_renderer as nr
 from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_config
 from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
-from learn3d.experiments.experiment import read_result
 from learn3d.files import formats, sandbox
-from learn3d.make_data import meshes
-from learn3d.make_data.render import DatasetConfig, make_dataset
-from learn3d.pages.report import read_metrics
 from learn3d.runs import checkpoint, log
+from learn3d.studio.make_data import meshes
+from learn3d.studio.make_data.render import DatasetConfig, make_dataset
+from learn3d.studio.tables.experiment import read_result
+from learn3d.studio.tables.report import read_metrics
 
 ERRORS = (ValueError, FileNotFoundError, OSError)  # what a reader may raise
 
@@ -44,9 +45,7 @@ class Target:
 
 SETTINGS = {  # of data sets whose meshes are written by `write_meshes`; 24 views unless said
     "kato": {"test": 1, "val": 0},
-    "dvr": {"test": 1, "val": 0},
     "kar": {"test": 1, "val": 0, "views": 4},
-    "r2n2": {},
     "pascal3d": {"val": 1, "views": 4},
     "photos": {"test": 1, "val": 0, "views": 4},
 }
@@ -67,11 +66,6 @@ FILES: dict[str, dict[str, m.Mutation]] = {  # one of each kind; ID: an object o
         "voxels/modelVoxels32/03001627/ID.mat": m.damage,
         "splits.json": m.damage_json,
     },
-    "r2n2": {
-        "ShapeNetRendering/03001627/ID/rendering/00.png": m.damage_png,
-        "ShapeNetRendering/03001627/ID/rendering/rendering_metadata.txt": m.damage_text,
-        "ShapeNetVox32/03001627/ID/model.binvox": m.damage,
-    },
     "pascal3d": {"chair_val.npz": NPZ},
     "photos": {"chair/poses.csv": m.damage_text, "chair/images/ID": m.damage_png},
 }
@@ -80,14 +74,16 @@ FILES: dict[str, dict[str, m.Mutation]] = {  # one of each kind; ID: an object o
 def layout_target(tmp: Path, layout: str) -> Target:
     """A made data set; `load` and the check must agree on whether it can be read."""
     source, folder, split = tmp / "meshes", tmp / layout, "val" if layout == "pascal3d" else "test"
-    source.mkdir()
-    write_meshes(source)
-    config = DatasetConfig(output=folder, category="chair", source=source, layout=layout, **SETTINGS[layout])
-    make_dataset(config)
+    if layout == "dvr":
+        write_dvr(folder, {"train": ["b1"], "test": ["a0"]})
+    else:
+        source.mkdir()
+        write_meshes(source)
+        config = DatasetConfig(output=folder, category="chair", source=source, layout=layout, **SETTINGS[layout])
+        make_dataset(config)
     first = {
         "dvr": lambda: (folder / "03001627" / "softras_test.lst").read_text().split()[0],
         "kar": lambda: json.loads((folder / "splits.json").read_text())["03001627"]["test"][0],
-        "r2n2": lambda: max(p.name for p in (folder / "ShapeNetRendering" / "03001627").iterdir()),
         "photos": lambda: next(
             row.split(",")[0] for row in (folder / "chair" / "poses.csv").read_text().split("\n") if ",test" in row
         ),
@@ -261,7 +257,7 @@ def drop_in_target(tmp: Path) -> Target:
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {
-    **{layout: partial(layout_target, layout=layout) for layout in SETTINGS},
+    **{layout: partial(layout_target, layout=layout) for layout in FILES},
     "meshes": mesh_target,
     "mesh pack": pack_target,
     "checkpoint": checkpoint_target,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import trimesh
 
-from learn3d.make_data.render import DatasetConfig, DatasetReport, make_dataset
+from learn3d.studio.make_data.render import DatasetConfig, DatasetReport, make_dataset
 
 
 def lopsided_mesh(depth: float) -> trimesh.Trimesh:

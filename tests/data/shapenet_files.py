@@ -66,7 +66,7 @@ def unit(v: np.ndarray) -> np.ndarray:
 
 
 def blender_eye(azimuth_deg: float, elevation_deg: float, distance: float) -> np.ndarray:
-    """Where the Blender scripts of Kato and R2N2 put the camera, in the mesh's frame: (x, z, -y) of Blender."""
+    """Where Kato's Blender script puts the camera, in the mesh's frame: (x, z, -y) of Blender."""
     a, e = np.radians([azimuth_deg, elevation_deg])
     x, y, z = np.cos(-a) * np.cos(e), np.sin(-a) * np.cos(e), np.sin(e)
     return distance * np.array([x, z, -y])
@@ -149,36 +149,3 @@ def write_kar(folder: Path, lists: dict[str, list[str]], size: int = 224):
         path.parent.mkdir(parents=True, exist_ok=True)
         scipy.io.savemat(path, {"Volume": volume.astype(np.uint8)})
     (folder / "splits.json").write_text(json.dumps({CHAIR: {"name": "chair"} | lists}))
-
-
-def write_r2n2(folder: Path, names: list[str], size: int = 137, scale: float = 1.0):
-    """ShapeNetRendering and ShapeNetVox32; the meshes are `scale` times the boxes, and so say the headers."""
-    rng = np.random.default_rng(0)
-    for name, boxes in zip(names, shapes(len(names)), strict=True):
-        root = folder / "ShapeNetRendering" / CHAIR / name / "rendering"
-        rows = []
-        for k in range(24):
-            azimuth, elevation, ratio = rng.uniform(0, 360), rng.uniform(25, 30), rng.uniform(0.65, 0.95)
-            eye = blender_eye(azimuth, elevation, ratio * 1.75)
-            shown = draw(eye, unit(np.cross(-eye, UP)), 16 / 35, size, boxes * scale)
-            alpha = np.where(shown, 255, 0).astype(np.uint8)
-            save(root / f"{k:02d}.png", np.dstack([rgb(shown, background=0), alpha]))
-            rows.append(f"{azimuth} {elevation} 0 {ratio} 25")
-        (root / "rendering_metadata.txt").write_text("\n".join(rows) + "\n")
-        path = folder / "ShapeNetVox32" / CHAIR / name / "model.binvox"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(binvox_bytes(inside(cell_centres(), boxes), scale))
-
-
-def binvox_bytes(grid: np.ndarray, scale: float = 1.0, translate: float | None = None) -> bytes:
-    """A grid [s, s, s] of x, y, z: a header, then runs (value, count <= 255) with y fastest, then z, then x."""
-    corner = -scale / 2 if translate is None else translate
-    size = len(grid)
-    header = f"#binvox 1\ndim {size} {size} {size}\ntranslate {corner} {corner} {corner}\nscale {scale}\ndata\n"
-    runs = bytearray()
-    for value in grid.transpose(0, 2, 1).ravel().astype(int).tolist():
-        if runs and runs[-2] == value and runs[-1] < 255:
-            runs[-1] += 1
-        else:
-            runs += bytes([value, 1])
-    return header.encode() + bytes(runs)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.make_data.debian.models import Report, fetch_debian_models
+from learn3d.studio.make_data.debian.models import Report, fetch_debian_models
 
 CATALOGUE = "PluginFurnitureCatalog.properties"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from learn3d.config import config_to_dict
-from learn3d.experiments.measurement import ObjectMeans, Result
-from learn3d.experiments.plan import PlannedRun
 from learn3d.files.writing import write_json
 from learn3d.runs.folder import CONFIG
-from learn3d.runs.tasks import Task
+from learn3d.runs.measurement import CurvePoint, ObjectMeans, Result
+from learn3d.studio.tables.plan import PlannedRun
+from learn3d.studio.tasks import Task
 from learn3d.terminal import stop_on_signal
 
 
@@ -29,6 +29,7 @@ def result(**changes: Any) -> Result:
     texts |= {"category": "airplane", "data": "/data", "command": "learn3d train ..."}
     objects = [ObjectMeans(name, 24, 0.5, 0.4) for name in "abcde"]
     lists = {"versions": {"commit": "0123456789ab"}, "objects": objects}
+    lists["curve"] = [CurvePoint("val", 3, 0.2, None)]
     return Result(**(numbers | counts | texts | lists | changes))
 
 

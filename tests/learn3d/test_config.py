@@ -21,7 +21,6 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no such preset": (BASE | {"preset": "kato"}, "there is no preset 'kato'; did you mean 'plus-kato'?"),
     "layout": (BASE | {"layout": "shapenet"}, "layout must be 'kato'"),
     "flip": (BASE | {"augment": ["channels", "flip"]}, "but 'plus-kato' learns with the class of the original"),
-    "split": (BASE | {"layout": "r2n2"}, "the layout 'r2n2' has no split val; validate on test"),
     "size": (BASE | {"settings": {"encoder": "resnet18"}}, "the layout 'kato' have 64x64 pixels, but 224 are wanted"),
     "rotations": (
         BASE | {"preset": "plus-pascal", "view_bins": "15x20"},

@@ -19,10 +19,9 @@ from learn3d.data.conventions import KATO
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.readers.kar import KAR
 from learn3d.data.readers.pascal3d import PASCAL3D
-from learn3d.data.readers.r2n2 import R2N2
 from learn3d.evaluation import NO_MMD, evaluate, mean_mmd, spread_samples
-from learn3d.experiments.measurement import class_means, evaluate_runs, format_table
 from learn3d.methods.method import Grids, Meshes
+from learn3d.runs.measurement import class_means, evaluate_runs, format_table
 from nmr.metrics import voxel_iou
 
 
@@ -249,7 +248,7 @@ def test_mean_is_over_classes_not_over_runs() -> None:
     assert mean["mmd_paper"] is None
 
 
-ALL = (KATO, KAR, PASCAL3D, R2N2)
+ALL = (KATO, KAR, PASCAL3D)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +268,6 @@ def test_iou_after_the_axis_rule_is_the_published_one(convention, published):
         (KATO, [[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
         (KAR, [[0, 0, -1], [0, 1, 0], [1, 0, 0]]),
         (PASCAL3D, [[-1, 0, 0], [0, 0, -1], [0, -1, 0]]),
-        (R2N2, [[0, 0, -1], [0, 1, 0], [-1, 0, 0]]),
     ],
     ids=lambda value: getattr(value, "name", None),
 )

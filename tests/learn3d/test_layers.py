@@ -1,7 +1,8 @@
-"""The floors of learn3d: modules import their own room and lower floors only."""
+"""The wall: what learns never imports the studio, and the loop needs few modules."""
 
 import ast
-import re
+import subprocess
+import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -9,72 +10,45 @@ import learn3d
 
 SOURCES = Path(learn3d.__file__).parent
 
-#: Rooms and single modules, the highest floor first. A module imports its own room and lower floors.
-FLOORS = (
-    {"__main__"},
-    {"commands"},
-    {"pages", "demo"},
-    {"experiments"},
-    {"training", "reconstruction"},
-    {"figures"},
-    {"evaluation"},
-    {"make_data"},
-    {"runs"},
-    {"config"},
-    {"presets", "fitting", "poses"},
-    {"methods"},
-    {"networks", "losses"},
-    {"pictures"},
-    {"data"},
-    {"device", "settings", "shapes"},
-    {"files"},
-    {"terminal"},
-)
-FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
-
 
 def modules() -> dict[str, Path]:
-    """All modules by their name below learn3d: "training", "methods.vpl", "methods" for a room's __init__."""
-    found = {}
+    """All modules by their name: "learn3d.training", "learn3d.methods" for a room's __init__."""
+    names = {}
     for path in SOURCES.rglob("*.py"):
-        name = ".".join(path.relative_to(SOURCES).with_suffix("").parts).removesuffix(".__init__")
-        if name != "__init__":
-            found[name] = path
-    return found
+        parts = ("learn3d", *path.relative_to(SOURCES).with_suffix("").parts)
+        names[".".join(parts).removesuffix(".__init__")] = path
+    return names
 
 
 def imports(path: Path, known: dict[str, Path]) -> set[str]:
     """The modules of learn3d that a file imports anywhere, for type hints and inside of functions too."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "learn3d":
-            package = node.module.removeprefix("learn3d").lstrip(".")
-            for alias in node.names:
-                name = f"{package}.{alias.name}".lstrip(".")
-                found.add(name if name in known else package)
+        if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
         elif isinstance(node, ast.Import):
-            found |= {a.name.removeprefix("learn3d.") for a in node.names if a.name.startswith("learn3d.")}
-    return found
+            found |= {alias.name for alias in node.names}
+    return found & known.keys()
 
 
-def test_every_import_points_down():
+def test_the_core_never_imports_the_studio():
     known = modules()
-    assert {name.split(".")[0] for name in known} <= FLOOR.keys(), "a new room: say on which floor it stands"
-    pairs = [(name, other) for name, path in known.items() for other in imports(path, known)]
-    rooms = [(pair, *(module.split(".")[0] for module in pair)) for pair in pairs]
-    assert [pair for pair, room, target in rooms if target != room and not FLOOR[room] < FLOOR[target]] == []
+    core = {name: path for name, path in known.items() if not name.startswith("learn3d.studio")}
+    assert len(core) < len(known)
+    found = {name: [other for other in imports(path, known) if ".studio" in other] for name, path in core.items()}
+    assert {name: others for name, others in found.items() if others} == {}
 
 
 def test_no_module_imports_itself_over_others():
     known = modules()
-    graph = {name: (imports(path, known) & known.keys()) - {name} for name, path in known.items()}
+    rooms = {name for name, path in known.items() if path.stem == "__init__"}
+    graph = {name: imports(path, known) - {name} - rooms for name, path in known.items()}
     TopologicalSorter(graph).prepare()  # raises CycleError with the circle
 
 
-def test_only_commands_are_imported_by_a_name_made_at_run_time():
-    found = [name for name, path in modules().items() if re.search(r"\b(import_module|__import__)\b", path.read_text())]
-    assert found == ["commands"]
-
-
-def test_the_root_holds_ten_modules_at_most():
-    assert len([path for path in SOURCES.glob("*.py") if not path.stem.startswith("__")]) <= 10
+def test_the_loop_needs_few_modules():
+    code = "import sys, learn3d.training; print(*(name for name in sys.modules if name.split('.')[0] == 'learn3d'))"
+    words = [sys.executable, "-c", code]
+    loaded = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
+    assert not [name for name in loaded if ".studio" in name]
+    assert len(loaded) <= 67

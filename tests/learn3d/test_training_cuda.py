@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from learn3d.experiments.measurement import evaluate_runs
 from learn3d.runs import checkpoint
+from learn3d.runs.measurement import evaluate_runs
 from learn3d.training import train
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

@@ -11,31 +11,34 @@ import time
 
 import numpy as np
 import pytest
-import torch
 
-from nmr import _C, ops
+from nmr import _C
 
+# The arguments of each kernel: names, or "name=key" if the array has another name in the table below.
+MESH = "vertices faces starts"
 CALLS = {
-    "rasterize": lambda a: _C.rasterize(
-        a["vertices"], a["faces"], a["starts"], a["face_index"], True, 0.1, 100.0, True, 1
-    ),
-    "silhouette": lambda a: _C.silhouette_forward(a["face_index"], a["alpha"], True, 1),
-    "silhouette_backward": lambda a: _C.silhouette_backward(
-        a["vertices"], a["faces"], a["starts"], a["face_index"], a["alpha"], a["grad"], True, 1e-4, 1
-    ),
-    "local_gradient": lambda a: _C.local_gradient(
-        a["vertices"], a["faces"], a["starts"], a["face_index"], a["alpha"], a["grad"], True, 1e-4, 1
-    ),
-    "smoothness": lambda a: _C.smoothness_forward(a["vertices"], a["edges"], a["loss"], 1),
-    "smoothness_backward": lambda a: _C.smoothness_backward(a["vertices"], a["edges"], a["loss"], a["grad"], 1),
-    "soft_iou": lambda a: _C.soft_iou_forward(a["prediction"], a["target"], a["areas"], a["loss"], 1),
-    "soft_iou_backward": lambda a: _C.soft_iou_backward(
-        a["prediction"], a["target"], a["areas"], a["loss"], a["grad_prediction"], a["grad_target"], 1
-    ),
-    "voxelize": lambda a: _C.voxelize(a["vertices"].astype(np.float32), a["faces"], a["voxels"], a["size"], True, 1),
+    "rasterize": f"{MESH} face_index fill_back near far perspective",
+    "silhouette": f"{MESH} face_index alpha anti_aliasing fill_back near far perspective",
+    "silhouette_backward": f"{MESH} face_index grad_alpha=alpha grad_vertices anti_aliasing eps local",
+    "local": f"{MESH} face_index grad_alpha=alpha grad_vertices anti_aliasing eps local=true",
+    "smoothness": "vertices edges loss",
+    "smoothness_backward": "vertices edges grad_loss=loss grad_vertices",
+    "soft_iou_loss": "prediction target areas loss=value",
+    "soft_iou_loss_backward": "prediction target areas grad_loss=value grad_prediction grad_target",
+    "voxels": "vertices=single faces grid size touched",
 }
-RASTER, SMOOTHNESS = ("rasterize", "silhouette_backward", "local_gradient"), ("smoothness", "smoothness_backward")
-IOU = ("soft_iou", "soft_iou_backward")
+NUMBERS = dict(near=0.1, far=100.0, eps=1e-4, fill_back=True, perspective=True, anti_aliasing=True)
+NUMBERS |= dict(local=False, true=True, touched=True)
+RASTER, SMOOTHNESS = ("rasterize", "silhouette_backward", "local"), ("smoothness", "smoothness_backward")
+IOU = ("soft_iou_loss", "soft_iou_loss_backward")
+
+
+def call(name, table):
+    names = [pair.partition("=")[::2] for pair in CALLS[name].split()]
+    function = getattr(_C, "silhouette_backward" if name == "local" else name)
+    function(**{key: table[other or key] for key, other in names}, num_threads=1)
+
+
 STARTS = np.array([[0, 0], [6, 2], [12, 4]])
 
 
@@ -44,18 +47,25 @@ STARTS = np.array([[0, 0], [6, 2], [12, 4]])
     [
         (RASTER, dict(vertices=np.zeros((12, 3))), r"vertices must have shape \[B, V, 3\], got \[12, 3\]"),
         (RASTER, dict(starts=STARTS), r"vertices must have shape \[N, 3\], got \[2, 12, 3\]"),
-        (RASTER, dict(faces=np.zeros((4, 2), int)), r"faces must have shape \[F, 3\], or .* got \[4, 2\]"),
-        (RASTER, dict(faces=np.zeros((3, 4, 3), int)), r"with the B of vertices \[2, 12, 3\], got \[3, 4, 3\]"),
+        (RASTER, dict(faces=np.zeros((4, 2), int)), r"faces must have shape \[F, 3\] or \[2, F, 3\], got \[4, 2\]"),
+        (
+            RASTER,
+            dict(faces=np.zeros((3, 4, 3), int)),
+            r"faces .* \[F, 3\] or \[2, F, 3\], got \[3, 4, 3\]",
+        ),
         (RASTER, dict(faces=np.full((4, 3), -1)), "faces refer to vertex -1, but a mesh has 12 vertices"),
-        (("rasterize",), dict(face_index=np.zeros((2, 0, 0), np.int32)), r"H and W in 1\.\.16384, got \[2, 0, 0\]"),
+        (
+            ("rasterize",),
+            dict(face_index=np.zeros((2, 0, 0), np.int32)),
+            "face_index must have H and W in 1..16384",
+        ),
         (
             ("rasterize",),
             dict(face_index=np.zeros((3, 8, 8), np.int32)),
-            r"face_index must have shape \[2, H, W\] .*, got \[3, 8, 8\]",
+            r"face_index must have shape \[2, H, W\], got \[3, 8, 8\]",
         ),
-        (("silhouette",), dict(alpha=np.zeros((2, 4))), r"alpha must have shape \[B, h, w\], got \[2, 4\]"),
-        (("silhouette",), dict(alpha=np.zeros((2, 4, 5))), r"face_index must have shape \[2, 8, 10\], got \[2, 8, 8\]"),
-        (("silhouette",), dict(face_index=np.zeros((2, 4, 4), np.int32)), r"face_index must have shape \[2, 8, 8\]"),
+        (("silhouette",), dict(alpha=np.zeros((2, 4))), r"alpha must have shape \[2, 4, 4\], got \[2, 4\]"),
+        (("silhouette",), dict(alpha=np.zeros((2, 4, 5))), r"alpha must have shape \[2, 4, 4\], got \[2, 4, 5\]"),
         (RASTER[1:], dict(face_index=np.zeros((2, 9, 9), np.int32)), r"has an even size, got \[2, 9, 9\]"),
         (
             RASTER[1:],
@@ -63,22 +73,30 @@ STARTS = np.array([[0, 0], [6, 2], [12, 4]])
             "the face index map does not belong to these faces",
         ),
         (RASTER[1:], dict(alpha=np.zeros((2, 8, 8))), r"grad_alpha must have shape \[2, 4, 4\], got \[2, 8, 8\]"),
-        (RASTER[1:], dict(grad=np.zeros((1, 12, 3))), r"grad_vertices must have shape \[2, 12, 3\], got \[1, 12, 3\]"),
+        (
+            RASTER[1:],
+            dict(grad_vertices=np.zeros((1, 12, 3))),
+            r"grad_vertices .* \[2, 12, 3\], got \[1, 12, 3\]",
+        ),
         (SMOOTHNESS, dict(vertices=np.zeros((2, 12))), r"vertices must have shape \[B, V, 3\], got \[2, 12\]"),
         (SMOOTHNESS, dict(edges=np.zeros((1, 3), int)), r"edges must have shape \[E, 4\], got \[1, 3\]"),
         (SMOOTHNESS, dict(edges=np.full((1, 4), 12)), "edges refer to vertex 12, but a mesh has 12 vertices"),
         (SMOOTHNESS[:1], dict(loss=np.zeros(3)), r"loss must have shape \[2\], got \[3\]"),
         (SMOOTHNESS[1:], dict(loss=np.zeros(3)), r"grad_loss must have shape \[2\], got \[3\]"),
-        (SMOOTHNESS[1:], dict(grad=np.zeros((2, 12))), r"grad_vertices must have shape \[2, 12, 3\], got \[2, 12\]"),
-        (IOU, dict(prediction=np.zeros(9)), r"prediction must have shape \[B, N\], got \[9\]"),
+        (
+            SMOOTHNESS[1:],
+            dict(grad_vertices=np.zeros((2, 12))),
+            r"grad_vertices .* \[2, 12, 3\], got \[2, 12\]",
+        ),
+        (IOU, dict(prediction=np.zeros(9)), r"target must have shape \[9\], got \[2, 9\]"),
         (IOU, dict(target=np.zeros((2, 8))), r"target must have shape \[2, 9\], got \[2, 8\]"),
         (IOU, dict(areas=np.zeros((3, 2))), r"areas must have shape \[2, 2\], got \[3, 2\]"),
-        (IOU[:1], dict(loss=np.zeros(3)), r"iou must have shape \[2\], got \[3\]"),
-        (IOU[1:], dict(loss=np.zeros(3)), r"grad_iou must have shape \[2\], got \[3\]"),
+        (IOU[:1], dict(value=np.zeros(3)), r"loss must have shape \[\], got \[3\]"),
+        (IOU[1:], dict(value=np.zeros(3)), r"grad_loss must have shape \[\], got \[3\]"),
         (IOU[1:], dict(grad_prediction=np.zeros(9)), r"grad_prediction must have shape \[2, 9\], got \[9\]"),
         (IOU[1:], dict(grad_target=np.zeros((1, 9))), r"grad_target must have shape \[2, 9\], got \[1, 9\]"),
-        (("voxelize",), dict(size=0), r"size must lie in 1\.\.1024, got 0"),
-        (("voxelize",), dict(size=5), r"voxels must have shape \[2, 5, 5, 5\], got \[2, 4, 4, 4\]"),
+        (("voxels",), dict(size=0), r"size must lie in 1\.\.1024, got 0"),
+        (("voxels",), dict(size=5), r"grid must have shape \[2, 5, 5, 5\], got \[2, 4, 4, 4\]"),
     ],
 )
 def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
@@ -88,52 +106,42 @@ def test_no_call_reads_or_writes_outside_an_array(calls, change, words):
         starts=None,
         face_index=np.zeros((2, 8, 8), np.int32),
         alpha=np.zeros((2, 4, 4)),
-        grad=np.zeros((2, 12, 3)),
+        grad_vertices=np.zeros((2, 12, 3)),
+        single=np.ones((2, 12, 3), np.float32),
         edges=np.array([[0, 1, 2, 3]]),
         loss=np.zeros(2),
+        value=np.zeros(()),
         prediction=np.ones((2, 9)),
         target=np.ones((2, 9)),
         areas=np.ones((2, 2)),
         grad_prediction=np.zeros((2, 9)),
         grad_target=np.zeros((2, 9)),
-        voxels=np.zeros((2, 4, 4, 4), bool),
+        grid=np.zeros((2, 4, 4, 4), bool),
         size=4,
+        **NUMBERS,
     )
-    for call in calls:
-        CALLS[call](arguments)
+    for name in calls:
+        call(name, arguments)
         with pytest.raises(ValueError, match=words):
-            CALLS[call]({**arguments, **change})
+            call(name, {**arguments, **change})
 
 
 @pytest.mark.parametrize(
-    "call, words",
+    "name, change, words",
     [
-        (lambda v, wrong, face_index: _C.smoothness_forward(v, wrong.reshape(-1, 4), np.zeros(1), 1), "edges refer to"),
-        (
-            lambda v, wrong, face_index: _C.rasterize(v, wrong, None, face_index, True, 0.1, 100.0, True, 1),
-            "faces refer to vertex",
-        ),
-        (
-            lambda v, wrong, face_index: _C.interpolate_forward(
-                v, wrong[None], face_index[:, :2], np.zeros((1, 2, 4096, 3)), None, np.zeros((1, 2, 4096, 3)), 1
-            ),
-            "corners refer to",
-        ),
-        (
-            lambda v, wrong, face_index: _C.silhouette_backward(
-                v, wrong[:1], None, face_index, np.zeros((1, 4096, 4096)), np.zeros((1, 3, 3)), False, 1e-4, 1
-            ),
-            "the face index map does not belong",
-        ),
+        ("smoothness", lambda wrong: dict(edges=wrong.reshape(-1, 4)), "edges refer to"),
+        ("rasterize", lambda wrong: dict(faces=wrong), "faces refer to vertex"),
+        ("silhouette_backward", lambda wrong: dict(faces=wrong[:1]), "the face index map does not belong"),
+        ("soft_iou_loss", lambda wrong: dict(target=np.full((1, 4096, 4096), 255.0)), "divide a mask of 0..255"),
     ],
 )
-def test_other_python_threads_run_while_arrays_are_checked(call, words):
-    vertices, wrong, face_index = (
-        np.zeros((1, 3, 3)),
-        np.zeros((4_000_000, 3), int),
-        np.zeros((1, 4096, 4096), np.int32),
-    )
+def test_other_python_threads_run_while_arrays_are_checked(name, change, words):
+    wrong, face_index = np.zeros((4_000_000, 3), int), np.zeros((1, 4096, 4096), np.int32)
     wrong[-1], face_index[0, -1, -1] = 3, 2
+    image = np.zeros((1, 4096, 4096))
+    table = dict(vertices=np.zeros((1, 3, 3)), starts=None, face_index=face_index, alpha=image, loss=np.zeros(1))
+    table |= dict(prediction=image, areas=np.zeros((1, 2)), value=np.zeros(()), grad_vertices=np.zeros((1, 3, 3)))
+    table |= NUMBERS | dict(anti_aliasing=False) | change(wrong)
     turns, stop, interval = [0], [False], sys.getswitchinterval()
 
     def take_turns():
@@ -149,7 +157,7 @@ def test_other_python_threads_run_while_arrays_are_checked(call, words):
         before = turns[0]
         for _ in range(100):  # on a busy machine the thread may miss its turn
             with pytest.raises(ValueError, match=words):
-                call(vertices, wrong, face_index)
+                call(name, table)
             if turns[0] > before:
                 break
         assert turns[0] > before
@@ -159,19 +167,29 @@ def test_other_python_threads_run_while_arrays_are_checked(call, words):
         thread.join()
 
 
-@pytest.mark.parametrize("points", [(2, 5, 3), (3, 4, 3)])
-def test_projected_points_have_the_shape_of_the_vertices(points):
-    camera = [np.zeros(shape) for shape in ((2, 3, 4), (2, 2, 3))]
-    with pytest.raises(ValueError, match=rf"points must have shape \[2, 4, 3\], got \[{points[0]}, {points[1]}, 3\]"):
-        _C.project_forward(np.zeros((2, 4, 3)), *camera, None, None, None, None, np.zeros(points), True, 1)
-
-
-@pytest.mark.parametrize("change", [np.int32, np.asfortranarray, None])
-def test_nothing_is_converted_silently(change):
-    faces = None if change is None else np.arange(12).reshape(4, 3)
-    faces = faces.astype(change) if change is np.int32 else faces if change is None else change(faces)
-    with pytest.raises(TypeError, match="incompatible function arguments"):
-        _C.rasterize(np.zeros((2, 12, 3)), faces, None, np.zeros((2, 8, 8), np.int32), True, 0.1, 100.0, True, 1)
+@pytest.mark.parametrize(
+    "name, value, words",
+    [
+        (
+            "faces",
+            np.arange(12, dtype=np.int32).reshape(4, 3),
+            "faces must be .* array of int64, got int32",
+        ),
+        ("faces", np.asfortranarray(np.arange(12).reshape(4, 3)), "faces must be .* of int64, got one with gaps"),
+        ("faces", None, "faces must not be None"),
+        ("far", np.zeros(1), "far must be a number, got float64"),
+        ("faces", [[0, 1, 2]], "faces must be .*, got another type"),
+        ("normals", np.zeros(1), "there is no argument normals"),
+    ],
+)
+def test_nothing_is_converted_silently(name, value, words):
+    table = dict(vertices=np.zeros((2, 12, 3)), faces=np.arange(12).reshape(4, 3), starts=None)
+    table |= dict(face_index=np.zeros((2, 8, 8), np.int32)) | NUMBERS
+    arguments = {key: table[key] for key in CALLS["rasterize"].split()} | {name: value}
+    with pytest.raises(TypeError, match=words):
+        _C.rasterize(**arguments, num_threads=1)
+    with pytest.raises(TypeError, match="the argument faces is missing"):
+        _C.rasterize(vertices=table["vertices"], starts=None)
 
 
 def promised(gigabytes, dtype):
@@ -185,7 +203,7 @@ def promised(gigabytes, dtype):
 def test_more_faces_than_an_face_index_map_can_name():
     faces, face_index = promised(24, np.int64).reshape(-1, 3), np.zeros((1, 8, 8), np.int32)
     with pytest.raises(ValueError, match=r"at most 2\^30 faces per mesh"):
-        _C.rasterize(np.zeros((1, 3, 3)), faces, None, face_index, True, 0.1, 100.0, True, 1)
+        call("rasterize", dict(vertices=np.zeros((1, 3, 3)), faces=faces, starts=None, face_index=face_index) | NUMBERS)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
@@ -195,16 +213,8 @@ def test_more_vertices_than_the_set_up_of_faces_can_name(packed):
     starts = np.array([[0, 0], [len(vertices), 1]]) if packed else None
     face_index = np.zeros((1, 8, 8), np.int32)
     with pytest.raises(ValueError, match=r"at most 2\^29 vertices per mesh"):
-        _C.rasterize(vertices if packed else vertices[None], faces, starts, face_index, True, 0.1, 100.0, True, 1)
-
-
-def test_gradients_of_gradients_are_refused():
-    """Those of the public functions are in their own tests; this one no public function reaches."""
-    grad = torch.rand(1, 4, 4, 1, requires_grad=True)
-    with pytest.raises(RuntimeError, match=r"render has no second derivative.*without create_graph=True"):
-        ops.edges.resolve_backward(grad, None, torch.zeros(1, 8, 8, dtype=torch.int32), True, True, False)[
-            0
-        ].sum().backward()
+        vertices = vertices if packed else vertices[None]
+        call("rasterize", dict(vertices=vertices, faces=faces, starts=starts, face_index=face_index) | NUMBERS)
 
 
 def test_without_its_compiled_part_the_package_says_so():
@@ -213,14 +223,12 @@ def test_without_its_compiled_part_the_package_says_so():
     assert "ImportError: the compiled part of nmr is missing" in result.stderr
 
 
-@pytest.mark.parametrize("name", ["vertices", "matrix", "intrinsics", "distortion", "origin", "extent"])
-def test_project_backward_checks_the_shape_of_every_output(name):
-    shapes = dict(
-        vertices=(2, 4, 3), matrix=(2, 3, 4), intrinsics=(2, 2, 3), distortion=(2, 5), origin=(2, 3), extent=(2,)
-    )
-    inputs = [np.ones(shape) for shape in shapes.values()]
-    grads = {key: np.ones(shape) for key, shape in shapes.items()}
-    grads[name] = np.ones((7, *shapes[name]))
-    order = ("vertices", "matrix", "intrinsics", "distortion", "origin", "extent")
+@pytest.mark.parametrize("name", ["points", "vertices", "camera", "distortion"])
+def test_project_checks_the_shape_of_every_output(name):
+    inputs = dict(vertices=np.ones((2, 4, 3)), camera=np.ones((2, 22)), distortion=np.ones((2, 5)), starts=None)
+    grads = {f"grad_{key}": np.ones_like(value) for key, value in inputs.items() if key != "starts"}
+    grads["grad_points"] = np.ones((2, 4, 3))
+    _C.project_backward(**inputs, **grads, perspective=True, num_threads=1)
+    grads[f"grad_{name}"] = np.ones((7, *grads[f"grad_{name}"].shape))
     with pytest.raises(ValueError, match=f"grad_{name} must have shape"):
-        _C.project_backward(*inputs, None, np.ones((2, 4, 3)), *(grads[key] for key in order), True, 1)
+        _C.project_backward(**inputs, **grads, perspective=True, num_threads=1)

@@ -287,7 +287,10 @@ def random_arguments(batch, num_vertices, *, shared=False, distorted=True, dtype
 
 
 def project(vertices, matrix, intrinsics, distortion, origin, extent, perspective=True, starts=None):
-    return ops.project(vertices, matrix, intrinsics, distortion, origin, extent, starts, perspective)
+    origin = torch.zeros_like(matrix[:, 0, :3]) if origin is None else origin
+    extent = torch.ones_like(matrix[:, 0, 0]) if extent is None else extent
+    camera = torch.cat([matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)], dim=1)
+    return ops.project(vertices, camera, distortion, starts, perspective)
 
 
 @pytest.mark.parametrize("perspective, distorted", [(True, True), (True, False), (False, False), (False, True)])

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from vectors import load_vector
 
 import nmr
+import nmr.neural_renderer
 from nmr.cameras import Projection, points_from_angles
 
 

@@ -1,11 +1,11 @@
 """resolve: NMR's gradient for images of any channels, against the slow definition; its invariances, bad input."""
 
 import pytest
+import reference
 import torch
 from scenes import random_soup
 
 import nmr
-from nmr import reference
 
 EPS = 1e-3
 

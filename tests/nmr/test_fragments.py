@@ -1,11 +1,11 @@
 """fragments and depth_image: against the slow definition and finite differences, their invariances, bad input."""
 
 import pytest
+import reference
 import torch
 from scenes import random_soup
 
 import nmr
-from nmr import reference
 
 FAR = 50.0
 

@@ -44,7 +44,7 @@ def of_fragments(v, f, eyes, size, **how):
 
 def of_colors(make, smooth=False):
     def draw(v, f, eyes, size, *values):
-        how = dict(lights=nmr.Lights(smooth=smooth, **LIGHTS), smooth_normals=smooth, interpolation_gradient=True)
+        how = dict(lights=nmr.Lights(smooth=smooth, **LIGHTS), smooth=smooth, interpolation_gradient=True)
         each = [f] * len(v) if isinstance(v, list) and not isinstance(f, list) else f
         how |= dict(colors=make(*values, each) if make == seams else make(*values), background=0.3, image_size=size)
         return tuple(nmr.render(v, f, nmr.LookAt(eyes), outputs=("rgb", "alpha", "depth", "normals"), **how))
@@ -54,7 +54,7 @@ def of_colors(make, smooth=False):
 
 def of_soft_rgb(v, f, eyes, size, colors):
     how = dict(colors=nmr.VertexColors(colors), sigma=1e-3, gamma=0.02, faces_per_pixel=5, near=0.1, image_size=size)
-    return tuple(nmr.render_soft_rgb(v, f, nmr.LookAt(eyes), lights=nmr.Lights(**LIGHTS), **how))
+    return tuple(nmr.render_soft(v, f, nmr.LookAt(eyes), lights=nmr.Lights(**LIGHTS), **how))
 
 
 def of_transparent(v, f, eyes, size, colors, opacity):
@@ -363,13 +363,14 @@ class Recorder(TorchDispatchMode):
 @pytest.mark.parametrize("dtype, packed", [(torch.float32, False), (torch.float64, True)])
 def test_opcheck(dtype, packed, monkeypatch):
     """Schema, fake tensors, registration of the gradient and AOT autograd of every operator as it is called."""
-    monkeypatch.setattr(nmr.ops._register, "_PLAIN", set())  # every call goes through the dispatcher
+    monkeypatch.setattr(nmr.ops._kernel, "_PLAIN", set())  # every call goes through the dispatcher
     with Recorder() as recorder:
         call_everything(dtype, packed)
-    wanted = {x.op for x in vars(nmr.ops).values() if hasattr(x, "op")}
+    operators = [x for x in vars(nmr.ops).values() if hasattr(x, "op")]
+    wanted = {x.op for x in operators} | {x.backward.op for x in operators if hasattr(x, "backward")}
     assert {op for op, _ in recorder.calls} == wanted
     for (op, _), args in recorder.calls.items():
-        if op.name().endswith("_backward") or op.name() == "nmr::local_gradient":
+        if op.name().endswith("_backward"):
             torch.library.opcheck(op, args)
             continue
         leaves = [x.requires_grad_() if isinstance(x, torch.Tensor) and x.is_floating_point() else x for x in args]

@@ -1,11 +1,11 @@
 """The K nearest faces at each pixel."""
 
 import pytest
+import reference
 import torch
 from scenes import random_soup
 
 import nmr
-from nmr import reference
 
 NEAR, FAR = 0.1, 100.0
 

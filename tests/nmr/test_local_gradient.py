@@ -1,11 +1,11 @@
 """gradient="local" of silhouettes and colours: against the slow definition, by hand, its reach, ends of surfaces."""
 
 import pytest
+import reference
 import torch
 from scenes import random_soup
 
 import nmr
-from nmr import reference
 
 
 def square(left, bottom, right, top, dtype=torch.float64):

@@ -73,13 +73,13 @@ def test_same_bits_for_any_number_of_threads():
 
     def gradients():
         leaves = [x.clone().requires_grad_() for x in (vertices, *images)]
-        losses = smoothness_loss(leaves[0], edges), soft_iou_loss(*leaves[1:]), nmr.ops.soft_iou(*images)[0]
+        losses = smoothness_loss(leaves[0], edges), soft_iou_loss(*leaves[1:]), nmr.ops.soft_iou_loss(*images)[1]
         return losses[2], *torch.autograd.grad(losses[0] + losses[1], leaves)
 
     results = for_threads((1, 2, 5), gradients)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-    alone = [nmr.ops.soft_iou(*(x[b : b + 1] for x in images))[0] for b in range(7)]
+    alone = [nmr.ops.soft_iou_loss(*(x[b : b + 1] for x in images))[1] for b in range(7)]
     assert torch.equal(torch.cat(alone), results[0][0])
 
 
@@ -92,10 +92,10 @@ def test_smoothness_same_bits_alone_and_in_a_batch(dtype):
     edges = nmr.edge_table(faces)[:-1]  # 119: not a multiple of the group
     weights = torch.rand(19, generator=g).to(dtype)
     loss = nmr.ops.smoothness(vertices, edges)
-    grad = nmr.ops.smoothness_backward(vertices, edges, weights)
+    grad = nmr.ops.smoothness.backward(vertices, edges, weights, [True])
     for b in range(19):
         assert torch.equal(loss[b : b + 1], nmr.ops.smoothness(vertices[b : b + 1], edges))
-        alone = nmr.ops.smoothness_backward(vertices[b : b + 1], edges, weights[b : b + 1])
+        alone = nmr.ops.smoothness.backward(vertices[b : b + 1], edges, weights[b : b + 1], [True])
         assert torch.equal(grad[b : b + 1], alone)
 
 
@@ -176,9 +176,9 @@ def test_soft_iou_derivatives_of_any_kind():
     torch.testing.assert_close(leaf.grad, gradient)
     for dtype in (torch.float32, torch.float64):
         images = [x.to(dtype).detach().requires_grad_() for x in (prediction, target)]
-        torch.library.opcheck(nmr.ops.soft_iou.op, images)
-        areas, upstream = nmr.ops.soft_iou(*images)[1], torch.rand(3, dtype=dtype, generator=g)
-        torch.library.opcheck(nmr.ops.soft_iou_backward.op, (*images, areas, upstream, True, False))
+        torch.library.opcheck(nmr.ops.soft_iou_loss.op, images)
+        areas, upstream = nmr.ops.soft_iou_loss(*images)[1], torch.rand((), dtype=dtype, generator=g)
+        torch.library.opcheck(nmr.ops.soft_iou_loss.backward.op, (*images, areas, upstream, [True, False]))
 
 
 def octahedron():

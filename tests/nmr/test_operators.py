@@ -110,6 +110,19 @@ def test_export():
     assert torch.equal(program(MESHES), Depth()(MESHES))
 
 
+def test_memory_that_is_missing_is_reported_once(monkeypatch):
+    calls = []
+
+    def without_memory(*args, **kwargs):
+        calls.append(args)
+        raise RuntimeError("can't allocate memory")
+
+    monkeypatch.setattr(torch.Tensor, "new_empty", without_memory)
+    with pytest.raises(RuntimeError, match="can't allocate memory"):
+        nmr.ops.normals(MESHES, FACES, None, True)
+    assert len(calls) == 1
+
+
 def test_the_first_render_imports_no_compiler():
     """It takes milliseconds; torch._dynamo alone takes a second."""
     program = """

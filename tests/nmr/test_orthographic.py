@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
+import reference
 import torch
 
 import nmr
-from nmr import reference
 from nmr.cameras import from_opengl, from_pytorch3d
 
 SIZE = 24

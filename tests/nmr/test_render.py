@@ -168,6 +168,7 @@ def test_each_output_has_a_function_of_its_own():
     vertices, faces = bumpy_sphere()
     size = dict(image_size=16)
     images = nmr.render(vertices, faces, CAMERA, outputs=("rgb", "alpha", "depth", "normals", "fragments"), **size)
+    assert torch.equal(nmr.render(vertices, faces, CAMERA, outputs="depth", **size).depth, images.depth)
     assert torch.equal(images.rgb, nmr.render_rgb(vertices, faces, CAMERA, **size))
     assert torch.equal(images.alpha, nmr.render_silhouette(vertices, faces, CAMERA, **size))
     assert torch.equal(images.depth, nmr.render_depth(vertices, faces, CAMERA, **size))

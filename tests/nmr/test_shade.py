@@ -1,11 +1,11 @@
-"""sample_texture_cubes and interpolate: slow definitions, finite differences, their invariances, bad input."""
+"""texture_cubes and interpolate: slow definitions, finite differences, their invariances, bad input."""
 
 import pytest
+import reference
 import torch
 from scenes import random_soup
 
 import nmr
-from nmr import reference
 
 EPS = 1e-3
 
@@ -35,7 +35,7 @@ def test_texture_cubes_equal_the_slow_definition(size, channels, texture_batch):
     face_index, weights = fragments_of(vertices, faces, 10)
     assert (face_index >= len(faces)).any() and (face_index < 0).any()
     textures = random_like((texture_batch, len(faces), size, size, size, channels))
-    colors, grad = with_gradients(lambda t: nmr.ops.sample_texture_cubes(t, face_index, weights, None, EPS), textures)
+    colors, grad = with_gradients(lambda t: nmr.ops.texture_cubes(t, face_index, weights, None, EPS), textures)
 
     def slow(textures):
         out = torch.zeros(*face_index.shape, channels, dtype=torch.float64)
@@ -59,12 +59,12 @@ def test_texture_cubes_at_their_far_end(eps):
         weights[..., k] = 1
         index = [0, 0, 0]
         index[k] = 3
-        color = nmr.ops.sample_texture_cubes(textures, face_index, weights, None, eps).item()
+        color = nmr.ops.texture_cubes(textures, face_index, weights, None, eps).item()
         last = textures[0, 0][tuple(index)].item()
         index[k] = 2
         expected = (1 - eps) * last + eps * textures[0, 0][tuple(index)].item()
         assert color == pytest.approx(expected, rel=1e-6)
-    color = nmr.ops.sample_texture_cubes(textures, face_index, weights * float("nan"), None, eps)
+    color = nmr.ops.texture_cubes(textures, face_index, weights * float("nan"), None, eps)
     assert color == textures[0, 0, 0, 0, 0]
 
 

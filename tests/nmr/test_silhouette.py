@@ -5,11 +5,11 @@ import subprocess
 import sys
 
 import pytest
+import reference
 import torch
 from scenes import random_soup
 
 import nmr
-from nmr import reference
 
 RECTANGLES = [(7, 16), (15, 6), (1, 9), (9, 1)]
 

@@ -1,11 +1,11 @@
 """Soft silhouettes and soft colours."""
 
 import pytest
+import reference
 import torch
 from scenes import random_soup
 
 import nmr
-from nmr import reference
 
 
 def soup(seed, dtype=torch.float64, num_faces=10):
@@ -119,7 +119,7 @@ def test_image_and_gradients_equal_the_slow_definition(seed, size, layers, camer
     vertices, colors, background, sigma, gamma = leaves
     how = dict(sigma=sigma, gamma=gamma, faces_per_pixel=layers, near=NEAR, far=FAR, image_size=size, clip=False)
     colored = dict(colors=nmr.VertexColors(colors), background=background)
-    rgb, alpha = nmr.render_soft_rgb(vertices, faces, camera, **colored, **how)
+    rgb, alpha = nmr.render_soft(vertices, faces, camera, **colored, **how)
     wanted = reference.soft_colors(
         vertices, faces, colors, background, size, sigma, gamma, layers, NEAR, FAR, perspective=camera is None
     )
@@ -139,7 +139,7 @@ def test_gradients_of_colors_are_the_derivative():
     def draw(vertices, colors, background, sigma, gamma):  # no face is left out, so that the image is smooth
         how = dict(sigma=sigma, gamma=gamma, dist_eps=1e-30, near=1e-3, image_size=(5, 6), anti_aliasing=True)
         colors = nmr.VertexColors(colors)
-        return (*nmr.render_soft_rgb(vertices, faces, colors=colors, background=background, **how, clip=False),)
+        return (*nmr.render_soft(vertices, faces, colors=colors, background=background, **how, clip=False),)
 
     leaves[3:] = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.3, 0.4)]
     assert torch.autograd.gradcheck(draw, leaves, eps=1e-7, atol=1e-5, rtol=1e-4)
@@ -149,14 +149,14 @@ def test_a_face_shows_its_colour_beyond_its_border_and_the_background_behind():
     vertices = torch.tensor([[-0.5, -0.5, 2.0], [0.0, -0.5, 2.0], [0.0, 0.5, 2.0], [-0.5, 0.5, 2.0]]).double()
     faces, red = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[1.0, 0.0, 0.0]]).expand(4, 3)
     how = dict(colors=nmr.VertexColors(red), background=(0.0, 0.0, 1.0), sigma=1e-3, image_size=100)
-    rgb, alpha = nmr.render_soft_rgb(vertices, faces, **how)
+    rgb, alpha = nmr.render_soft(vertices, faces, **how)
     row, reach = rgb[0, 50], (1e-3 * torch.log(torch.tensor(1e4 - 1))).sqrt()
     x = (torch.arange(100) + 0.5) / 50 - 1
     near_border = (x > 0) & (x < reach)
     torch.testing.assert_close(row[near_border], red[:1].expand(int(near_border.sum()), 3).double(), rtol=0, atol=1e-6)
     torch.testing.assert_close(alpha[0, 50, 50], torch.sigmoid(-(x[50].double() ** 2) / 1e-3), rtol=1e-6, atol=0)
     assert torch.equal(row[x > reach], torch.tensor([[0.0, 0.0, 1.0]]).expand(int((x > reach).sum()), 3).double())
-    soft, _ = nmr.render_soft_rgb(vertices, faces, gamma=0.5, **how)  # now D counts: more blue farther out
+    soft, _ = nmr.render_soft(vertices, faces, gamma=0.5, **how)  # now D counts: more blue farther out
     assert (soft[0, 50, near_border, 2].diff() > 0).all() and soft[0, 50, 25, 2] < 0.3
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+import reference
 import torch
 from vectors import gradient_tolerance, load_vector, vector_names
 
 import nmr
-from nmr import reference
 
 SILHOUETTES = vector_names("sil_*")
 QUIRKS = vector_names("quirk_sil_*")

@@ -1,6 +1,6 @@
 """Readers, a file per layout of published data sets."""
 
-from learn3d.data.readers import around, dvr, kar, kato, pascal3d, photos, r2n2
+from learn3d.data.readers import around, dvr, kar, kato, pascal3d, photos
 
 #: Layout -> module with `PROPERTIES` and two functions. `load(folder, category, split, *, findings, ...)` reads a split
 #: of a category (name or synset id), with the keywords `PROPERTIES.options`. It raises MissingFile or DamagedFile for
@@ -10,7 +10,6 @@ READERS = {
     "kato": kato,
     "dvr": dvr,
     "kar": kar,
-    "r2n2": r2n2,
     "pascal3d": pascal3d,
     "photos": photos,
     "around": around,

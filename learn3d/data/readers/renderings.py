@@ -1,4 +1,4 @@
-"""Shared functions of the readers kar, r2n2 and dvr: read the files of many objects, and join them to arrays."""
+"""Shared functions of the readers kar and dvr: read the files of many objects, and join them to arrays."""
 
 import itertools
 from collections import Counter

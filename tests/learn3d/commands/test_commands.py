@@ -17,10 +17,10 @@ from learn3d import commands
 from learn3d.commands import train as train_command
 from learn3d.commands.train import Train
 from learn3d.config import load_config
-from learn3d.experiments.measurement import MEASURES
 from learn3d.runs.checkpoint import Progress
+from learn3d.runs.measurement import MEASURES
 from learn3d.runs.run import Summary
-from learn3d.shapes import numbered_shape
+from learn3d.studio.shapes import numbered_shape
 from learn3d.terminal import INTERRUPTED
 
 TOOLS = Path(__file__).parents[3] / "tools"
@@ -220,7 +220,7 @@ def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command
     def refuse(*_: object) -> None:
         raise OSError("the disk is full")
 
-    monkeypatch.setattr("learn3d.commands.models.write_json", refuse)
+    monkeypatch.setattr("learn3d.commands.train.write_json", refuse)
     assert command(*words)[:2] == (1, out), "the table is not lost"
 
 

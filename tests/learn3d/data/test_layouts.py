@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 import pytest
 from reader_checks import cut_short
-from shapenet_files import CHAIR, write_dvr, write_kar, write_r2n2
+from shapenet_files import CHAIR, write_dvr, write_kar
 
 from learn3d.data.layouts import LAYOUTS, Layout, check_folder, check_options, load_dataset
 from learn3d.data.readers import READERS, renderings
@@ -29,17 +29,14 @@ def folders(tmp_path_factory):
         np.savez(root / "kato" / f"{prefix}_test_voxels.npz", rng.random((2, 32, 32, 32)) < 0.5)
     write_dvr(root / "dvr", {"test": ["a0"]})
     write_kar(root / "kar", {"train": ["b1"], "val": ["c2"], "test": ["a0"]}, 64)
-    write_r2n2(root / "r2n2", ["a0", "b1"], 64)
-    for path in (p for layout in ("dvr", "kar", "r2n2") for p in list((root / layout).rglob(CHAIR))):
+    for path in (p for layout in ("dvr", "kar") for p in list((root / layout).rglob(CHAIR))):
         shutil.copytree(path, path.with_name(TABLE))
     lists = json.loads((root / "kar" / "splits.json").read_text())
     (root / "kar" / "splits.json").write_text(json.dumps(lists | {TABLE: lists[CHAIR]}))
     return root
 
 
-@pytest.mark.parametrize(
-    ("layout", "views", "classes"), [("kato", 48, 24), ("dvr", 24, 24), ("kar", 20, 72), ("r2n2", 24, 24)]
-)
+@pytest.mark.parametrize(("layout", "views", "classes"), [("kato", 48, 24), ("dvr", 24, 24), ("kar", 20, 72)])
 def test_one_category_or_several(folders, layout, views, classes) -> None:
     one = load_dataset(layout, folders / layout, "chair", "test")
     assert (len(one), one.num_views, one.num_classes) == (views, classes, 1)
@@ -123,5 +120,5 @@ def test_command_prints_problems_and_a_table_and_sets_its_exit_status(tiny_folde
     assert (report["errors"], report["warnings"], report["layout"]) == (2, 0, "kato")
     assert [p["severity"] for p in report["splits"][0]["problems"]] == ["error", "error"]
 
-    status, _, said = command("check-dataset", tmp_path, "--layout", "r2n2")
-    assert status == 1 and "layout 'kato', not 'r2n2'" in said
+    status, _, said = command("check-dataset", tmp_path, "--layout", "dvr")
+    assert status == 1 and "layout 'kato', not 'dvr'" in said

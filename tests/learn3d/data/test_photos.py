@@ -14,7 +14,6 @@ import pytest
 import torch
 from PIL import Image
 
-from learn3d.commands.data import EstimatePoses
 from learn3d.config import TrainConfig
 from learn3d.data.layouts import check_folder, load_dataset
 from learn3d.data.poses import LookAtPoses
@@ -24,6 +23,7 @@ from learn3d.data.view_bins import choose_bins, view_classes
 from learn3d.evaluation import evaluate
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
+from learn3d.studio.commands import EstimatePoses
 from learn3d.training import train
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "make_photo_folder.py"

@@ -1,4 +1,4 @@
-"""ShapeNet's renderings as DVR, Kar et al. and 3D-R2N2 packed them, written to their descriptions."""
+"""ShapeNet's renderings as DVR and Kar et al. packed them, written to their descriptions."""
 
 from __future__ import annotations
 
@@ -10,32 +10,20 @@ import numpy as np
 import pytest
 import scipy.io
 import torch
-from PIL import Image
 from reader_checks import cut_short, expect, problems, silhouette_iou
-from shapenet_files import (
-    CHAIR,
-    COLOR,
-    binvox_bytes,
-    box_mesh,
-    save,
-    shapes,
-    swap_frames,
-    write_dvr,
-    write_kar,
-    write_r2n2,
-)
+from shapenet_files import CHAIR, COLOR, box_mesh, save, shapes, swap_frames, write_dvr, write_kar
 
 from learn3d.data.conventions import KATO, view_poses
-from learn3d.data.readers import READERS, dvr, kar, r2n2
+from learn3d.data.readers import READERS, dvr, kar
 from learn3d.data.readers.kar import KAR
-from learn3d.data.readers.r2n2 import R2N2
+from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.data.readers.renderings import check_poses
 from learn3d.files.reading import DamagedFile
 from nmr.metrics import voxel_iou
 
 LISTS = {"train": ["b1"], "val": ["c2"], "test": ["a0"]}
 ASIDE = np.eye(4)[[0]].T @ np.eye(4)[[3]]
-OBJECT = {"dvr": "a0", "kar": "a0", "r2n2": "b1"}  # of the split "test"
+OBJECT = "a0"  # of the split "test"
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +31,6 @@ def originals(tmp_path_factory):
     root = tmp_path_factory.mktemp("renderings")
     write_dvr(root / "dvr", LISTS)
     write_kar(root / "kar", LISTS, 80)  # the real renders have 224 pixels
-    write_r2n2(root / "r2n2", ["a0", "b1"], 72)  # and these 137
     return root
 
 
@@ -52,18 +39,14 @@ def copy(originals, tmp_path):
     return lambda layout: shutil.copytree(originals / layout, tmp_path / layout)
 
 
-def views(folder: Path, name: str = "") -> Path:
+def views(folder: Path, name: str = OBJECT) -> Path:
     """The folder of the images of an object."""
-    parents = {"dvr": "", "kar": "renders", "r2n2": "ShapeNetRendering"}
-    root = folder / parents[folder.name] / CHAIR / (name or OBJECT[folder.name])
-    return root / "rendering" if folder.name == "r2n2" else root
+    return folder / {"dvr": "", "kar": "renders"}[folder.name] / CHAIR / name
 
 
 def grid(folder: Path) -> Path:
     """The voxels of an object."""
-    if folder.name == "r2n2":
-        return folder / "ShapeNetVox32" / CHAIR / OBJECT["r2n2"] / "model.binvox"
-    return folder / "voxels" / "modelVoxels32" / CHAIR / f"{OBJECT['kar']}.mat"
+    return folder / "voxels" / "modelVoxels32" / CHAIR / f"{OBJECT}.mat"
 
 
 def mesh(number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -72,23 +55,17 @@ def mesh(number: int) -> tuple[np.ndarray, np.ndarray]:
     return swap_frames(vertices), faces
 
 
-@pytest.mark.parametrize(("layout", "number", "count", "half_fov"), [("kar", 0, 20, 14.9314), ("r2n2", 1, 24, 24.5672)])
-def test_renders_voxels_and_cameras_agree_with_the_object(originals, layout, number, count, half_fov) -> None:
-    dataset = READERS[layout].load(originals / layout, "chair", "test")
-    assert (len(dataset), dataset.object_names) == (count, (OBJECT[layout],))
-    assert dataset.poses.half_fov_deg == pytest.approx(half_fov, abs=1e-4)
-    assert silhouette_iou(dataset, *mesh(number)).min() > 0.92
-    vertices, faces = map(torch.from_numpy, mesh(number))
+def test_renders_voxels_and_cameras_of_kar_agree_with_the_object(originals) -> None:
+    dataset = kar.load(originals / "kar", "chair", "test")
+    assert (len(dataset), dataset.object_names) == (20, (OBJECT,))
+    assert dataset.poses.half_fov_deg == pytest.approx(14.9314, abs=1e-4)
+    assert silhouette_iou(dataset, *mesh(0)).min() > 0.92
+    vertices, faces = map(torch.from_numpy, mesh(0))
     truth = torch.from_numpy(dataset.voxels)
-    iou = {c.name: float(voxel_iou(c.voxelize(vertices, faces), truth)) for c in (KATO, KAR, R2N2)}
-    assert iou.pop(layout) > 0.75 and max(iou.values()) < 0.4
+    iou = {c.name: float(voxel_iou(c.voxelize(vertices, faces), truth)) for c in (KATO, KAR, PASCAL3D)}
+    assert iou.pop("kar") > 0.75 and max(iou.values()) < 0.4
     colors, mask = dataset.images[:, :3].transpose(0, 2, 3, 1), dataset.images[:, 3]
     assert (colors[mask == 255] == COLOR).all() and (colors[mask == 0] == 255).all() and not dataset.inverted
-
-
-def test_distances_of_r2n2_are_in_sides_of_the_grid(tmp_path) -> None:
-    write_r2n2(tmp_path, ["a0", "b1"], 72, scale=0.8)
-    assert silhouette_iou(r2n2.load(tmp_path, "chair", "test"), *mesh(1)).min() > 0.92
 
 
 def test_images_and_cameras_of_dvr_are_those_of_katos_files(originals) -> None:
@@ -141,32 +118,25 @@ def test_objects_may_have_fewer_renders(copy) -> None:
     assert not problems("kar", folder, "test")
 
 
-@pytest.mark.parametrize(("layout", "size"), [("kar", 80), ("r2n2", 72)])
-def test_large_images_keep_their_size_and_masks_have_64_pixels(originals, layout, size) -> None:
-    load, folder = READERS[layout].load, originals / layout
-    dataset = load(folder, "chair", "test", image_size=size)
-    assert dataset.image_size == size and set(np.unique(dataset.images[:, 3])) == {0, 255}
-    small = load(folder, "chair", "test").images[:, 3]
+def test_large_images_keep_their_size_and_masks_have_64_pixels(originals) -> None:
+    dataset = kar.load(originals / "kar", "chair", "test", image_size=80)
+    assert dataset.image_size == 80 and set(np.unique(dataset.images[:, 3])) == {0, 255}
+    small = kar.load(originals / "kar", "chair", "test").images[:, 3]
     np.testing.assert_array_equal(dataset.masks, small)
     assert len(np.unique(small)) > 2  # borders are averaged
     with pytest.raises(ValueError, match=r"expected a square image of at least 137x137"):
-        load(folder, "chair", "test", image_size=137)
+        kar.load(originals / "kar", "chair", "test", image_size=137)
 
 
-def test_contents_and_splits(originals, tmp_path) -> None:
-    for layout, splits in {"dvr": tuple(LISTS), "kar": tuple(LISTS), "r2n2": ("train", "test")}.items():
-        assert READERS[layout].contents(originals / layout) == {CHAIR: splits}
-        assert [problems(layout, originals / layout, split) for split in splits] == [()] * len(splits)
-    write_r2n2(tmp_path, list("gfedcba"), 64)
-    names = {split: r2n2.load(tmp_path, CHAIR, split).object_names for split in ("train", "test")}
-    assert names == {"train": tuple("abcde"), "test": tuple("fg")}  # the first four fifths of the sorted ids
-    with pytest.raises(ValueError, match="split must be one of train, test; got 'val'"):
-        r2n2.load(tmp_path, CHAIR, "val")
+def test_contents_and_splits(originals) -> None:
+    for layout in ("dvr", "kar"):
+        assert READERS[layout].contents(originals / layout) == {CHAIR: tuple(LISTS)}
+        assert [problems(layout, originals / layout, split) for split in LISTS] == [()] * len(LISTS)
 
 
 def rewrite_row(k: int, text: str):
     def change(folder: Path) -> None:
-        path = views(folder) / ("view.txt" if folder.name == "kar" else "rendering_metadata.txt")
+        path = views(folder) / "view.txt"
         rows = path.read_text().splitlines()
         rows[k : k + 1] = [text] if text else []
         path.write_text("\n".join(rows))
@@ -237,12 +207,6 @@ FAULTS = {
     ("kar", "view.txt: row 4 has azimuth 1, elevation 95 and distance 2"): rewrite_row(4, "1 95 0 2"),
     ("kar", "a0.mat: is missing"): lambda f: grid(f).unlink(),
     ("kar", "a0.mat: has float64 [16, 16, 16]"): lambda f: scipy.io.savemat(grid(f), {"Volume": np.ones((16,) * 3)}),
-    ("r2n2", "rendering/23.png: is missing"): lambda f: (views(f) / "23.png").unlink(),
-    ("r2n2", "02.png: has no alpha channel"): lambda f: save(views(f) / "02.png", np.zeros((72, 72, 3), np.uint8)),
-    ("r2n2", "rendering_metadata.txt: cannot be read (23 rows of finite numbers, 24 are needed)"): rewrite_row(0, ""),
-    ("r2n2", "row 1 has azimuth -10, elevation 27 and distance -1.75"): rewrite_row(1, "10 27 0 -1 25"),
-    ("r2n2", "model.binvox: cannot be read (cannot reshape"): lambda f: cut_short(grid(f)),
-    ("r2n2", "rendering: is missing; expected the folder of an object"): lambda f: shutil.rmtree(views(f)),
 }
 
 
@@ -265,12 +229,6 @@ def test_oddities_of_an_object_are_warnings(copy) -> None:
     folder = copy("kar")
     scipy.io.savemat(grid(folder), {"Volume": np.zeros((32, 32, 32), np.uint8)})
     expect("kar", folder, "test", "a0.mat: the grid is empty", "warning")
-    folder = copy("r2n2")
-    grid(folder).write_bytes(binvox_bytes(np.zeros((32, 32, 32), bool)))
-    pixels = np.array(Image.open(views(folder) / "07.png"))
-    pixels[..., 3] = 0
-    save(views(folder) / "07.png", pixels)
-    assert [p.severity for p in problems("r2n2", folder, "test")] == ["warning"] * 2
 
 
 LIST_FAULTS = {
@@ -300,12 +258,8 @@ def test_lists_that_are_absent_or_overlap(copy) -> None:
     expect("dvr", folder, "test", "test shares 1 objects with train, such as b1", "warning")
     path.unlink()
     expect("dvr", folder, "test", "is missing; expected a list of ids. Splits here: train, val")
-    folder = copy("r2n2")
-    shutil.rmtree(views(folder, "a0").parent)
-    expect("r2n2", folder, "train", "holds 1 objects, which leaves none for train; expected at least 2")
-    shutil.rmtree(folder / "ShapeNetRendering" / CHAIR)
-    (folder / "ShapeNetRendering" / "02691156").mkdir()
-    expect("r2n2", folder, "train", "there is no folder of 'chair'; those here are: 02691156")
+    (folder / CHAIR).rename(folder / "02691156")
+    expect("dvr", folder, "train", "there is no folder of 'chair'; those here are: 02691156")
 
 
 def test_everything_wrong_is_found_in_one_walk(copy) -> None:

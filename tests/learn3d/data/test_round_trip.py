@@ -18,8 +18,8 @@ from learn3d.data.conventions import mesh_to_object
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import LAYOUTS, load_dataset
 from learn3d.data.mirror_plane import find_mirror_plane
-from learn3d.make_data.render import DatasetConfig, make_dataset
-from learn3d.make_data.writers import WRITERS
+from learn3d.studio.make_data.render import DatasetConfig, make_dataset
+from learn3d.studio.make_data.writers import WRITERS
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,6 @@ def test_masks_cameras_and_voxels(made):
         dataset = load_dataset(made.layout, made.folder, "chair", split)
         assert dataset.inverted == LAYOUTS[made.layout].inverted
         assert (dataset.voxels is not None) == LAYOUTS[made.layout].voxels
-        assert (dataset.points is not None) == (made.layout == "dvr")
         expected = SETTINGS[made.layout].get("views", 24)
         if made.layout == "kar" and split == "train":
             expected = 1  # the published protocol
@@ -85,10 +84,6 @@ def test_masks_cameras_and_voxels(made):
             if dataset.voxels is not None:
                 voxels = dataset.convention.voxelize(vertices, faces)[0].numpy()
                 assert (voxels == dataset.voxels[number]).all()
-            if dataset.points is not None:
-                low, high = vertices.numpy().min(0), vertices.numpy().max(0)
-                np.testing.assert_allclose(dataset.points[number].min(0), low, atol=0.01)
-                np.testing.assert_allclose(dataset.points[number].max(0), high, atol=0.01)
         # colours: nothing outside of the object, something on it
         colors = batch.images[:, :3].float()
         background = colors.permute(0, 2, 3, 1)[(batch.images[:, 3] == 0)]

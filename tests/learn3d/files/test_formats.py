@@ -16,8 +16,6 @@ import pytest
 import scipy.io
 import trimesh
 from PIL import Image
-from shapenet_files import binvox_bytes
-from trimesh.exchange.binvox import load_binvox
 
 from learn3d.data.framing import read_photo
 from learn3d.files import formats, limits, renderings, sandbox
@@ -195,34 +193,3 @@ def test_other_files_than_matlab_are_refused(tmp_path):
     for content in (b"MATLAB", saved(Volume=CELLS)[:-5], b"", bytes(limits.VOLUME_BYTES + 1)):
         with pytest.raises(ValueError, match=r"a\.mat: "):
             matlab(tmp_path, content)
-
-
-def binvox(path: Path, content: bytes, size: int = 8) -> tuple[np.ndarray, float]:
-    path.write_bytes(content)
-    return sandbox.read(formats.read_binvox, path, size)
-
-
-def test_binvox_grids_have_the_axes_of_the_mesh(tmp_path):
-    content = binvox_bytes(CELLS, scale=0.7, translate=-0.3)
-    voxels, side = binvox(tmp_path / "model.binvox", content)
-    np.testing.assert_array_equal(voxels, CELLS)
-    assert voxels.dtype == bool and side == 0.7
-    np.testing.assert_array_equal(np.asarray(load_binvox(io.BytesIO(content)).matrix), CELLS)  # trimesh agrees
-    assert binvox(tmp_path / "full", binvox_bytes(np.ones((32, 32, 32), bool)), 32)[0].all()  # runs above 255
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (b"\ndata\n", b"\n", "cannot reshape"),
-        (b"dim 8 8 8", b"dim 8 8 9", "it has dim [b'8', b'8', b'9'] and scale 1.0, wanted 8"),
-        (b"scale 1.0", b"", "scale"),
-        (b"scale 1.0", b"scale nan", "and scale nan, wanted"),
-        (b"data\n", b"data\n\x01\x05", "cannot reshape array of size 517"),
-    ],
-)
-def test_damaged_files_are_named(tmp_path, old: bytes, new: bytes, message: str):
-    path = tmp_path / "model.binvox"
-    with pytest.raises(ValueError) as error:
-        binvox(path, binvox_bytes(CELLS).replace(old, new))
-    assert str(error.value).startswith(str(path)) and message in str(error.value)

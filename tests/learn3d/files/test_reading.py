@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from learn3d.files import npz, sandbox, writing
-from learn3d.files.formats import read_binvox, read_matlab, read_mesh, read_state_dict
+from learn3d.files.formats import read_matlab, read_mesh, read_state_dict
 from learn3d.files.reading import parse_json, read_bytes, read_json, read_text
 from learn3d.files.renderings import PHOTOGRAPHS, open_image
 
@@ -35,7 +35,6 @@ READERS = {
     "image": lambda path: open_image(path, PHOTOGRAPHS, 100),
     "mesh": read_mesh,
     "MATLAB": lambda path: sandbox.read(read_matlab, path, "Volume", 32),
-    "binvox": lambda path: sandbox.read(read_binvox, path, 32),
     "weights": read_state_dict,
     "text": lambda path: read_text(path, 100, "a text"),
 }

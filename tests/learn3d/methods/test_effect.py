@@ -14,10 +14,10 @@ import torch
 from learn3d.data.dataset import Batch
 from learn3d.data.readers import kato
 from learn3d.losses import domain_confusion_loss, pose_classification_loss
-from learn3d.make_data.render import DatasetConfig, make_dataset
 from learn3d.methods import create_method
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.presets import PRESETS
+from learn3d.studio.make_data.render import DatasetConfig, make_dataset
 
 SIDES = (0, 6, 12, 18)  # views from the four sides
 

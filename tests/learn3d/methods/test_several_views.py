@@ -17,12 +17,12 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices
 from learn3d.evaluation import evaluate
 from learn3d.losses import depth_losses
-from learn3d.make_data.render import DatasetConfig, make_shards
 from learn3d.methods import create_method
 from learn3d.methods.multi_view import ManyViews, MultiView, MultiViewSettings
 from learn3d.methods.optimization import SparseGradientAdam, TrainingSchedule
 from learn3d.networks.generators import deform_bounded_sphere
 from learn3d.presets import PRESETS
+from learn3d.studio.make_data.render import DatasetConfig, make_shards
 
 
 def make_batch(objects: list[int]) -> Batch:

@@ -13,7 +13,7 @@ from learn3d.methods import create_method, mesh_method
 from learn3d.methods.mesh_method import refine
 from learn3d.pictures.surfaces import grid_surface
 from learn3d.presets import PRESETS
-from learn3d.reconstruction import reconstruct_dataset
+from learn3d.studio.picture_to_mesh.reconstruction import reconstruct_dataset
 
 
 def test_surface_of_a_ball_is_where_the_ball_is() -> None:

@@ -199,11 +199,12 @@ def test_background_of_preact_is_grey() -> None:
     assert seen[0][:, :, 0, 0].tolist() == [[0, 0, 0], [-1, 1, 0]]
 
 
-def test_network_input_scales_bytes_to_the_unit_interval() -> None:
+@pytest.mark.parametrize("memory_format", [torch.channels_last, torch.contiguous_format])
+def test_network_input_scales_bytes_to_the_unit_interval(memory_format: torch.memory_format) -> None:
     noise = torch.randint(0, 256, (3, 4, 64, 64), dtype=torch.uint8)
-    result = network_input(noise, "cpu")
+    result = network_input(noise, "cpu", memory_format=memory_format)
     assert torch.equal(result, noise.float() / 255)
-    assert result.is_contiguous(memory_format=torch.channels_last)
+    assert result.is_contiguous(memory_format=memory_format)
     with pytest.raises(ValueError, match=r"images must be uint8 \[B, 4, 224, 224\]"):
         network_input(noise, "cpu", 224)
 

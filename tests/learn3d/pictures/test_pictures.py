@@ -13,6 +13,7 @@ import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.methods.method import Grids
+from learn3d.pictures.photograph import BACK_LIGHT, photograph, studio_lights
 from learn3d.pictures.sheets import (
     HEADER,
     MARGIN,
@@ -24,7 +25,6 @@ from learn3d.pictures.sheets import (
     save_png,
     tile,
 )
-from learn3d.pictures.studio import BACK_LIGHT, photograph, studio_lights
 from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit, turntable
 
 WHITE = np.ones(3, np.float32)

@@ -112,6 +112,17 @@ def test_a_copy_inside_of_a_package(tmp_path):
     assert namespace["nr"] is namespace["same"] is nr
 
 
+def test_a_copy_inside_of_a_package_that_does_not_exist():
+    nr.install_as("nmr_alias.external.neural_renderer")
+    namespace = {}
+    exec(
+        "import nmr_alias.external.neural_renderer as nr\nfrom nmr_alias.external import neural_renderer as same",
+        namespace,
+    )
+    assert namespace["nr"] is namespace["same"] is nr
+    assert importlib.import_module("nmr_alias.external.neural_renderer.look").look is nr.look
+
+
 def test_an_alias_by_hand_has_its_modules():
     sys.modules["nmr_alias"] = nr
     vertices, faces = nmr.icosphere(1)

@@ -1,0 +1,109 @@
+"""Turns the pixels that a browser sends into a mask and meshes, with a message for each step; example pictures."""
+
+import base64
+import io
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+import nmr
+from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
+from learn3d.data.framing import check_mask, mask_box
+from learn3d.pictures.photograph import PALETTES, natural_look, photograph
+from learn3d.studio.picture_to_mesh.cutting import Box, correct, find_mask
+from learn3d.studio.picture_to_mesh.reconstruction import Model, mesh_bytes, reconstruct_picture
+from learn3d.studio.shapes import make_shape
+
+SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
+EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # category: seed
+_MARGIN = 24  # pixels around the object of an example
+
+Send = Callable[[dict[str, Any]], None]
+
+
+class Picture(NamedTuple):
+    """A picture, and hints about its object."""
+
+    colors: np.ndarray  # uint8 [H, W, 3]
+    mask: np.ndarray  # uint8 [H, W], above 127: object; 255 everywhere if unknown
+    strokes: np.ndarray | None = None  # corrections of the mask, uint8 [H, W], see `cutting.correct`
+    box: Box | None = None  # box around the object
+
+
+def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> Picture:
+    """Decode a picture that a browser sends: R, G, B, mask for each pixel, then optionally strokes, a byte per pixel.
+
+    Raises ValueError for a wrong size or number of bytes.
+    """
+    pixels = width * height
+    if not (0 < width <= SIDE and 0 < height <= SIDE) or len(content) not in (4 * pixels, 5 * pixels):
+        raise ValueError(f"a picture of {width} x {height} pixels came in {len(content)} bytes; at most {SIDE} a side")
+    values = np.frombuffer(content, np.uint8)
+    rgba = values[: 4 * pixels].reshape(height, width, 4)
+    strokes = values[4 * pixels :].reshape(height, width) if len(values) > 4 * pixels else None
+    return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3].copy(), strokes, box)
+
+
+def find_object(picture: Picture) -> tuple[np.ndarray, bool]:
+    """The object's mask uint8 [H, W], and whether other large regions were found.
+
+    The mask is the given one, with its corrections; without one it is the largest region found in the box or picture.
+    """
+    if picture.box is None and picture.strokes is not None:
+        return correct(picture.colors, picture.mask, picture.strokes), False
+    if picture.box is None and picture.mask.min() < 255:
+        return picture.mask, False
+    return find_mask(picture.colors, picture.box)
+
+
+def make_meshes(models: Mapping[str, Model], picture: Picture, send: Send) -> None:
+    """Send the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
+    try:
+        mask, more = find_object(picture)
+        send({"mask": _base64(np.packbits(mask > 127).tobytes()), "more": more})
+        try:
+            check_mask(mask, cropped=True)
+        except ValueError:
+            raise ValueError("No object was found. Draw a box around it, or paint it with Add.") from None
+        send({"meshes": [_mesh(label, model, picture.colors, mask, send) for label, model in models.items()]})
+    except ValueError as error:
+        send({"error": str(error)})
+
+
+def _mesh(label: str, model: Model, colors: np.ndarray, mask: np.ndarray, send: Send) -> dict[str, Any]:
+    result = reconstruct_picture(
+        model, colors, mask, progress=lambda text, part: send({"progress": text, "part": part})
+    )
+    if not len(result.surface.faces):
+        raise ValueError(f"The model {label} makes an empty shape of this picture. Try another picture.")
+    angle = np.radians(result.azimuth_deg)
+    x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
+    glb = mesh_bytes(result.surface, "glb", "object")
+    return {
+        "label": label,
+        "glb": _base64(glb),
+        "yaw": float(np.arctan2(x, z)),
+        "kind": result.kind,
+        "warning": result.warning,
+    }
+
+
+def example(category: str) -> bytes:
+    """An example picture as PNG: a generated object in natural colours on transparency, seen obliquely."""
+    rng = np.random.default_rng(EXAMPLES[category])
+    mesh = make_shape(category, rng)
+    vertices = np.float32(mesh.vertices @ mesh_to_object("y", "z").T)
+    colors, lights = natural_look(vertices, mesh.faces, rng, PALETTES[category])
+    azimuth = rng.choice([-1, 1]) * rng.uniform(20, 70)
+    camera = nmr.LookAt.from_angles(DISTANCE, 22.0, [azimuth], half_fov_deg=HALF_FOV_DEG)
+    rgb, alpha = photograph(vertices, mesh.faces, colors, camera, image_size=SIDE, lights=lights)
+    left, top, right, bottom = mask_box(alpha[0])
+    image = Image.fromarray(np.dstack([rgb[0], alpha[0]]))
+    image.crop((left - _MARGIN, top - _MARGIN, right + _MARGIN, bottom + _MARGIN)).save(png := io.BytesIO(), "png")
+    return png.getvalue()
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()

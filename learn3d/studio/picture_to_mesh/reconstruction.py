@@ -1,0 +1,406 @@
+"""Reconstruction: from images with masks to mesh files and pictures of them."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+import torch
+import trimesh
+from PIL import Image
+from torch import Tensor, nn
+
+from learn3d.config import TrainConfig
+from learn3d.data.conventions import mesh_to_object
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.framing import MEAN_OBJECT_SIZE, Crops, check_mask, mask_box, read_photo
+from learn3d.data.layouts import LAYOUTS, Layout, require_folder
+from learn3d.data.poses import Poses
+from learn3d.files import writing
+from learn3d.methods.mesh_method import MeshMethod, refine
+from learn3d.methods.method import Method
+from learn3d.networks.encoders import CENTRED_SIZE, centre
+from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
+from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable
+from learn3d.runs import checkpoint
+from learn3d.settings import split_names
+from learn3d.studio.picture_to_mesh.coloring import color_mesh
+from learn3d.studio.picture_to_mesh.cutting import Box, find_mask, is_plain
+from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
+from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
+from learn3d.studio.picture_to_mesh.smoothing import divide, outer_surface
+from learn3d.studio.picture_to_mesh.templates import MIRROR, TEMPLATES, Templates, fit_template
+from learn3d.terminal import note
+
+MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
+
+SMALL_MODEL = Path(__file__).with_name("small.safetensors")  # the model in the package
+STRIP_SIZE = 192  # side of each picture in a strip, in pixels
+_OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
+_SEARCHED_SIDE = 1024  # side in pixels to which a photograph is reduced before its object is searched
+_COLORED = 256  # side in pixels of the picture that gives the colours
+_LONGEST_EDGE = 0.1  # longest edge of a coloured template, since hidden parts have the colours of its vertices
+_MIN_OBJECT_SIZE = 0.05  # smallest possible object size
+
+
+class Model(NamedTuple):
+    """A trained model, ready to turn pictures into meshes."""
+
+    method: Method
+    config: TrainConfig
+    object_size: float  # `ViewDataset.mean_object_size` of its training images
+    known_codes: KnownCodes | None = None  # None if its file has none
+    templates: Templates | None = None  # None if its file has none
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The categories that it was trained on."""
+        return split_names(self.config.category)
+
+    def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
+        """Call `prepare_image` with the image size, object size and layout of these networks."""
+        size, layout = self.method.image_size, self.config.layout
+        return prepare_image(colors, mask, crop=crop, object_size=self.object_size, size=size, layout=layout)
+
+
+def load_model(run: Path | None, which: str = "last") -> Model:
+    """The model of a run folder or checkpoint file, or the model in the package if `run` is None."""
+    path = checkpoint.find(run or SMALL_MODEL, which)
+    method, config, metadata = checkpoint.load_method(path)
+    tensors = checkpoint.load(path)[0]
+    stored = ((KnownCodes, KNOWN_CODES), (Templates, TEMPLATES))
+    parts = (kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored)
+    return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, *parts)
+
+
+def cut_out_pictures(model: Model, folder: Path) -> Tensor:
+    """All PNG files with transparency in a folder as stored images uint8 [M, 4, S, S]. ValueError if there are none."""
+    files = sorted(folder.rglob("*.png"))
+    if not files:
+        raise ValueError(f"there is no PNG file in {folder}")
+    return torch.from_numpy(np.stack([model.prepare(*read_photo(path)) for path in files]))
+
+
+def reconstruct_files(
+    run: Path | None,
+    folder: Path,
+    images: Sequence[Path],
+    masks: Sequence[Path] = (),
+    *,
+    crop: bool = True,
+    box: Box | None = None,
+    refined: bool = True,
+    which: str = "last",
+    mesh_format: MeshFormat = "glb",
+) -> list[Path]:
+    """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
+
+    masks: a file for each image. Without them the object is searched in images without transparency, and in all of them
+    with a `box` (see `cutting`). refined: see `reconstruct_picture`. Returns the files, named after the
+    images (see `save`). Raises ValueError if a mask is empty, or if a result would replace an input file. A file that
+    cannot be used is an error after all others are done.
+    """
+    if masks and len(masks) != len(images):
+        raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
+    names = [Path(image).stem for image in images]
+    if len(set(names)) < len(names):
+        names = [f"{number:03}_{name}" for number, name in enumerate(names)]
+    given = {Path(path).resolve() for path in (*images, *masks)}
+    if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
+        raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
+    model = load_model(run, which)
+    paths, faults = [], []
+    for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
+        try:
+            photo = _read(image, mask, box)
+        except (ValueError, OSError) as error:
+            faults.append(error)
+            continue
+        made = reconstruct_picture(model, *photo, crop=crop, refined=refined)
+        if made.warning:
+            note(f"warning: {name}: {made.warning}")
+        elif made.kind:
+            note(f"{name}: category {made.kind}")
+        paths += save(folder, [name], [made], model, mesh_format)
+    for error in faults[1:]:
+        note(f"error: {error}")
+    if faults:
+        raise faults[0]
+    return paths
+
+
+def reconstruct_dataset(
+    run: Path | None,
+    folder: Path,
+    data: Path,
+    indices: Sequence[int],
+    *,
+    category: str | None = None,
+    split: str = "test",
+    which: str = "last",
+    refined: bool = False,
+    mesh_format: MeshFormat = "glb",
+) -> list[Path]:
+    """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`.
+
+    refined: fit the shapes to the masks at the data set's poses; ValueError if it has none. Returns the files, named
+    after category, split and index (see `save`).
+    """
+    require_folder(data)
+    model = load_model(run, which)
+    dataset = checkpoint.load_data(model.config, split, data=data, category=category)
+    batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
+    if refined and batch.poses is None:
+        raise ValueError(f"the data of {dataset.category} have no poses, which fitting needs; leave out --refine")
+    surfaces = reconstruct(model.method, batch.images, *((batch.masks, batch.poses) if refined else ()))
+    stored = batch.images.numpy()
+    if batch.poses is None:
+        azimuths = [input_azimuth_deg(surface, image[3]) for surface, image in zip(surfaces, stored, strict=True)]
+    else:
+        azimuths = azimuths_deg(batch.poses).tolist()
+    names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
+    return save(folder, names, list(map(Reconstruction, surfaces, stored, azimuths)), model, mesh_format)
+
+
+@torch.no_grad()
+def reconstruct(
+    method: Method, images: np.ndarray | Tensor, masks: Tensor | None = None, poses: Poses | None = None
+) -> list[Surface]:
+    """Shapes, in the object frame, of stored images uint8 [B,4,S,S], for example from `prepare_image`.
+
+    With masks float32 [B,64,64] and poses, the shapes are fitted to them; ValueError if the method predicts voxels.
+    """
+    images = torch.as_tensor(images)
+    if poses is not None:
+        return refine(method, images, masks, poses).surfaces()
+    return method.decode(method.encode(images)).surfaces()
+
+
+def _read(path: Path, mask_path: Path | None = None, box: Box | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path`, or found in the image."""
+    colors, mask = read_photo(path, mask_path, optional=True)
+    searched = mask is None or box is not None  # a box counts even if the file has transparency
+    if searched:
+        if box is None:
+            photo = Image.fromarray(colors)
+            photo.thumbnail((_SEARCHED_SIDE, _SEARCHED_SIDE))
+            colors = np.asarray(photo)
+            how = "as all that differs from the plain background" if is_plain(colors) else "by GrabCut in the middle"
+            wrong = "if the outline in the strip of views is wrong, give --box or --masks"
+            note(f"note: {path} has no transparency, so the object was searched, {how}; {wrong}")
+        mask, more = find_mask(colors, box)
+        if more:
+            note(f"note: {path}: several parts were found, and only the largest is used")
+    try:
+        check_mask(mask, cropped=not searched)
+    except ValueError as error:
+        missed = "no object was found in this photograph. Give --box or --masks, or cut the object out (transparency)"
+        raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
+    return colors, mask
+
+
+def prepare_image(
+    colors: np.ndarray,
+    mask: np.ndarray,
+    *,
+    crop: bool = True,
+    object_size: float = MEAN_OBJECT_SIZE,
+    size: int = 64,
+    layout: Layout = "kato",
+) -> np.ndarray:
+    """Turn colours uint8 [H,W,3] and a mask uint8 [H,W] into a stored image uint8 [4,size,size] of a layout.
+
+    The background becomes white. crop: centre the object in a square, so that its larger side takes `object_size` of
+    it; without, the picture must be framed like that already and is only padded to a square and scaled. Colours are
+    inverted if the layout inverts them. Layouts with stretched images (Pascal3D+) keep the background, and `crop` cuts
+    out the mask's box as their reader does (`learn3d.data.framing`).
+
+    Raises ValueError if the mask has no pixel above half.
+    """
+    if not (mask > 127).any():
+        raise ValueError("the mask has no pixel above half strength; is it the right mask?")
+    height, width = mask.shape
+    left, top, right, bottom = mask_box(mask) if crop else (0, 0, width, height)
+    if LAYOUTS[layout].stretched:
+        box = np.array([[left, top, right - left, bottom - top]])
+        planes = (colors, np.repeat(mask[..., None], 3, axis=2))
+        cut, cut_mask = (Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes)
+        return np.concatenate([cut, cut_mask[:1]])
+    side = max(right - left, bottom - top) / (max(object_size, _MIN_OBJECT_SIZE) if crop else 1)
+    reduction = max(1, int(side / (_OVERSAMPLING * size)))  # averaging blocks first is much faster
+    alpha = mask.astype(np.float32) / 255
+    planes = [(255 - colors[..., channel]) * alpha for channel in range(3)] + [255 * alpha]
+    planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduction)) for plane in planes])
+    x, y, half = ((left + right) / 2 / reduction, (top + bottom) / 2 / reduction, side / 2 / reduction)
+    pad = math.ceil(max(0, half - x, half - y, x + half - planes.shape[2], y + half - planes.shape[1]))
+    planes = np.pad(planes, ((0, 0), (pad, pad), (pad, pad)))  # 0 is the background of inverted colours
+    box = (x - half + pad, y - half + pad, x + half + pad, y + half + pad)
+    filter = Image.Resampling.BOX if 2 * half >= size else Image.Resampling.BILINEAR  # mean of the covered pixels
+    prepared = np.stack([np.asarray(Image.fromarray(plane).resize((size, size), filter, box)) for plane in planes])
+    if not LAYOUTS[layout].inverted:
+        prepared[:3] = 255 - prepared[:3]
+    return np.rint(prepared).clip(0, 255).astype(np.uint8)
+
+
+class Reconstruction(NamedTuple):
+    """The shape of a picture, and how it was found."""
+
+    surface: Surface  # object frame; with the picture's colours if it was fitted
+    stored: np.ndarray  # uint8 [4, S, S]: the input of the network
+    azimuth_deg: float  # estimated azimuth of the picture's camera
+    silhouette_iou: float | None = None  # IoU of the fitted shape's silhouette and the mask; None without a fit
+    kind: str | None = None  # predicted category; None without a fit, or without templates if the model has only one
+    warning: str | None = None  # a reason to doubt the shape; None without a fit
+
+
+@torch.no_grad()
+def reconstruct_picture(
+    model: Model,
+    colors: np.ndarray,
+    mask: np.ndarray,
+    *,
+    crop: bool = True,
+    refined: bool = True,
+    progress: Progress = lambda *_: None,
+) -> Reconstruction:
+    """Reconstruct a picture uint8 [H, W, 3] with its mask uint8 [H, W]; its camera is unknown.
+
+    refined: fit camera, shape and colours to the picture; methods with voxels only predict.
+    progress: called with the name of each stage and the share that is done.
+    """
+    method, stored = model.method, model.prepare(colors, mask, crop=crop)
+    image = torch.from_numpy(stored)
+    if not refined or not isinstance(method, MeshMethod):
+        (surface,) = reconstruct(method, image[None])
+        found = method.view_probabilities(image[None])
+        azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
+        return Reconstruction(surface, stored, azimuth_deg)
+    framed = frame(colors, mask)
+    mask = reduce_mask(framed[3])
+    progress("camera", 0.0)
+    predicted = predict(method, image, mask)
+    kind, warning = recognize(model, predicted.code[0])
+    templates = model.templates if warning is None else None
+    if templates is not None:
+        fitted, kind = fit_template(templates, model.categories, predicted, mask, progress)
+        mesh, mirror = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), MIRROR
+    else:
+        fitted = fit(method, predicted, mask, progress)
+        mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
+    progress("colours", 0.9)
+    surface = color_mesh(mesh, fitted.view, framed, mirror, textured=templates is not None)
+    return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
+
+
+def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
+    """Predicted category of a picture's code [C], and a warning if it is that of an unknown kind of object.
+
+    The category is None if the model has only one.
+    """
+    if model.known_codes is None:
+        return None, None
+    kinds = model.categories
+    kind = kinds[model.known_codes.nearest_kind(code)] if len(kinds) > 1 else None
+    if not model.known_codes.is_strange(code):
+        return kind, None
+    known = ", ".join(kinds)
+    advice = "so its shape is a guess; check the outline"
+    return kind, f"this looks like nothing that the model was trained on ({known}), {advice}"
+
+
+def frame(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """A picture uint8 [H, W, 3] and its mask as uint8 [4, 256, 256] on white, with the object centred and large."""
+    # In the layout of Kar, colours are not inverted.
+    return prepare_image(colors, mask, object_size=CENTRED_SIZE, size=_COLORED, layout="kar")
+
+
+def reduce_mask(mask: np.ndarray) -> Tensor:
+    """A mask uint8 [S, S] as float32 [64, 64] in 0 .. 1."""
+    return nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE, mode="area")[0, 0]
+
+
+@torch.no_grad()
+def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None) -> float:
+    """Azimuth, in degrees, from which the shape's silhouette fits the mask uint8 [S,S] of its image best.
+
+    A guess, since elevation and distance are unknown; 0 for an empty shape. probabilities: see `find_view`.
+    """
+    if not len(surface.faces):
+        return 0.0
+    target = centre(reduce_mask(mask)[None, None])[0, 0]
+    return float(find_view(surface.vertices, surface.faces, target, probabilities)[0].azimuth_deg)
+
+
+def export_mesh(path: Path, surface: Surface) -> None:
+    """Write a mesh of the object frame as OBJ, GLB or PLY (by the file's ending): see `mesh_bytes`."""
+    writing.write_bytes(path, mesh_bytes(surface, path.suffix.lower().lstrip("."), path.stem))
+
+
+def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
+    """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed, normals outwards.
+
+    The object frame is left-handed, so the mesh is reflected and the order of each face reversed. A GLB has the texture
+    or else the vertex colours, a PLY only the vertex colours. `name` is the node's in a GLB, whose material is
+    double-sided: learnt surfaces cross themselves, and viewers would hide the faces that are seen from behind.
+    """
+    points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
+    mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
+    if kind == "glb" and surface.texture is not None:
+        mesh = _with_texture(mesh, *surface.texture)
+    elif surface.colors is not None and kind != "obj":
+        colors = surface.colors.detach().cpu().clamp(0, 1)
+        colors = colors**2.2 if kind == "glb" else colors  # colours of vertices in a GLB are linear
+        mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
+    if kind == "glb":
+        options = {"include_normals": True, "tree_postprocessor": _finish_materials}
+        content = trimesh.Scene({name: mesh}).export(file_type=kind, **options)
+    else:
+        content = mesh.export(file_type=kind)
+    return content.encode() if isinstance(content, str) else content
+
+
+def _with_texture(mesh: trimesh.Trimesh, image: Tensor, uv: Tensor) -> trimesh.Trimesh:
+    """The mesh with a texture; uv: float [F, 3, 2], the corners of each face before its order was reversed."""
+    corners = mesh.faces.ravel()
+    texture = Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=texture)
+    visual = trimesh.visual.TextureVisuals(uv.flip(1).flatten(0, 1).numpy(), material)
+    faces, normals = np.arange(len(corners)).reshape(-1, 3), mesh.vertex_normals[corners]
+    return trimesh.Trimesh(mesh.vertices[corners], faces, vertex_normals=normals, visual=visual, process=False)
+
+
+def _finish_materials(tree: dict) -> None:
+    """Make the materials of a glTF tree matt and double-sided, without mipmaps, whose texels would mix faces."""
+    materials = tree.setdefault("materials", [{}])
+    for material in materials:
+        material.setdefault("pbrMetallicRoughness", {}).update(metallicFactor=0.0, roughnessFactor=1.0)
+        material["doubleSided"] = True
+    for texture in tree.get("textures", ()):
+        texture["sampler"] = 0
+        tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]  # linear, clamped
+    for mesh in tree.get("meshes", ()):  # an empty shape has none
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
+
+
+def save(
+    folder: Path, names: Sequence[str], made: Sequence[Reconstruction], model: Model, mesh_format: MeshFormat
+) -> list[Path]:
+    """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input, mask, six views) of each shape.
+
+    Returns three paths for each name.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    titles = ["input", "mask", "from the input's side", *(f"turned by {60 * k}°" for k in range(1, 6))]
+    paths = []
+    for name, (surface, stored, azimuth_deg, *_) in zip(names, made, strict=True):
+        mesh, animation, strip = (folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png"))
+        export_mesh(mesh, surface)
+        save_gif(animation, turntable(surface))
+        colors = natural_colors(stored, inverted=LAYOUTS[model.config.layout].inverted)
+        views = draw_around(surface, [azimuth_deg - 60 * k for k in range(6)], image_size=STRIP_SIZE)
+        shown = [colors, np.repeat(stored[3][..., None], 3, axis=2), *views]
+        save_png(strip, tile([shown], titles, tile_size=STRIP_SIZE))
+        paths += [mesh, animation, strip]
+    return paths

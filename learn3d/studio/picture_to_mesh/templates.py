@@ -1,0 +1,187 @@
+"""Templates: generated shapes. The one that fits a picture best is stretched and bent until its outline matches.
+
+A template has the thin legs, gaps and straight edges that a deformed sphere cannot have. A model knows the codes of its
+templates; the shapes themselves are made again from their numbers.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import binary_erosion, distance_transform_edt
+from torch import Tensor
+
+import nmr
+from learn3d.data.conventions import mesh_to_object
+from learn3d.data.dataset import ViewDataset
+from learn3d.methods.mesh_method import MeshMethod
+from learn3d.studio.picture_to_mesh.fit import Fit, Prediction, Progress, View, belief, minimize
+from learn3d.studio.shapes import CATEGORIES, numbered_shape
+
+SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates
+COUNT = 1000  # templates of each category
+AXES = 24  # principal axes of the codes that are kept
+CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
+KEPT = 16  # best of them, which are stretched
+VOXELS, NEARNESS = 0.5, 0.5  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
+EDGES, FARTHEST = 0.15, 6.0  # weight of the distance of two outlines in pixels, and the largest that counts
+STRETCHING, STRETCH_STEPS = 1.0, 30  # weight of unequal factors along the axes, steps
+LATTICE, BENDING, BENDING_STEPS = 4, 1.5, 40  # points of the lattice along each axis, weight of their moves, steps
+MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))  # maps most generated shapes to themselves, in the object frame
+TEMPLATES = "template_numbers", "template_codes", "template_axes"  # names of the tensors in a checkpoint
+
+
+class Templates(NamedTuple):
+    """Codes of generated shapes, reduced to their principal axes."""
+
+    numbers: Tensor  # int32 [N, M]: numbers of M shapes of each of N categories
+    codes: Tensor  # float [N, M, K]
+    axes: Tensor  # float [K + 1, C]: the mean of all codes, and K axes
+
+    def nearest(self, code: Tensor, categories: Sequence[str]) -> tuple[list[tuple[str, int]], Tensor]:
+        """The `CANDIDATES` shapes with codes nearest to a code [C]: category and number of each, and the cosines."""
+        mean, *axes = self.axes.float()
+        place = torch.stack(axes) @ (F.normalize(code, dim=0) - mean)
+        cosines = 1 - (self.codes.float().flatten(0, 1) - place).square().sum(1) / 2
+        best = cosines.topk(min(CANDIDATES, len(cosines)))
+        count = self.numbers.shape[1]
+        names = [(categories[row // count], int(self.numbers.flatten()[row])) for row in best.indices.tolist()]
+        return names, best.values
+
+
+@torch.no_grad()
+def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | None:
+    """The templates of a training set; None if one of its categories has none.
+
+    They are the objects that `make-dataset --procedural` generates with the seed `SEED`. They are recognised by their
+    names, and by their voxels, which must be those of the shape with the number in the name.
+    """
+    found = {category: [] for category in dataset.class_names or (dataset.category,)}  # numbers and codes
+    if dataset.voxels is None or not found.keys() <= set(CATEGORIES):
+        return None
+    for item, name in enumerate(dataset.object_names):
+        category, _, number = name.rpartition("_")
+        if category not in found or not number.isdecimal() or len(found[category]) >= COUNT:
+            continue
+        batch = dataset.batch(torch.from_numpy(np.flatnonzero(dataset.object_ids == item)))
+        vertices, faces = template(category, int(number))
+        if nmr.metrics.voxel_iou(dataset.convention.voxelize(vertices[None], faces), batch.voxels[:1]) > 0.98:
+            of_views = F.normalize(method.encode(batch.images), dim=1)
+            found[category].append((int(number), F.normalize(of_views.mean(0), dim=0)))
+    if not (count := min(map(len, found.values()))):
+        return None
+    numbers, codes = zip(*(each for of_kind in found.values() for each in of_kind[:count]), strict=True)
+    codes, shape = torch.stack(codes), (len(found), count)
+    mean = codes.mean(0)
+    axes = torch.linalg.svd(codes - mean, full_matrices=False).Vh[:AXES]
+    reduced = ((codes - mean) @ axes.T).view(*shape, -1)
+    return Templates(torch.tensor(numbers, dtype=torch.int32).view(shape), reduced, torch.cat([mean[None], axes]))
+
+
+def template(category: str, number: int) -> tuple[Tensor, Tensor]:
+    """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame."""
+    shape = numbered_shape(category, SEED, number)
+    vertices = np.asarray(shape.vertices) @ mesh_to_object("y", "z").T
+    faces = np.asarray(shape.faces)[:, ::-1].copy()  # the reflection of the frame turns them inside out
+    return torch.tensor(vertices, dtype=torch.float32), torch.from_numpy(faces.astype(np.int64))
+
+
+@torch.no_grad()
+def fit_template(
+    templates: Templates,
+    categories: Sequence[str],
+    predicted: Prediction,
+    mask: Tensor,
+    progress: Progress = lambda *_: None,
+) -> tuple[Fit, str]:
+    """Fit a template to a framed mask float32 [64, 64]; also returns its category.
+
+    Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel IoU with the predicted
+    shape, and the cosine of the two codes. The best are stretched along the axes, and the best of these is bent.
+    """
+    progress("shape", 0.3)
+    names, nearness = templates.nearest(predicted.code[0], categories)
+    shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
+    voxels = torch.cat([_voxels(*mesh) for mesh in zip(shapes, faces, strict=True)])
+    alike = nmr.metrics.voxel_iou(voxels, _voxels(*predicted.shape[:2]).expand_as(voxels))
+    prior = VOXELS * alike.float() + NEARNESS * nearness
+    views = predicted.shape.view.select(torch.zeros(len(shapes), dtype=torch.int64))
+    best = (_likeness(views, shapes, faces, mask) + prior).topk(min(KEPT, len(shapes))).indices
+    shapes, faces, prior = [shapes[i] for i in best], [faces[i] for i in best], prior[best]
+    progress("stretch", 0.5)
+    views, shapes, cost = _stretch(views.select(best), shapes, faces, mask)
+    scores = _likeness(views, shapes, faces, mask) + belief(views.azimuth_deg, predicted.azimuths) + prior - cost
+    one = int(scores.argmax())
+    progress("surface", 0.8)
+    view, vertices = _bend(views.select(torch.tensor([one])), shapes[one], faces[one], mask)
+    size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
+    view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * view.shift)
+    vertices = size * vertices
+    iou = float(view.ious(vertices[None], faces[one], mask))
+    return Fit(vertices, faces[one], view, iou), names[int(best[one])][0]
+
+
+def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
+    return nmr.voxelize(0.998 * vertices[None].clamp(-0.5, 0.5) + 0.5, faces)
+
+
+def _likeness(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> Tensor:
+    """How alike the outlines of N shapes and of a mask [64, 64] are: their IoU less the distance of their edges, [N].
+
+    By the IoU alone a solid back is better than slats beside the true ones.
+    """
+    (wanted, near_wanted), *drawn = map(_edges, (mask, *views.silhouettes(shapes, faces)))
+    apart = [(near_wanted[edge].mean() + near[wanted].mean()) / 2 for edge, near in drawn]
+    return views.ious(shapes, faces, mask) - EDGES * torch.tensor(apart).float()
+
+
+def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels on the edge of a silhouette [64, 64], and the distance of each pixel to them, at most `FARTHEST`."""
+    inside = np.pad(silhouette.numpy() > 0.35, 1)
+    inside[0, 0] = True  # in the margin: there is always an edge
+    edge = inside & ~binary_erosion(inside)
+    return edge, np.minimum(distance_transform_edt(~edge), FARTHEST)
+
+
+def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> tuple[View, list[Tensor], Tensor]:
+    """Stretch each shape along the three axes: fitted views and shapes, and how unequal the factors are, [N]."""
+    logs = torch.zeros(len(shapes), 3).requires_grad_()
+
+    def stretched() -> list[Tensor]:
+        return [shape * factor for shape, factor in zip(shapes, logs.exp(), strict=True)]
+
+    def costs() -> Tensor:
+        return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
+
+    def loss(views: View) -> Tensor:
+        ious = views.ious(stretched(), faces, mask)
+        return (costs() + 0.1 * logs.square().sum(1) - ious).sum()
+
+    return minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs), stretched(), costs()
+
+
+def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[View, Tensor]:
+    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them."""
+    low, high = vertices.amin(0), vertices.amax(0)
+    place = (vertices - low) / (high - low).clamp(min=1e-3)
+    x, y, z = (
+        torch.stack([math.comb(LATTICE - 1, k) * t**k * (1 - t) ** (LATTICE - 1 - k) for k in range(LATTICE)], 1)
+        for t in place.unbind(1)
+    )
+    weights = torch.einsum("va,vb,vc->vabc", x, y, z)
+    lattice = torch.zeros(LATTICE, LATTICE, LATTICE, 3).requires_grad_()
+
+    def moves() -> Tensor:
+        return (lattice + lattice.flip(0) @ MIRROR) / 2
+
+    def bent() -> Tensor:
+        return vertices + torch.einsum("vabc,abcd->vd", weights, moves())
+
+    def loss(view: View) -> Tensor:
+        rough = sum(moves().diff(dim=axis).square().sum() for axis in range(3)) + 0.1 * moves().square().sum()
+        return BENDING * rough - view.ious(bent()[None], faces, mask).sum()
+
+    return minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice), bent()

@@ -1,0 +1,191 @@
+"""The report of a table from stored results: the paper's figures beside ours, with confidence intervals.
+
+Our values are not subtracted from the paper's, which are for other meshes. Intervals over test objects are by
+bootstrap, intervals over seeds by Student's t.
+"""
+
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from learn3d.config import command_line
+from learn3d.data.categories import SYNSETS
+from learn3d.files import limits
+from learn3d.files.reading import read_json
+from learn3d.runs.measurement import HEADERS, Result, figures
+from learn3d.studio.tables.plan import PlannedRun, Request, select_rows
+from learn3d.studio.tables.tables import MEAN, TABLES
+
+RESAMPLES = 2000
+Cells = list[list[str]]
+Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
+
+NOTES = (
+    "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
+    "again). ±: 95 % intervals over seeds (Student's t).\n\nThe paper's figures are for reference: they are on its own "
+    "data, with its own length of training. In parentheses: its mean over other categories than those here."
+)
+_POSE_ERRORS = {  # fields of the JSON file beside a table of poses, and the columns
+    "accuracy": "Acc@30",
+    "updated_accuracy": "after training",
+    "half_turn_accuracy": "up to half a turn",
+    "median_deg": "median error, degrees",
+    "flips": "flips",
+    "objects_flipped": "objects flipped",
+    "confidence": "mean confidence",
+}
+
+
+def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray]) -> np.ndarray:
+    """Means of 2,000 resampled test sets, float64 [2000]; NaN if no image of a set has a value.
+
+    sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c, and their number.
+    Objects are drawn with replacement within each category, because the images of an object depend on each other. The
+    result is the mean over the images of a category, then over categories. The draws depend only on the numbers of
+    objects. So results on the same objects can be subtracted: the bootstrap of their difference is paired.
+    (scipy.stats.bootstrap has neither strata nor weights.)
+    """
+    rng = np.random.default_rng(0)
+    means = []
+    for of_objects, images in zip(sums, counts, strict=True):
+        drawn = rng.integers(len(images), size=(RESAMPLES, len(images)))
+        with np.errstate(invalid="ignore"):
+            means.append(of_objects[drawn].sum(1) / images[drawn].sum(1))
+    return np.mean(means, axis=0)
+
+
+def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
+    """The ends of the middle 95 % of resampled values; None if all are NaN."""
+    known = resampled[np.isfinite(resampled)]
+    return tuple(np.quantile(known, [0.025, 0.975]).tolist()) if len(known) else None
+
+
+def make_report(
+    request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]
+) -> tuple[dict[str, Cells], str]:
+    """The tables "main", "differences", "runs", "curves" and, if poses were estimated, "poses"; the report as Markdown.
+
+    "curves" has the validations of each run. The Markdown leaves them out.
+    results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has no path of a machine.
+    """
+    table = TABLES[request.table]
+    done = [run for run in runs if run.folder in results]
+    measured: dict[tuple[str | None, str], dict[int, Result]] = {}
+    trained = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
+    curves, commands = [["run", "split", "step", HEADERS[0], "MMD"]], {}
+    for run in done:
+        result, config = results[run.folder], run.config
+        measured.setdefault((run.variant, config.category), {})[config.seed] = result
+        counts = [f"step {result.step}", str(result.iterations), str(config.batch_size), str(result.images)]
+        minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
+        trained.append([run.name, *counts, *figures(vars(result)), minutes, result.commit])
+        for split, step, *values in result.curve:
+            curves.append([run.name, split, str(step), *("-" if v is None else f"{v:.4f}" for v in values)])
+        words = {"data": "DATA", "category": "CATEGORY", "seed": "SEED", "poses": "OUTPUT/poses/CATEGORY-seedSEED.npz"}
+        words["output"] = f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED"
+        commands[command_line(config, **words)] = None
+    categories = list(dict.fromkeys(run.config.category for run in runs))
+    columns = {name: [name] for name in categories} | {MEAN: categories}
+    measures = {"mmd": "mmd"} if table.measure == "mmd" else {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19"}
+    baseline = table.rows[table.baseline].variant
+    main, differences = [["method", "", *columns]], [["method", *columns]]
+    for label, row in select_rows(request).items():
+        ours, theirs = (
+            [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
+            for variant in (row.variant, baseline)
+        )
+        if row.printed:
+            printed = [_format_printed(row.printed, column, categories) for column in columns]
+            main.append([label, f"paper ({row.about})", *printed])
+        if row.variant:
+            main += [[label, f"here ({name})", *(_compare(m, side) for side in ours)] for m, name in measures.items()]
+        if row.variant and row.variant != baseline:
+            pairs = zip(ours, theirs, strict=True)
+            differences.append([label, *(_compare(table.measure, *pair) for pair in pairs)])
+    tables = {"main": main, "differences": differences, "runs": trained, "curves": curves}
+    missing = [run.name for run in runs if run not in done]
+    parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
+    parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
+    if len(poses := _pose_rows(runs, results)) > 1:
+        tables["poses"] = poses
+        parts += ["Estimated azimuths of all images, and voxel IoU (kato18) of the trainings:", _markdown(poses)]
+    parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *commands, "```"])]
+    return tables, "\n\n".join(parts) + "\n"
+
+
+def _format_printed(printed: Mapping[str, float], column: str, categories: Sequence[str]) -> str:
+    """The paper's figure for a column. Its mean is over the same categories as ours, else in parentheses."""
+    if column == MEAN and set(categories) != (set(printed) - {MEAN} or set(SYNSETS)):
+        if all(name in printed for name in categories):
+            return f"{np.mean([printed[name] for name in categories]):.3f}"
+        return f"({printed[MEAN]:.3f})" if MEAN in printed else "-"
+    return f"{printed[column]:.3f}" if column in printed else "-"
+
+
+def _compare(measure: str, *sides: Side) -> str:
+    """The mean of one method, or the difference of two, with its intervals; "-" if a result is missing."""
+    values = [[[getattr(r, measure) for r in by_seed.values()] for by_seed in side] for side in sides]
+    if not all(v and None not in v for side in values for v in side):
+        return "-"
+    form = ".3f" if len(sides) == 1 else "+.3f"
+    means = [np.mean([np.mean(v) for v in side]) for side in values]
+    text = format(means[0] - sum(means[1:]), form)
+    seeds = list(sides[0][0])
+    if len(seeds) > 1 and all(list(by_seed) == seeds for side in sides for by_seed in side):
+        ours, *theirs = (np.mean(side, axis=0) for side in values)
+        text += f" ±{stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(ours - sum(theirs)):.3f}"
+    if measure == "mmd":
+        return text + (f" (x {means[0] / means[1]:.2f})" if len(means) == 2 else "")
+    for of_category in zip(*sides, strict=True):
+        if len({tuple(o.name for o in r.objects) for by_seed in of_category for r in by_seed.values()}) > 1:
+            return text  # on different objects: they cannot be resampled together
+    ours, *theirs = (_resample(measure, side) for side in sides)
+    if interval := percentile_interval(ours - sum(theirs)):
+        text += f" [{interval[0]:{form}}, {interval[1]:{form}}]"
+    return text
+
+
+def _resample(measure: str, side: Side) -> np.ndarray:
+    """Mean IoUs over resampled objects [2000]. The IoUs of an object are those of all seeds."""
+    sums, counts = [], []
+    for by_seed in side:
+        images = np.array([[o.images for o in result.objects] for result in by_seed.values()], float)
+        means = [[getattr(o, measure) or 0.0 for o in result.objects] for result in by_seed.values()]
+        sums.append((means * images).sum(0))
+        counts.append(images.sum(0))
+    return resampled_means(sums, counts)
+
+
+def read_pose_errors(poses: Path) -> dict[str, float]:
+    """The JSON file beside a table of estimated poses."""
+    return read_json(poses.with_suffix(".json"), limits.JSON_BYTES, "the errors of a table of poses")
+
+
+def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Cells:
+    """A header; errors of the estimated poses of each run, and its IoU beside that of the run on known poses."""
+    known = {(r.config.category, r.config.seed): results.get(r.folder) for r in runs if r.config.poses is None}
+    by_category: dict[str, dict[str, Sequence[float]]] = {}
+    for run in runs:
+        config, both = run.config, (known.get((run.config.category, run.config.seed)), results.get(run.folder))
+        if config.poses is not None and None not in both:
+            errors, ious = read_pose_errors(config.poses), [result.voxel_iou for result in both]
+            values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
+            by_category.setdefault(config.category, {})[str(config.seed)] = values
+    rows = [["category", "seed", *_POSE_ERRORS.values(), "IoU, known poses", "IoU, estimated poses", "ratio"]]
+    for category, by_seed in by_category.items():
+        if len(by_seed) > 1:
+            by_seed["mean"] = np.mean(list(by_seed.values()), axis=0)
+        for seed, values in by_seed.items():
+            cells = [f"{value:.1f}" if place == 3 else f"{value:.3f}" for place, value in enumerate(values)]
+            rows.append([category, seed, *cells])
+    return rows
+
+
+def _markdown(table: Cells) -> str:
+    """The table as Markdown, with HTML escaped, because names in results come from untrusted files."""
+    cells = [[html.escape(" ".join(c.splitlines()), quote=False).replace("|", "\\|") for c in row] for row in table]
+    lines = ["| " + " | ".join(row) + " |" for row in cells]
+    return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]])

@@ -1,0 +1,167 @@
+"""Plans the training runs of a table: their names, folders and options."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from learn3d.config import USUAL_OPTIONS, TrainConfig, all_options
+from learn3d.data.layouts import LAYOUTS, Layout
+from learn3d.presets import PRESETS
+from learn3d.settings import Rare, split_names
+from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS, Row
+from learn3d.terminal import unknown_name
+
+_FIXED = (*USUAL_OPTIONS, "layout", "device", "threads", "poses")  # options that --set cannot change
+
+
+@dataclass(frozen=True)
+class Request:
+    """The table that the user asks for, with options."""
+
+    table: str
+    """Name of the table, see --list."""
+    data: Path
+    """Folder of the data set."""
+    output: Path
+    """Folder of runs and reports; all tables can share one."""
+    category: str = ""
+    """Categories, separated by commas, each trained by itself (default: the table's)."""
+    methods: tuple[str, ...] = ()
+    """Methods of the table: labels of rows, or names of variants (default: all)."""
+    iterations: int | None = None
+    """Training steps; methods with a quarter of the batch, such as Plus, take four times as many (default: the
+    preset's)."""
+    batch_size: int | None = None
+    """Images per step; Plus and others take a quarter of it (default: the preset's)."""
+    seeds: int | None = None
+    """Number of seeds, 0 .. seeds - 1 (default: the table's)."""
+    layout: Rare[Layout | None] = None
+    """Layout of the data set (default: the table's)."""
+    device: Rare[Literal["cpu", "cuda"]] = "cpu"
+    """Device on which the networks run."""
+    threads: Rare[int | None] = None
+    """CPU threads of each run (default: cores, or OMP_NUM_THREADS, divided by --jobs)."""
+    set: tuple[str, ...] = ()
+    """Settings and training options to change: NAME=VALUE for all methods that have them, METHOD:NAME=VALUE for one
+    (default: none)."""
+    jobs: int = 1
+    """Runs at a time, each in a process of its own with its share of the cores."""
+    report_only: bool = False
+    """Train nothing: report the runs that are complete."""
+
+    def __post_init__(self) -> None:
+        if self.table not in TABLES:
+            raise ValueError(f"{unknown_name('table', self.table, TABLES)} (see --list)")
+        if self.jobs < 1 or (self.seeds is not None and self.seeds < 1):
+            raise ValueError(f"jobs and seeds must be at least 1, got {self.jobs} and {self.seeds}")
+
+
+class PlannedRun(NamedTuple):
+    """A training run and its test. Tables that need the same run share its folder."""
+
+    variant: str
+    config: TrainConfig
+
+    @property
+    def folder(self) -> Path:  # OUTPUT/runs/<category>/<variant>-seed<k>
+        return self.config.output
+
+    @property
+    def name(self) -> str:
+        return f"{self.config.category}/{self.folder.name}"
+
+
+def select_rows(request: Request) -> dict[str, Row]:
+    """The rows of the table that the request asks for by label or variant, by label; all if it names no methods.
+
+    Quoted rows are always included. Raises ValueError for a method that the table does not have.
+    """
+    rows = TABLES[request.table].rows
+    names = {label.lower(): row.variant for label, row in rows.items()} | {r.variant: r.variant for r in rows.values()}
+    asked = [method.lower() for method in request.methods] or list(names)
+    if unknown := [method for method in asked if method not in names]:
+        raise ValueError(unknown_name("method of the table", unknown[0], filter(None, names.values())))
+    chosen = {names[method] for method in asked}
+    return {label: row for label, row in rows.items() if row.variant is None or row.variant in chosen}
+
+
+def plan_runs(request: Request) -> list[PlannedRun]:
+    """The runs of a request, by category, then row, then seed.
+
+    Raises ValueError for an unknown method, for a layout without true voxels, and for options that do not fit (see
+    `TrainConfig`).
+    """
+    table = TABLES[request.table]
+    layout = request.layout or table.layout
+    if not LAYOUTS[layout].voxels:
+        raise ValueError(f"the layout {layout!r} has no true voxels, so that no run of the table could be measured")
+    variants = [row.variant for row in select_rows(request).values() if row.variant]
+    changes = _parse_changes(variants, request.set)
+    return [
+        PlannedRun(name, _configure(request, name, changes[name], layout, category, seed))
+        for category in dict.fromkeys(split_names(request.category) or table.categories)
+        for name in variants
+        for seed in range(request.seeds or table.seeds)
+    ]
+
+
+def _configure(
+    request: Request, name: str, given: dict[str, Any], layout: Layout, category: str, seed: int
+) -> TrainConfig:
+    variant = VARIANTS[name]
+    preset, length_of = PRESETS[variant.preset], PRESETS[variant.small_batches_of or variant.preset]
+    changes, divisor = dict(variant.changes) | given, BATCH_DIVISOR if variant.small_batches_of else 1
+    iterations = (request.iterations or length_of.iterations) * divisor
+    batch_size = request.batch_size or length_of.batch_size
+    if batch_size % divisor:
+        raise ValueError(f"{name} divides batches by {divisor}: batch_size must be a multiple, got {batch_size}")
+    if "warmup_steps" in changes:  # as for presets
+        changes["warmup_steps"] = min(changes["warmup_steps"], iterations // 10)
+    settings = {field.name: changes.pop(field.name) for field in fields(preset.settings) if field.name in changes}
+    return TrainConfig(
+        data=request.data,
+        category=category,
+        output=request.output / "runs" / category / f"{name}-seed{seed}",
+        poses=request.output / "poses" / f"{category}-seed{seed}.npz" if variant.estimates_poses else None,
+        preset=variant.preset,
+        settings=dataclasses.replace(preset.settings.for_iterations(iterations), **settings),
+        layout=layout,
+        iterations=iterations,
+        batch_size=batch_size // divisor * variant.batch_factor,
+        seed=seed,
+        device=request.device,
+        threads=request.threads,
+        **changes,
+    )
+
+
+def _parse_changes(variants: Sequence[str], texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The changes NAME=VALUE and VARIANT:NAME=VALUE, by variant."""
+    known = {name: all_options(TrainConfig(Path(), "-", Path(), VARIANTS[name].preset)) for name in variants}
+    changes: dict[str, dict[str, Any]] = {variant: {} for variant in variants}
+    for text in texts:
+        target, separator, value = text.partition("=")
+        variant, _, name = target.rpartition(":")
+        name = name.replace("-", "_")
+        meant = [v for v in variants if variant in ("", v) and name in known[v] and name not in _FIXED]
+        if not meant or not separator:
+            raise ValueError(
+                f"--set {text}: give NAME=VALUE or METHOD:NAME=VALUE, with a method of {', '.join(variants)}, and an "
+                "option of `learn3d train` that neither the table nor another option decides"
+            )
+        for v in meant:
+            changes[v][name] = _parse_value(value, isinstance(known[v][name], tuple))
+    return changes
+
+
+def _parse_value(text: str, is_list: bool = False) -> Any:
+    """A value as in JSON (0.5, true, null), else the text itself; a list is written as "a,b"."""
+    if is_list:
+        return tuple(map(_parse_value, filter(None, text.strip("[]").split(","))))
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

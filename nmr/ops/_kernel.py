@@ -1,0 +1,240 @@
+"""Makes operators of the compiled kernels: ``@kernel`` turns the shapes of a kernel's results into an operator.
+
+An operator is a function of tensors and numbers, given by position, without default values (torch would leave out
+arguments equal to them). Calls with plain tensors reach the kernel through a ``torch.autograd.Function``, or directly
+if no gradient is wanted: for small meshes the dispatcher takes longer than the kernel. Everything else (torch.compile,
+torch.export, fake tensors) reaches it through ``torch.ops.nmr``.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Optional, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+try:
+    from .. import _C
+except ImportError as error:
+    raise ImportError(
+        "the compiled part of nmr is missing: Python imports the source folder, or the installation failed; "
+        "run `pip install .` in the repository and start Python in another folder, or use `pip install -e .`"
+    ) from error
+
+P, R = ParamSpec("P"), TypeVar("R")
+
+_LIBRARY = torch.library.Library("nmr", "FRAGMENT")
+_MAYBE = Optional[Tensor]  # noqa: UP045, equal to Tensor | None
+# In torch's schema language. Lists of tensors would have no gradient.
+_TYPES = {Tensor: "Tensor", _MAYBE: "Tensor?", bool: "bool", int: "SymInt", float: "float", list[bool]: "bool[]"}
+_PLAIN = {Tensor, torch.nn.Parameter, type(None), bool, int, float, list}
+
+
+def kernel(
+    results: str, *, gradients: str = "", keep: str = "", constant: str = "", used_by: str = "", twice=None
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorates a function that allocates the results of a kernel, given its arguments: the operator ``nmr::<name>``.
+
+    Parameters
+    ----------
+    results : str
+        Names of the results in ``nmr._C``, where the kernel has the name of the function. Its arguments have their own.
+    gradients : str
+        Names of the differentiable arguments. Their gradients come from ``<name>_backward`` of ``nmr._C``: its
+        arguments are those of the kernel, the results in ``keep`` and ``constant``, and ``grad_<result>`` of the
+        results that have a gradient.
+    keep, constant : str
+        Results that the backward pass needs; ``constant``: they have no gradient.
+    used_by : str
+        The public function, for the error that it has no second derivative.
+    twice : function, optional
+        The backward pass in torch, for second derivatives, if there are any.
+
+    Returns
+    -------
+    function
+        Calls the operator. Its attribute ``op`` is torch's, for ``opcheck``; ``backward`` is the operator of the
+        gradients: arguments as above, then ``wanted``, a flag for each differentiable argument. A gradient that is not
+        wanted is empty.
+    """
+
+    def decorate(allocate: Callable[P, R]) -> Callable[P, R]:
+        hints = get_type_hints(allocate)
+        call = _operator(allocate.__name__, hints, hints.pop("return"), allocate, results.split())
+        functools.update_wrapper(call, allocate)
+        if gradients:
+            kept = {"keep": keep.split(), "constant": constant.split()}
+            call.backward = _add_gradient(call, hints, results.split(), gradients.split(), **kept)
+            _refuse_gradient(call.backward, used_by) if twice is None else _add_second(call.backward, twice)
+        return call
+
+    return decorate
+
+
+def _operator(name: str, hints: dict, returned: type, allocate: Callable, results: list[str]) -> Callable:
+    """Registers a kernel, its fake (``allocate``) and its vmap rule: one call per item."""
+    several, compiled = get_origin(returned) is tuple, getattr(_C, name)
+    names, first = list(hints), next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
+
+    def run(*args):
+        device = args[first].device
+        if device.type != "cpu":
+            outputs = run(*(x.cpu() if isinstance(x, Tensor) else x for x in args))
+            return tuple(x.to(device) for x in outputs) if several else outputs.to(device)
+        outputs = allocate(*args)
+        given = dict(zip(names, args, strict=True))
+        wanted = given.pop("wanted", None)
+        given.update(zip(results, outputs if several else (outputs,), strict=True))
+        if wanted is not None:
+            given.update((result, None) for result, want in zip(results, wanted, strict=True) if not want)
+        compiled(**given, num_threads=torch.get_num_threads())
+        return outputs
+
+    def call(*args):
+        if torch.compiler.is_compiling() or not _PLAIN.issuperset(map(type, args)):
+            return op(*args)
+        if torch._C._are_functorch_transforms_active():
+            return call.transformed(*args)
+        if call.direct is not None and _gradient_is_wanted(args):
+            return call.direct(*args)
+        return run(*args)
+
+    def one_by_one(info, in_dims, *args):
+        def item(i):
+            return (x if d is None else x.select(d, i) for x, d in zip(args, dims, strict=True))
+
+        dims = [d if isinstance(x, Tensor) else None for x, d in zip(args, in_dims, strict=True)]
+        items = [call(*item(i)) for i in range(info.batch_size)]
+        if not several:
+            return torch.stack(items), 0
+        return tuple(map(torch.stack, zip(*items, strict=True))), (0,) * len(results)
+
+    arguments = ", ".join(f"{_TYPES[hint]} {argument}" for argument, hint in hints.items())
+    of_results = f"({', '.join(_TYPES[hint] for hint in get_args(returned))})" if several else _TYPES[returned]
+    _LIBRARY.define(f"{name}({arguments}) -> {of_results}", tags=(torch.Tag.pt2_compliant_tag,))
+    _LIBRARY.impl(name, run, "CompositeExplicitAutograd")
+    op = getattr(torch.ops.nmr, name).default
+    torch.library.register_fake(op, allocate, lib=_LIBRARY)
+    if hasattr(torch.library, "register_vmap"):  # torch < 2.5 loops, too, but warns that it is slow
+        torch.library.register_vmap(op, one_by_one, lib=_LIBRARY)
+    call.op, call.run, call.vmap, call.direct, call.transformed = op, run, one_by_one, None, op
+    return call
+
+
+def _gradient_is_wanted(args) -> bool:
+    """In reverse mode, or in forward mode, which is an error."""
+    tensors = [x for x in args if isinstance(x, Tensor)]
+    if torch.is_grad_enabled() and any([x.requires_grad for x in tensors]):
+        return True
+    return forward_ad._current_level >= 0 and any([forward_ad.unpack_dual(x).tangent is not None for x in tensors])
+
+
+def _add_gradient(
+    forward: Callable, hints: dict, results: list[str], gradients: list[str], keep: list[str], constant: list[str]
+) -> Callable:
+    """Registers the operator of the gradients, and with it the gradient of ``forward``."""
+    names, count = list(hints), len(hints)
+    tensors = [k for k, name in enumerate(names) if hints[name] in (Tensor, _MAYBE)]
+    numbers = [k for k in range(count) if k not in tensors]
+    of = [names.index(name) for name in gradients]
+    kept = [k for k, name in enumerate(results) if name in (*keep, *constant)]
+    without = [k for k, name in enumerate(results) if name in constant]
+    upstream = [k for k in range(len(results)) if k not in without]
+
+    def allocate(*args):
+        wanted = args[-1]
+        like = next(x for x in args if isinstance(x, Tensor))
+        inputs = [args[k] if want else None for k, want in zip(of, wanted, strict=True)]
+        grads = tuple(like.new_empty(0) if x is None else x.new_empty(x.shape) for x in inputs)
+        return grads if len(of) > 1 else grads[0]
+
+    # A gradient is None if a result is not used.
+    added = {results[k]: Tensor for k in kept}
+    added |= {f"grad_{results[k]}": Tensor if len(results) == 1 else _MAYBE for k in upstream}
+    returned = tuple[(Tensor,) * len(of)] if len(of) > 1 else Tensor
+    name, found = f"{forward.op.name().removeprefix('nmr::')}_backward", [f"grad_{name}" for name in gradients]
+    backward = _operator(name, hints | added | {"wanted": list[bool]}, returned, allocate, found)
+
+    def set_up(ctx, inputs, output):
+        outputs = (output,) if len(results) == 1 else output
+        ctx.set_materialize_grads(False)
+        if without:
+            ctx.mark_non_differentiable(*(outputs[k] for k in without))
+        ctx.save_for_backward(*(inputs[k] for k in tensors), *(outputs[k] for k in kept))
+        ctx.numbers = [inputs[k] for k in numbers]
+
+    def pull(ctx, *grads):
+        grads, wanted = [grads[k] for k in upstream], [ctx.needs_input_grad[k] for k in of]
+        found: list[Tensor | None] = [None] * count
+        if any(wanted) and any(grad is not None for grad in grads):
+            arguments, saved = [None] * count, ctx.saved_tensors
+            for k, value in zip((*tensors, *numbers), (*saved[: len(tensors)], *ctx.numbers), strict=True):
+                arguments[k] = value
+            grads = backward(*arguments, *saved[len(tensors) :], *grads, wanted)
+            for k, want, grad in zip(of, wanted, (grads,) if len(of) == 1 else grads, strict=True):
+                found[k] = grad if want else None
+        return tuple(found)
+
+    _register_autograd(forward, pull, set_up)
+    return backward
+
+
+def _refuse_gradient(backward: Callable, used_by: str) -> None:
+    def refuse(ctx, *grads):
+        raise RuntimeError(
+            f"{used_by} has no second derivative: its gradient is computed by a kernel that is not differentiable; "
+            "call backward() without create_graph=True"
+        )
+
+    _register_autograd(backward, refuse, lambda ctx, inputs, output: None)
+
+
+def _add_second(backward: Callable, twice: Callable) -> None:
+    """``twice`` takes the tensors that ``backward`` takes, and returns all gradients."""
+
+    def set_up(ctx, inputs, output):
+        ctx.save_for_backward(*inputs[:-1])
+        ctx.wanted = inputs[-1]
+
+    def pull(ctx, *grads):
+        def gradients(*inputs):
+            return tuple(x for x, want in zip(twice(*inputs), ctx.wanted, strict=True) if want)
+
+        pulled = torch.func.vjp(gradients, *ctx.saved_tensors)[1]
+        return *pulled(tuple(x for x, want in zip(grads, ctx.wanted, strict=True) if want)), None
+
+    _register_autograd(backward, pull, set_up)
+
+
+def _register_autograd(operator: Callable, backward: Callable, set_up: Callable) -> None:
+    """``backward`` and ``set_up`` are of the form that ``torch.library.register_autograd`` has."""
+    op, run, name = operator.op, operator.run, operator.op.name().replace("::", "_")
+    torch.library.register_autograd(op, backward, setup_context=set_up, lib=_LIBRARY)
+
+    def forward(*args):
+        return run(*args) if _PLAIN.issuperset(map(type, args)) else op(*args)
+
+    def forward_with_context(ctx, *args):
+        output = run(*args)
+        set_up(ctx, args, output)
+        return output
+
+    def jvp(ctx, *tangents):
+        raise RuntimeError(
+            f"{op.name()} has no forward-mode derivative (torch.func.jvp, torch.autograd.forward_ad); "
+            "use reverse mode: backward(), or torch.func.grad, vjp or jacrev"
+        )
+
+    def function(**parts):
+        parts = {part: staticmethod(code) for part, code in parts.items()}
+        return type(name, (torch.autograd.Function,), parts).apply
+
+    # torch binds the arguments of a Function with setup_context by its signature, which takes longer than the kernel of
+    # a small mesh. Only torch.func needs that form.
+    operator.direct = function(forward=forward_with_context, backward=backward, jvp=jvp)
+    operator.transformed = function(
+        forward=forward, setup_context=set_up, backward=backward, jvp=jvp, vmap=operator.vmap
+    )

@@ -1,0 +1,177 @@
+"""The server of `learn3d demo` by plain HTTP: strangers' requests, and many visitors at once."""
+
+from __future__ import annotations
+
+import base64
+import json
+import socket
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from urllib.parse import urlsplit
+
+import httpx
+import numpy as np
+import pytest
+import trimesh
+
+pytest.importorskip("uvicorn", reason="needs the extra demo")
+
+from learn3d.studio.demo import server as serving
+
+SIZE = 64
+ADDRESS = f"mesh?width={SIZE}&height={SIZE}"
+
+
+@pytest.fixture(scope="module")
+def client(server) -> httpx.Client:
+    with httpx.Client(base_url=server[1], timeout=120) as client:
+        yield client
+
+
+@pytest.fixture
+def box() -> bytes:
+    """R, G, B, mask of a blue box on grey; the mask is unknown."""
+    pixels = np.full((SIZE, SIZE, 4), 255, np.uint8)
+    pixels[..., :3] = 200
+    pixels[16:48, 16:48, :3] = (40, 60, 120)
+    return pixels.tobytes()
+
+
+def messages(answer: httpx.Response) -> list[dict]:
+    assert answer.status_code == 200, answer.text
+    return [json.loads(line) for line in answer.text.splitlines()]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": ""},
+        {"Host": "evil.example", "Origin": "http://evil.example"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+    ],
+)
+def test_other_sites_cannot_use_the_page(client, box, headers) -> None:
+    assert client.get("", headers=headers).status_code == 403
+    assert client.post(ADDRESS, content=box, headers=headers).status_code == 403
+
+
+@pytest.mark.parametrize("name", ["localhost", "127.0.0.1", "[::1]"])
+def test_its_own_page_can(client, name) -> None:
+    assert client.get("", headers={"Host": f"{name}:1", "Origin": f"http://{name}:1"}).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["", "page.js", "about", "examples/chair.png", "none", "../server.py"])
+def test_browsers_are_told_to_run_and_fetch_nothing_else(client, path) -> None:
+    headers = client.get(path).headers
+    assert headers["content-security-policy"].startswith("default-src 'self'; img-src 'self' blob:;")
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize("path", ["%2e%2e/server.py", "..%2fserver.py", "/etc/passwd", "page.py"])
+def test_only_files_of_the_page_are_served(server, path) -> None:
+    host, _, port = urlsplit(server[1]).netloc.partition(":")
+    with socket.create_connection((host, int(port))) as visitor:  # httpx would tidy the path up
+        visitor.sendall(f"GET /{path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+        assert b" 404 " in visitor.recv(100)
+
+
+def test_a_picture_becomes_meshes_and_nothing_of_it_comes_back(client, box) -> None:
+    answer = client.post(ADDRESS, content=box)
+    assert answer.headers["content-type"] == "application/x-ndjson"
+    mask, *_, last = messages(answer)
+    found = np.unpackbits(np.frombuffer(base64.b64decode(mask["mask"]), np.uint8)).reshape(SIZE, SIZE)
+    assert found.sum() == 32 * 32 and found[16:48, 16:48].all()
+    assert len(last["meshes"]) == 2 and last["meshes"][1]["label"] == "other"
+    for made in last["meshes"]:
+        glb = trimesh.load(trimesh.util.wrap_as_stream(base64.b64decode(made["glb"])), "glb", force="mesh")
+        assert len(glb.faces) > 100 and b"COLOR_0" in base64.b64decode(made["glb"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"params": {"width": 64, "height": 63}},
+        {"params": {"width": 64}},
+        {"params": {"width": 0, "height": 0}, "content": b""},
+        {"params": {"width": 600, "height": 1}, "content": bytes(2400)},
+        {"params": {"width": "\x1b]0;title\x07", "height": 64}},
+        {"params": {"width": 64, "height": 64, "box": "1,2,3"}},
+        {"content": b"<script>alert(1)</script>"},
+    ],
+)
+def test_what_is_no_picture_is_refused_in_a_sentence(client, server, box, change) -> None:
+    request = {"params": {"width": SIZE, "height": SIZE}, "content": box} | change
+    answer = client.post("mesh", **request)
+    assert answer.status_code == 400 and "this is no picture" in answer.text
+    assert answer.headers["content-type"].startswith("text/plain")
+    assert (server[0].folder / "errors.txt").read_text() == ""
+
+
+@pytest.mark.parametrize("where", ["1,1,200,200", "-5,0,20,20", "0,0,64,64", "3,3,1,1"])
+def test_a_box_that_cannot_be_is_an_error_of_the_picture(client, box, where) -> None:
+    (said,) = messages(client.post(ADDRESS, params={"width": SIZE, "height": SIZE, "box": where}, content=box))
+    assert "box" in said["error"]
+
+
+def test_a_request_is_bounded(client) -> None:
+    assert client.post(ADDRESS, content=bytes(serving.MOST_BYTES + 1)).status_code == 413
+    chunks = (bytes(2**16) for _ in range(2**10))  # its length is not stated
+    try:
+        assert client.post(ADDRESS, content=chunks).status_code == 413
+    except httpx.TransportError:  # closed while it was still sent
+        pass
+
+
+def test_a_picture_must_arrive_in_time_and_visitors_may_leave(client, server, box) -> None:
+    process, address = server
+    host = urlsplit(address).netloc
+    headers = f"Host: {host}\r\nContent-Length: {len(box)}\r\n"
+    with socket.create_connection(host.split(":")) as visitor:
+        visitor.sendall(f"POST /{ADDRESS} HTTP/1.1\r\n{headers}\r\n".encode() + box[:100])
+        time.sleep(0.3)
+    with socket.create_connection(host.split(":")) as visitor:
+        visitor.sendall(f"POST /{ADDRESS} HTTP/1.1\r\n{headers}\r\n".encode() + box)
+        visitor.recv(100)
+    assert "meshes" in messages(client.post(ADDRESS, content=box))[-1], "the next one has the turn"
+    assert (process.folder / "errors.txt").read_text() == ""
+
+
+def test_thirty_visitors_at_once_all_get_their_mesh_and_see_their_place(server, box) -> None:
+    def visit(_: int) -> list[dict]:
+        return messages(httpx.post(server[1] + ADDRESS, content=box, timeout=300))
+
+    with ThreadPoolExecutor(30) as visitors:
+        said = list(visitors.map(visit, range(30)))
+    assert all("meshes" in each[-1] for each in said)
+    places = [[message["place"] for message in each if "place" in message] for each in said]
+    assert max(map(len, places)) > 5 and all(each == sorted(each, reverse=True) for each in places)
+
+
+def test_words_of_a_visitor_reach_the_terminal_written_out(monkeypatch, capsys) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("\x1b]0;title\x07")
+
+    class Server(serving.uvicorn.Server):
+        def run(self, sockets: list[socket.socket]) -> None:
+            thread = threading.Thread(target=super().run, args=[sockets])
+            thread.start()
+            address = "http://{}:{}/".format(*sockets[0].getsockname())
+            try:
+                with pytest.raises(httpx.TransportError):  # broken off, as the answer had begun
+                    httpx.post(address + "mesh?width=1&height=1", content=bytes(4))
+            finally:
+                self.should_exit = True
+                thread.join()
+
+    monkeypatch.setattr(serving, "make_meshes", fail)
+    monkeypatch.setattr(serving.uvicorn, "Server", Server)
+    monkeypatch.setattr(serving, "load_model", lambda run: SimpleNamespace(categories=["cup"]))
+    serving.serve([], host="127.0.0.1", port=0, browser=False)
+    said = capsys.readouterr().err
+    assert "Traceback" in said and r"\x1b]0;title\x07" in said, "an unexpected error is not hidden"
+    assert "\x1b" not in said and "\x07" not in said

@@ -1,0 +1,183 @@
+"""Images into the data set's form, and meshes into files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+import nmr
+from learn3d.data.conventions import mesh_to_object
+from learn3d.data.framing import Crops
+from learn3d.pictures.surfaces import Surface
+from learn3d.studio.picture_to_mesh.reconstruction import (
+    _read,
+    export_mesh,
+    input_azimuth_deg,
+    load_model,
+    prepare_image,
+    reconstruct,
+    reconstruct_dataset,
+    reconstruct_files,
+)
+
+
+@pytest.fixture
+def short_turntables(monkeypatch) -> None:
+    monkeypatch.setattr(
+        "learn3d.studio.picture_to_mesh.reconstruction.turntable", lambda _: np.zeros((2, 32, 32, 3), np.uint8)
+    )
+
+
+def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
+    stored = tiny_set.images[3]
+    again = prepare_image(255 - stored[:3].transpose(1, 2, 0), stored[3], crop=False)
+    assert np.array_equal(again, stored)
+
+
+def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables, capsys) -> None:
+    picture = np.full((120, 160, 3), 240, np.uint8)
+    picture[30:90, 50:110] = (180, 40, 30)
+    Image.fromarray(picture).save(tmp_path / "box.png")
+    written = reconstruct_files(finished_run, tmp_path / "out", [tmp_path / "box.png"])
+    assert len(trimesh.load(written[0], force="mesh").faces) > 100
+    Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
+    with pytest.raises(ValueError, match=r"plain.png: no object was found .* Give --box or --masks"):
+        _read(tmp_path / "plain.png")
+    picture[40:80, 120:150] = 0
+    Image.fromarray(picture).save(tmp_path / "two.png")
+    for name, said in (("box.png", "differs from the plain background; if"), ("two.png", "several parts were found")):
+        mask = _read(tmp_path / name)[1]
+        assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60 and said in capsys.readouterr().err
+
+
+def test_results_never_replace_the_images(finished_run, tmp_path) -> None:
+    picture = np.zeros((64, 64, 4), np.uint8)
+    picture[20:40, 10:50] = 255
+    Image.fromarray(picture).save(tmp_path / "chair.png")
+    before = (tmp_path / "chair.png").read_bytes()
+    with pytest.raises(ValueError, match=r"chair\.png would replace an image that was given; give another --output"):
+        reconstruct_files(finished_run, tmp_path, [tmp_path / "chair.png"])
+    assert (tmp_path / "chair.png").read_bytes() == before
+
+
+def test_an_empty_shape_is_an_empty_file(tmp_path) -> None:
+    export_mesh(tmp_path / "empty.glb", Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64)))
+    assert not trimesh.load(tmp_path / "empty.glb").geometry
+
+
+def test_a_large_photograph_is_prepared_like_a_small_one() -> None:
+    y, x = np.mgrid[:150, :200]
+    colors = np.stack([x, y, x + y], axis=2).astype(np.uint8) // 2
+    mask = (255 * (((x - 110) / 60) ** 2 + ((y - 70) / 50) ** 2 < 1)).astype(np.uint8)
+    large = (np.kron(colors, np.ones((16, 16, 1), np.uint8)), np.kron(mask, np.ones((16, 16), np.uint8)))
+    for options in ({}, {"crop": False}, {"size": 32}):
+        difference = prepare_image(*large, **options).astype(int) - prepare_image(colors, mask, **options)
+        assert np.abs(difference).mean() < 2, options
+
+
+@pytest.mark.parametrize(("y", "x", "factor"), [(0, 0, 1), (40, 100, 1), (199, 260, 1), (8, 20, 5)])
+def test_crop_centres_and_scales_the_object(y: int, x: int, factor: int) -> None:
+    mask = np.zeros((300 // factor, 400 // factor), np.uint8)
+    mask[y : y + 60 // factor, x : x + 120 // factor] = 255
+    stored = prepare_image(np.zeros((*mask.shape, 3), np.uint8), mask, object_size=0.75)
+    rows, columns = np.flatnonzero(stored[3].max(1) > 127), np.flatnonzero(stored[3].max(0) > 127)
+    assert (columns[0], columns[-1]) == (8, 55)
+    assert (rows[0], rows[-1]) == (20, 43)
+    assert np.array_equal(stored[0], stored[3])
+
+
+def test_natural_colours_on_white_for_layouts_that_have_them() -> None:
+    colors = np.full((64, 64, 3), (255, 0, 10), np.uint8)
+    mask = np.zeros((64, 64), np.uint8)
+    mask[10:20, 30:40] = 255
+    for crop in (False, True):
+        stored = prepare_image(colors, mask, crop=crop, size=32, layout="kar")
+        assert stored[:3, 0, 0].tolist() == [255, 255, 255], "beside the image, too"
+        assert [255, 0, 10, 255] in stored.reshape(4, -1).T.tolist()
+
+
+def test_photographs_are_cut_as_pascals_reader_does() -> None:
+    rng = np.random.default_rng(0)
+    colors = rng.integers(0, 256, (120, 200, 3), np.uint8)
+    mask = np.zeros((120, 200), np.uint8)
+    mask[30:70, 50:130] = 255
+    stored = prepare_image(colors, mask, size=64, layout="pascal3d")
+    wanted = Crops.from_images([colors], np.array([[50, 30, 80, 40]]), 64).cut()[0]
+    assert np.array_equal(stored[:3], wanted), "natural colours, background and all"
+    assert stored[3].mean() == pytest.approx(255 / 1.3**2, rel=0.05)
+
+
+@pytest.mark.parametrize("layout", ["kato", "pascal3d"])
+def test_masks_that_show_nothing_are_refused(layout: str) -> None:
+    with pytest.raises(ValueError, match="no pixel above half strength"):
+        prepare_image(np.zeros((4, 4, 3), np.uint8), np.full((4, 4), 9, np.uint8), layout=layout)
+
+
+@pytest.mark.parametrize("kind", ["obj", "glb", "ply"])
+def test_mesh_files_are_right_handed_with_normals_outwards(tmp_path, kind: str) -> None:
+    sphere, faces = nmr.icosphere(2)
+    vertices = sphere * torch.tensor([0.5, 0.3, 0.2]) + torch.tensor([0.1, 0.2, 0.3])
+    export_mesh(tmp_path / f"a.{kind}", Surface(vertices, faces))
+    mesh = trimesh.load(tmp_path / f"a.{kind}", force="mesh")
+    assert (len(mesh.vertices), len(mesh.faces)) == (162, 320)
+    assert mesh.is_watertight
+    assert mesh.volume > 0.9 * 4 / 3 * np.pi * 0.5 * 0.3 * 0.2
+    # read with the data sets' rule the mesh is where the network put it
+    assert np.allclose((mesh_to_object() @ mesh.bounds.T).T.mean(0), [0.1, 0.2, 0.3], atol=1e-5)
+    assert np.allclose(mesh.extents, [0.4, 0.6, 1.0], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply"])
+def test_colours_of_vertices_are_kept(tmp_path, kind: str) -> None:
+    vertices, faces = nmr.icosphere(1)
+    colors = (vertices - vertices.min()) / (vertices.max() - vertices.min())
+    export_mesh(tmp_path / f"chair.{kind}", Surface(vertices, faces, colors))
+    (mesh,) = trimesh.load(tmp_path / f"chair.{kind}", force="scene", process=False).geometry.values()
+    found = mesh.visual.vertex_attributes["color"] if kind == "glb" else mesh.visual.vertex_colors
+    wanted = colors.numpy() ** (2.2 if kind == "glb" else 1)  # those of a GLB are linear
+    assert np.abs(found[:, :3] / 255 - wanted).max() < 0.01
+
+
+def test_the_faces_of_a_glb_are_seen_from_both_sides(tmp_path) -> None:
+    export_mesh(tmp_path / "chair.glb", Surface(*nmr.icosphere(1)))
+    content = (tmp_path / "chair.glb").read_bytes()
+    tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert tree["materials"][primitive["material"]]["doubleSided"] is True
+    assert list(trimesh.load(tmp_path / "chair.glb").geometry) == ["chair"]
+
+
+def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_path, short_turntables) -> None:
+    paths = reconstruct_dataset(finished_run, tmp_path / "a", tiny_folder, [5])
+    assert [p.name for p in paths] == [f"airplane_test_000005.{s}" for s in ("glb", "gif", "png")]
+    with np.load(tiny_folder / "02691156_test_images.npz") as archive:
+        stored = archive["arr_0"][0, 5]
+    rgba = np.concatenate([255 - stored[:3], stored[3:]]).transpose(1, 2, 0)
+    (tmp_path / "in").mkdir()
+    Image.fromarray(rgba).save(tmp_path / "photo.png")
+    Image.fromarray(rgba).save(tmp_path / "in" / "photo.png")
+    files = reconstruct_files(finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, refined=False)
+    meshes = [trimesh.load(path[0], force="mesh") for path in (files, paths)]
+    assert np.array_equal(*(mesh.vertices for mesh in meshes)) and np.array_equal(*(mesh.faces for mesh in meshes))
+    (surface,) = reconstruct(load_model(finished_run).method, stored[None])
+    assert np.allclose((surface.vertices.numpy() @ mesh_to_object()).max(0), meshes[0].bounds[1], atol=1e-5)
+    twins = [tmp_path / "photo.png", tmp_path / "in" / "photo.png"]
+    files = reconstruct_files(finished_run, tmp_path / "c", twins, mesh_format="ply")
+    assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
+    with pytest.raises(ValueError, match="2 images but 1 masks"):
+        reconstruct_files(finished_run, tmp_path / "d", twins, [tmp_path / "photo.png"])
+    (tmp_path / "bad.png").write_text("no picture")
+    with pytest.raises(ValueError, match=r"bad\.png"):
+        reconstruct_files(finished_run, tmp_path / "e", [tmp_path / "bad.png", tmp_path / "photo.png"])
+    assert (tmp_path / "e" / "photo.glb").is_file(), "the others are done"
+
+
+def test_a_learnt_azimuth_decides_if_outlines_do_not() -> None:
+    mask, probabilities = np.zeros((64, 64), np.uint8), torch.full((24,), 1e-3)
+    mask[16:48, 16:48], probabilities[5] = 255, 1.0  # the cell of -105 .. -90 degrees
+    assert -110 < input_azimuth_deg(Surface(*nmr.icosphere(2)), mask, probabilities) < -85

@@ -1,0 +1,122 @@
+"""Pictures become generated shapes with the same outline."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+import trimesh
+
+import nmr
+from learn3d.data.conventions import mesh_to_object
+from learn3d.data.layouts import load_dataset
+from learn3d.pictures.photograph import photograph
+from learn3d.pictures.surfaces import Surface
+from learn3d.studio.make_data.render import DatasetConfig, make_shards
+from learn3d.studio.picture_to_mesh.coloring import paint
+from learn3d.studio.picture_to_mesh.reconstruction import Model, load_model, mesh_bytes, reconstruct_picture
+from learn3d.studio.picture_to_mesh.smoothing import divide, sharpen, smooth
+from learn3d.studio.picture_to_mesh.templates import learn_templates, template
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return load_model(None)
+
+
+def picture(category: str, number: int) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = template(category, number)
+    camera = nmr.LookAt.from_angles(2.7, 20.0, [35.0], half_fov_deg=15.0)
+    colors, mask = photograph(vertices * torch.tensor([1.1, 1.0, 0.95]), faces, (0.2, 0.5, 0.3), camera, image_size=128)
+    return colors[0], mask[0]
+
+
+def bodies(surface: Surface) -> int:
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())  # it merges equal vertices
+    return mesh.body_count if mesh.volume > 0 else 0  # below 0: it is inside out
+
+
+def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model) -> None:
+    for kind, category in enumerate(model.categories):
+        number = int(model.templates.numbers[kind, 8])
+        colors, mask = picture(category, number)
+        code = model.method.encode(torch.from_numpy(model.prepare(colors, mask))[None])[0]
+        names, cosines = model.templates.nearest(code.float(), model.categories)
+        assert (category, number) in names and (cosines.diff() <= 0).all()
+    made = reconstruct_picture(model, *(shown := picture("chair", int(model.templates.numbers[2, 8]))))
+    assert made.kind == "chair" and made.silhouette_iou > 0.8 and bodies(made.surface) >= 3
+    assert torch.allclose(made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08), "the picture's"
+    unknown = model.known_codes._replace(output=model.known_codes.output + 100)
+    lump = reconstruct_picture(model._replace(known_codes=unknown), *shown)
+    assert lump.warning and bodies(lump.surface) < 3, "other things get the predicted shape"
+
+
+def test_generated_shapes_of_a_training_set_become_templates(model: Model, tmp_path) -> None:
+    make_shards(DatasetConfig(tmp_path, "lamp", layout="around", procedural=8, test=1, val=1, shards=True))
+    dataset = load_dataset("around", tmp_path, "lamp", "train")
+    found = learn_templates(model.method, dataset)
+    assert [f"lamp_{number:05d}" for number in found.numbers[0]] == list(dataset.object_names)
+    assert torch.allclose(found.axes[1:] @ found.axes[1:].T, torch.eye(len(found.axes) - 1), atol=1e-4)
+    others = dataclasses.replace(dataset, object_names=tuple(f"mine {name}" for name in dataset.object_names))
+    assert learn_templates(model.method, others) is None
+
+
+def test_long_edges_are_divided_and_sharp_ones_stay_sharp() -> None:
+    box = trimesh.creation.box((1.0, 0.6, 0.02))
+    vertices, faces = divide(torch.tensor(box.vertices).float(), torch.tensor(box.faces), 0.1)
+    mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(box.volume, rel=1e-4)
+    assert mesh.edges_unique_length.max() <= 0.1
+    sharp = sharpen(Surface(vertices, faces, vertices.abs()))
+    normals = nmr.vertex_normals(sharp.vertices, sharp.faces)
+    assert torch.allclose(normals.abs().amax(1), torch.ones(len(normals)), atol=1e-4), "along the axes"
+    assert torch.equal(sharp.colors, sharp.vertices.abs()) and torch.equal(sharp.vertices[sharp.faces], vertices[faces])
+
+
+def painted() -> Surface:
+    """A sphere and a thin box with a texture: the colour 0.5 + p at the point p. The vertices are black."""
+    mesh = trimesh.util.concatenate([trimesh.creation.box((0.9, 0.02, 0.1)), trimesh.creation.icosphere(2, 0.4)])
+    vertices, faces = divide(torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces), 0.1)
+    return paint(
+        Surface(vertices, faces, 0 * vertices), lambda points, _: (0.5 + points, torch.full((len(points),), 1e3))
+    )
+
+
+def test_every_place_of_a_texture_has_the_colour_of_its_point() -> None:
+    surface = painted()
+    image, uv = surface.texture
+    shares = torch.from_numpy(np.random.default_rng(0).dirichlet([0.3, 0.3, 0.3], (len(uv), 9))).float()
+    grid = (shares @ uv * 2 - 1) * torch.tensor([1.0, -1.0])
+    found = F.grid_sample(image.movedim(2, 0)[None], grid[None], align_corners=False)[0].movedim(0, 2)
+    wanted = 0.5 + shares @ surface.vertices[surface.faces]
+    assert (found - wanted).abs().max() < 1e-4
+    plain = surface._replace(colors=torch.full_like(surface.vertices, 0.3))
+    image = paint(plain, lambda points, _: (points, torch.zeros(len(points)))).texture.image
+    assert torch.minimum((image - 0.3).abs(), 1 - image).max() < 1e-5, "the vertices', and unused texels"
+
+
+def test_a_glb_shows_the_texture() -> None:
+    surface = painted()
+    mesh = trimesh.load(io.BytesIO(mesh_bytes(surface, "glb", "box")), file_type="glb", force="mesh", process=False)
+    texture = np.asarray(mesh.visual.material.baseColorTexture)
+    u, v = mesh.visual.uv[mesh.faces].mean(1).T
+    found = texture[((1 - v) * len(texture)).astype(int), (u * texture.shape[1]).astype(int), :3] / 255
+    assert np.abs(found - 0.5 - mesh.triangles_center @ mesh_to_object().T).max() < 0.02
+    assert mesh.volume > 0 and mesh.visual.material.doubleSided
+    assert (mesh.vertex_normals[mesh.faces] * mesh.face_normals[:, None]).sum(2).min() > 0.5, "the surface's, outwards"
+
+
+def test_edges_are_rounded_and_flat_parts_stay() -> None:
+    box = trimesh.creation.box((1.0, 0.6, 0.4))
+    vertices, faces = divide(torch.tensor(box.vertices).float(), torch.tensor(box.faces), 0.05)
+    rounded = smooth(vertices, faces)
+    volume = trimesh.Trimesh(rounded.numpy(), faces.numpy(), process=False).volume
+    assert volume == pytest.approx(box.volume, rel=0.03)
+    top = rounded[(vertices[:, :2].abs() < 0.15).all(1) & (vertices[:, 2] > 0)]
+    assert len(top) > 5 and torch.allclose(top[:, 2], torch.tensor(0.2), atol=1e-3)
+    corner = torch.tensor([0.5, 0.3, 0.2])
+    assert 0.005 < float((rounded - corner).norm(dim=1).min()) < 0.1

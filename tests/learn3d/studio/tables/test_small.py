@@ -1,0 +1,110 @@
+"""Every table of the paper in small: `learn3d experiment` from its command line to its reports.
+
+Procedural airplanes in three layouts, small networks, two steps of batch 8: the figures mean nothing, but every run is
+planned, trained, measured, shared between tables and reported. Runs in processes of their own are in `test_runs`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import stub_work
+
+from learn3d import commands
+from learn3d.runs.checkpoint import load_metadata
+from learn3d.studio.make_data.render import DatasetConfig, make_dataset
+from learn3d.studio.tables import experiment
+from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS
+
+pytestmark = pytest.mark.slow
+
+PASCAL_SEEDS = 2
+#: Small data of each layout: 4 objects to train on and 2 to test on, with enough views for MMD.
+DATA = {
+    "kato": {"procedural": 7, "test": 2, "val": 1},
+    "kar": {"procedural": 7, "test": 2, "val": 1, "views": 20},
+    "pascal3d": {"procedural": 6, "val": 2, "views": 6},
+}
+_SMALL = ("encoder=conv-small", "generator=sphere-small")
+_VPL = ("discriminator_channels=8", "image_size=64", "silhouette_size=64")
+#: --set of every variant: its smallest networks.
+SMALLER = dict.fromkeys(VARIANTS, _SMALL) | {
+    **{name: (*_SMALL, "bank_size=4") for name in VARIANTS if name.startswith("plus") or name == "kar-plus"},
+    **{name: (*_SMALL, "warmup_steps=1") for name in VARIANTS if "schedule" in name or "shared" in name},
+    "vpl": ("discriminator_channels=8", "encoder=preact-resnet18"),
+    "kar-vpl": _VPL,
+    "pascal-vpl": (*_VPL, "generator=cube-conv"),
+    **dict.fromkeys(("pascal-baseline", "pascal-proposed"), _SMALL[:1]),
+    "pascal-plus": (_SMALL[0], "bank_size=4"),
+    "prgan": ("discriminator_channels=4,8,16,32", "generator_channels=16,8,4,1"),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Data of each layout, and all tables, each made by its command into the folder `out`.
+
+    VPL's checkpoints of half a gigabyte are removed as soon as they are measured, the other runs at the end.
+    """
+    folder = tmp_path_factory.mktemp("tables")
+    for layout, options in DATA.items():
+        make_dataset(DatasetConfig(output=folder / layout, category="airplane", layout=layout, **options))
+    for name, table in TABLES.items():
+        words = f"{name} --data {folder / table.layout} --output {folder / 'out'} --category airplane --iterations 2 "
+        words += f"--batch-size 8 --jobs 2 --threads 1 --seeds {PASCAL_SEEDS if name == 'pascal' else 1} "
+        words += "--set max_val_images=6 log_every=1 precision=fp32"
+        variants = [row.variant for row in table.rows.values() if row.variant]
+        smaller = [f"{variant}:{change}" for variant in variants for change in SMALLER[variant]]
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as said:
+            patch.setattr("sys.argv", ["learn3d"])
+            patch.setattr(experiment, "run_tasks", stub_work.run_tasks_here)
+            assert commands.main("experiment", *words.split(), *smaller) == 0, said.getvalue()
+        for path in folder.glob("out/runs/*/*vpl-seed*/*.safetensors"):
+            path.unlink()
+    yield folder
+    shutil.rmtree(folder / "out", ignore_errors=True)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> None:
+    table, text = TABLES[name], (folder / "out" / f"{name}.md").read_text()
+    assert "Missing" not in text
+    lines = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines()]
+    for label, row in table.rows.items():
+        cells = {line[1]: line[2:] for line in lines if line[0] == label}
+        assert (f"paper ({row.about})" in cells) == bool(row.printed)
+        if row.variant is None:
+            assert len(cells) == 1, "a quoted row is not measured"
+            continue
+        files = sorted(folder.glob(f"out/runs/airplane/{row.variant}-seed?/test.json"))
+        results = [json.loads(file.read_text()) for file in files]
+        assert len(results) == (PASCAL_SEEDS if name == "pascal" else 1)
+        for result in results:
+            for measure in ("voxel_iou", "voxel_iou_kato19", "f_score", "mmd", "mmd_paper", "chamfer_l1"):
+                assert 0 <= result[measure] <= (1 if "iou" in measure or "score" in measure else math.inf), label
+            assert result["voxel_iou"] > 0, "even an untrained shape overlaps with an airplane"
+            assert result["iterations"] == 2 * (BATCH_DIVISOR if VARIANTS[row.variant].small_batches_of else 1)
+            assert [point[1] for point in result["curve"]] == [result["iterations"]], "the last step is validated"
+        mean = sum(result[table.measure] for result in results) / len(results)
+        cell, mean_cell = cells["here (mmd)" if name == "mmd" else "here (kato18)"]
+        assert cell == mean_cell and cell.startswith(f"{mean:.3f}"), label
+        assert ("±" in cell) == (name == "pascal")
+        if name != "mmd":
+            low, high = map(float, re.search(r"\[(.*), (.*)\]", cell).groups())
+            assert low - 1e-3 <= mean <= high + 1e-3
+        in_list = {line[1]: line[2:] for line in lines if line[0] == f"airplane/{row.variant}-seed0"}
+        assert f"{results[0]['chamfer_l1']:.4f}" in in_list[f"step {results[0]['step']}"]
+
+
+def test_settings_of_rows_reach_their_runs(folder: Path) -> None:
+    wanted = {"60x60": 6, "30x30": 24, "20x20": 54, "20x15": 72, "15x20": 72, "15x15": 96, "10x10": 216}
+    files = {widths: folder / f"out/runs/airplane/bins-{widths}-seed0/best.safetensors" for widths in wanted}
+    assert {widths: load_metadata(file).info.num_views for widths, file in files.items()} == wanted
