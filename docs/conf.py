@@ -20,7 +20,7 @@ release = nmr.__version__
 html_title = f"nmr + learn3d {release}"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "sphinx_copybutton"]
-exclude_patterns = ["_build", "examples/README.md"]  # show_gallery has the latter
+exclude_patterns = ["_build", "examples/README.md", "log"]  # show_gallery has the gallery; logs are downloads
 default_role = "literal"  # `name` in a docstring
 
 highlight_language = "none"  # blocks without a language are drawings and tables
@@ -74,10 +74,12 @@ def offer_colab(app: Sphinx, page: str, text: list[str]) -> None:
 
 
 def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
-    """Links to Markdown files outside of docs become downloads. MyST does the same with links to all other files."""
+    """Links to Markdown files that are no pages become downloads. MyST does the same with links to all other files."""
     for link in list(doctree.findall(addnodes.pending_xref)):
-        target = Path(f"{link['reftarget']}.md")
-        if link.get("refdomain") == "doc" and target.is_absolute() and target.is_file():
+        if link.get("refdomain") != "doc" or link["reftarget"] in app.env.found_docs:
+            continue
+        target = Path(app.srcdir) / f"{link['reftarget']}.md"  # outside of docs, the target is absolute
+        if target.is_file():
             relative = os.path.relpath(target, Path(app.env.doc2path(link["refdoc"])).parent)
             link.replace_self(addnodes.download_reference("", *link.children, reftarget=relative))
 
