@@ -46,9 +46,9 @@ def test_no_module_imports_itself_over_others():
     TopologicalSorter(graph).prepare()  # raises CycleError with the circle
 
 
-def test_the_loop_needs_few_modules():
+def test_the_loop_needs_few_modules(tmp_path: Path):
     code = "import sys, learn3d.training; print(*(name for name in sys.modules if name.split('.')[0] == 'learn3d'))"
     words = [sys.executable, "-c", code]
-    loaded = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
+    loaded = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path).stdout.split()
     assert not [name for name in loaded if ".studio" in name]
     assert len(loaded) <= 67

@@ -19,7 +19,8 @@ PAGE = Path(__file__).parents[3] / "docs" / "contributing.md"
 
 
 def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module_text, preset_text = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)
+    section = PAGE.read_text().split("### A method")[1].split("\n### ")[0]
+    module_text, preset_text = re.findall(r"```python\n(.*?)```", section, re.S)
     (tmp_path / "mirror_of_the_page.py").write_text(module_text)
     monkeypatch.syspath_prepend(tmp_path)
     page = importlib.import_module("mirror_of_the_page")
