@@ -89,6 +89,16 @@ void mipmaps_forward(const Mipmaps<T>& args) {
   });
 }
 
+namespace {
+
+// The gradients of one image's levels.
+template <class T>
+struct MipmapSums {
+  Buffer<T> values;
+};
+
+}  // namespace
+
 // The gradient of a level is its own plus that passed on by the coarser level.
 template <class T>
 void mipmaps_backward(const Mipmaps<T>& args) {
@@ -97,8 +107,9 @@ void mipmaps_backward(const Mipmaps<T>& args) {
     const Grid whole = grid_of(args.grids, args.images, args.levels, i, 0);
     const Grid last = grid_of(args.grids, args.images, args.levels, i, args.levels - 1);
     const int64_t begin = whole.first * C, end = (last.first + last.height * last.width) * C;
-    std::vector<T> sums(args.grad_pyramid + begin, args.grad_pyramid + end);
-    T* sum = sums.data() - begin;
+    T* sums = reserve(thread_scratch<MipmapSums<T>>().values, end - begin);
+    std::copy_n(args.grad_pyramid + begin, end - begin, sums);
+    T* sum = sums - begin;
     for (int64_t level = args.levels - 1; level > 0; --level) {
       const Grid fine = grid_of(args.grids, args.images, args.levels, i, level - 1);
       const Grid coarse = grid_of(args.grids, args.images, args.levels, i, level);
@@ -106,7 +117,7 @@ void mipmaps_backward(const Mipmaps<T>& args) {
         for (int64_t c = 0; c < C; ++c) sum[from * C + c] += weight * sum[to * C + c];
       });
     }
-    std::copy_n(sums.data(), whole.height * whole.width * C, args.grad_texels + first_texel(args, i) * C);
+    std::copy_n(sums, whole.height * whole.width * C, args.grad_texels + first_texel(args, i) * C);
   });
 }
 

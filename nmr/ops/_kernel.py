@@ -76,7 +76,7 @@ def kernel(
 
 def _operator(name: str, hints: dict, returned: type, allocate: Callable, results: list[str]) -> Callable:
     """Registers a kernel, its fake (``allocate``) and its vmap rule: one call per item."""
-    several, compiled = get_origin(returned) is tuple, getattr(_C, name)
+    several = get_origin(returned) is tuple
     names, first = list(hints), next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
 
     def run(*args):
@@ -90,7 +90,7 @@ def _operator(name: str, hints: dict, returned: type, allocate: Callable, result
         given.update(zip(results, outputs if several else (outputs,), strict=True))
         if wanted is not None:
             given.update((result, None) for result, want in zip(results, wanted, strict=True) if not want)
-        compiled(**given, num_threads=torch.get_num_threads())
+        getattr(_C, name)(**given, num_threads=torch.get_num_threads())
         return outputs
 
     def call(*args):

@@ -413,10 +413,10 @@ def test_no_kernel_reads_or_writes_outside_an_array(monkeypatch):
     calls = {}
 
     def record(name, kernel):
-        def call(*args):
-            kinds = tuple(x.ndim if isinstance(x, np.ndarray) else x is None for x in args)
-            calls[name, kinds] = [x.copy() if isinstance(x, np.ndarray) else x for x in args]
-            return kernel(*args)
+        def call(**args):
+            arrays = {key: x.detach().numpy().copy() for key, x in args.items() if isinstance(x, torch.Tensor)}
+            calls[name, tuple((key, x.ndim) for key, x in arrays.items())] = args | arrays
+            return kernel(**args)
 
         return call
 
@@ -436,14 +436,14 @@ def test_no_kernel_reads_or_writes_outside_an_array(monkeypatch):
 def mostly_refused(kernels, calls):
     refused = accepted = 0
     for (name, _), args in calls.items():
-        arrays = [n for n, x in enumerate(args) if isinstance(x, np.ndarray)]
-        copies = [guarded(x) if n in arrays else x for n, x in enumerate(args)]
-        for n in arrays:
-            for other in changes(args[n]):
-                for m in arrays:
-                    copies[m][...] = args[m]
+        arrays = {key: x for key, x in args.items() if isinstance(x, np.ndarray)}
+        copies = {key: guarded(x) for key, x in arrays.items()}
+        for changed in arrays:
+            for other in changes(arrays[changed]):
+                for key, x in arrays.items():
+                    copies[key][...] = x
                 try:
-                    kernels[name](*copies[:n], guarded(other), *copies[n + 1 :])
+                    kernels[name](**args | copies | {changed: guarded(other)})
                     accepted += 1
                 except ValueError:
                     refused += 1
