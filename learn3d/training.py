@@ -1,17 +1,18 @@
 """The training loop: configuration, data, networks, steps, validation, checkpoints."""
 
 import dataclasses
+import math
 import time
 
 from learn3d.config import TrainConfig
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.evaluation import NO_MMD, evaluate, spread_samples
 from learn3d.methods import create_method
 from learn3d.methods.mesh_method import MeshMethod
-from learn3d.methods.method import Method
+from learn3d.methods.method import Losses, Method
 from learn3d.methods.pose_updates import update_poses, update_steps
 from learn3d.pictures.grid import picture_grid
 from learn3d.pictures.sheets import save_png
@@ -70,7 +71,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             log.say(run.describe(progress, train_set, val_set, threads))
             for step, batch in enumerate(batches(train_set, config, start), start):
                 step_began = time.monotonic()
-                losses = method.take_step(batch, step)
+                losses = take_step(method, batch, step)
                 if chosen := threads.after_step(time.monotonic() - step_began):
                     log.say(f"step {step}: {chosen}")
                 recent = progress.losses | losses  # the last two steps: some methods alternate between two networks
@@ -95,6 +96,41 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                     log.say(f"stopped by {stopped_by} after step {step}; continue with: {then}")
                     break
     return Summary(folder, progress, progress.step == config.iterations, time.monotonic() - started)
+
+
+def take_step(method: Method, batch: Batch, step: int) -> dict[str, float]:
+    """Take training step `step` (from 1). Returns its losses before weighting, and "total", their weighted sum.
+
+    Raises FloatingPointError if a loss is not finite, before its gradient is computed.
+    """
+    optimizers = method.optimizers
+    factor = method.schedule.lr_factor(step)
+    for optimizer in optimizers.values():
+        for group in optimizer.param_groups:
+            group["lr"] = factor * group.setdefault("initial_lr", group["lr"])
+    values: dict[str, float] = {}
+    total = 0.0
+    for losses, names in method.phases(batch, step):  # PrGAN's steps have several phases, others have one
+        values |= loss_values(losses, step)
+        total += sum(weight * values[name] for name, (weight, _) in losses.items())
+        weighted = sum(weight * loss for weight, loss in losses.values())
+        weighted.backward()
+        for name in names:
+            optimizers[name].step()
+        for optimizer in optimizers.values():
+            optimizer.zero_grad()
+    if method.ema is not None:
+        method.ema.update(step)
+    return values | {"total": total}
+
+
+def loss_values(losses: Losses, step: int) -> dict[str, float]:
+    """The losses as numbers, before weighting. Raises FloatingPointError if one is not finite."""
+    values = {name: float(loss.detach()) for name, (_, loss) in losses.items()}
+    if not all(math.isfinite(value) for value in values.values()):
+        listed = ", ".join(f"{name} {value:g}" for name, value in values.items())
+        raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")
+    return values
 
 
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:

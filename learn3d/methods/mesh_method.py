@@ -15,7 +15,7 @@ from learn3d.data.dataset import MASK_SIZE, Batch, DatasetInfo
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.losses import pose_classification_loss
-from learn3d.methods.method import Meshes, Method, MethodSettings
+from learn3d.methods.method import Losses, Meshes, Method, MethodSettings
 from learn3d.methods.optimization import adam
 from learn3d.networks.encoders import ENCODERS, EncoderName, ViewClassifier, network_input
 from learn3d.networks.generators import GENERATORS, GeneratorName, MeshGenerator, SymmetryOption
@@ -124,11 +124,6 @@ class MeshMethod(Method):
         rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
         return {name: adam(network, rate, betas) for name, network in trained.items()}
 
-    @property
-    def weights(self) -> dict[str, float]:
-        settings = self.settings
-        return {"projection": 1.0, "smoothness": settings.lambda_smooth, "view": settings.lambda_view}
-
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:
             load_pretrained(self.encoder, self.settings.pretrained)
@@ -192,14 +187,11 @@ class MeshMethod(Method):
         """Silhouettes float32 [B, 64, 64] of vertices [B, V, 3]. Rendering runs on the CPU."""
         return nmr.render_silhouette(vertices, self.faces, poses.cameras(), image_size=MASK_SIZE)
 
-    def surface_losses(self, vertices: Tensor) -> dict[str, Tensor]:
-        """The losses on vertices [B, V, 3] whose weight is above 0."""
-        losses = {
-            "smoothness": lambda: nmr.losses.smoothness_loss(vertices, self.edges),
-            "inflation": lambda: nmr.losses.inflation_loss(vertices, self.faces),
-            "area": lambda: nmr.losses.area_loss(vertices, self.faces),
-        }
-        return {name: loss() for name, loss in losses.items() if self.weights.get(name, 0.0) > 0}
+    def surface_losses(self, vertices: Tensor, step: int) -> Losses:
+        """The losses on vertices [B, V, 3] in step `step`; one whose weight is 0 is left out."""
+        if self.settings.lambda_smooth == 0:
+            return {}
+        return {"smoothness": (self.settings.lambda_smooth, nmr.losses.smoothness_loss(vertices, self.edges))}
 
 
 CODE_STEPS, VERTEX_STEPS = 40, 40  # steps of `refine`

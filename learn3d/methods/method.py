@@ -1,22 +1,25 @@
-"""Base classes of every method: settings, training step, prediction of shapes from images."""
+"""Base classes of every method: settings, losses of a training step, prediction of shapes from images."""
 
 from __future__ import annotations
 
 import abc
 import contextlib
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeAlias
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch, DatasetInfo
-from learn3d.methods.optimization import EMA, TrainingSchedule, backpropagate
+from learn3d.methods.optimization import EMA, TrainingSchedule
 from learn3d.pictures.surfaces import Surface, grid_surface
 from learn3d.settings import checked
+
+#: The losses of a batch by name: the weight of each, and its value before weighting, a scalar tensor.
+Losses: TypeAlias = dict[str, tuple[float, Tensor]]
 
 
 @checked
@@ -72,10 +75,11 @@ class Grids:
 
 
 class Method(abc.ABC):
-    """One method in training or in use. A subclass creates networks and defines a training step.
+    """One method in training or in use. A subclass creates networks and optimizers and computes losses;
+    `training.take_step` takes the steps.
 
-    Training steps depend only on the parameters and buffers of `networks`, on `optimizers`, `ema` and torch's global
-    random state. A run that is resumed from these is bit-identical.
+    Losses depend only on the batch, the step, the parameters and buffers of `networks`, and torch's global random
+    state. A run that is resumed from these, `optimizers` and `ema` is bit-identical.
     """
 
     needs_poses: ClassVar[bool] = True  # whether every training image must have a known pose
@@ -110,11 +114,22 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Optimizers by name, with the learning rates of the settings; `take_step` applies the schedule."""
+        """Optimizers by name, with the learning rates of the settings; the loop applies the schedule."""
 
-    @abc.abstractmethod
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """The method's part of `take_step`: compute losses, call `backward_and_step` and return its values."""
+    def losses(self, batch: Batch, step: int) -> Losses:
+        """The losses of training step `step` (from 1), whose weighted sum all optimizers minimise together.
+
+        Parameters that no loss of the step depends on do not change.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define losses, or phases for several in a step")
+
+    def phases(self, batch: Batch, step: int) -> Iterator[tuple[Losses, tuple[str, ...]]]:
+        """The phases of training step `step`: the losses of each, and the names of the optimizers that minimise them.
+
+        A step has one phase, `losses` with all optimizers, unless a subclass yields others. The optimizers of a phase
+        have stepped when the next one is computed.
+        """
+        yield self.losses(batch, step), tuple(self.optimizers)
 
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
@@ -128,46 +143,11 @@ class Method(abc.ABC):
         """Probability of each cell of `AZIMUTHS`, float32 [B, K], for stored images; None if they were not learnt."""
         return None
 
-    @property
-    def weights(self) -> Mapping[str, float]:
-        """Weights of the losses of `backward_and_step`, by name."""
-        return {}
-
-    def weights_at(self, step: int) -> Mapping[str, float]:
-        """The weights of the losses in step `step` (from 1), if they change during a run."""
-        return self.weights
-
     def start_from_pretrained(self) -> None:  # noqa: B027
         """Load the file of pretrained weights that the settings name, if any; called at the start of a run."""
 
     def check_batch(self, batch: Batch) -> None:  # noqa: B027
         """Raise ValueError if the method cannot learn from batches like this one; called at the start of a run."""
-
-    def take_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Take training step `step` (from 1); return all computed losses, unweighted, and "total".
-
-        Raises FloatingPointError if a loss is not finite, before any gradient of that loss is computed.
-        """
-        factor = self.schedule.lr_factor(step)
-        for optimizer in self.optimizers.values():
-            optimizer.zero_grad()  # frees the gradients' memory for the forward pass
-            for group in optimizer.param_groups:
-                group["lr"] = factor * group.setdefault("initial_lr", group["lr"])
-        values = self.training_step(batch, step)
-        if self.ema is not None:
-            self.ema.update(step)
-        return values
-
-    def backward_and_step(self, losses: Mapping[str, Tensor], step: int, *names: str) -> dict[str, float]:
-        """Backpropagate the weighted sum of the losses (see `backpropagate`) and let optimizers step: those named, or
-        all. Parameters that no loss depends on do not change.
-        """
-        for optimizer in self.optimizers.values():
-            optimizer.zero_grad()
-        values = backpropagate(losses, self.weights_at(step), step)
-        for name in names or self.optimizers:
-            self.optimizers[name].step()
-        return values
 
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
         """Context in which the networks have their EMA weights, if the run keeps an EMA."""

@@ -5,13 +5,14 @@ the shape of one image must explain other views of its object, whose depth is us
 """
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.losses import depth_losses, gaussian_prior_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
+from learn3d.methods.method import Losses
 from learn3d.methods.optimization import SparseGradientAdam
 from learn3d.networks.encoders import EncoderName
 from learn3d.networks.generators import GeneratorName, SymmetryOption
@@ -43,7 +44,7 @@ class MultiView(MeshMethod):
             optimizers["centroid"] = SparseGradientAdam(centroid, lr=CENTROID_LEARNING_RATE * rate)
         return optimizers
 
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
+    def losses(self, batch: Batch, step: int) -> Losses:
         """Render the shapes of both views, a and b, in both views. The loss is the mean of the four IoU losses plus
         lambda_smooth times the mean smoothness of the shapes.
         """
@@ -52,8 +53,8 @@ class MultiView(MeshMethod):
         # shapes a, b, a, b in the views a, a, b, b
         seen = torch.arange(2 * pairs).reshape(2, pairs)[[0, 0, 1, 1]].flatten()
         silhouettes = self.render(torch.cat([vertices, vertices]), batch.poses[seen])
-        losses = {"projection": nmr.losses.soft_iou_loss(silhouettes, batch.masks[seen])}
-        return self.backward_and_step(losses | self.surface_losses(vertices), step)
+        projection = nmr.losses.soft_iou_loss(silhouettes, batch.masks[seen])
+        return {"projection": (1.0, projection), **self.surface_losses(vertices, step)}
 
 
 @checked
@@ -86,13 +87,7 @@ class ManyViews(MeshMethod):
     def create_networks(self) -> dict[str, nn.Module]:
         return super().create_networks() | self.create_view_classifier()
 
-    @property
-    def weights(self) -> dict[str, float]:
-        settings = self.settings
-        own = {"depth": settings.lambda_depth, "slope": settings.lambda_slope, "prior": settings.lambda_prior}
-        return super().weights | own
-
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
+    def losses(self, batch: Batch, step: int) -> Losses:
         """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
         depth + lambda_slope slope + lambda_smooth smoothness + lambda_prior prior + lambda_view view. Every second
         image of symmetric objects is flipped first, but not for the loss view.
@@ -100,11 +95,11 @@ class ManyViews(MeshMethod):
         settings, count = self.settings, len(batch) // GROUP_SIZE
         images = batch.images[:count]
         codes, vertices = self.predict(self.flip_every_second(images)[0])
-        losses: dict[str, Tensor] = {}
+        losses: Losses = {}
         if settings.lambda_prior > 0:
-            losses["prior"] = gaussian_prior_loss(codes, "squared")
+            losses["prior"] = (settings.lambda_prior, gaussian_prior_loss(codes, "squared"))
         if settings.lambda_view > 0:
-            losses["view"] = self.view_loss(images, batch.poses[:count])
+            losses["view"] = (settings.lambda_view, self.view_loss(images, batch.poses[:count]))
         vertices = vertices.cpu()
         uses_depth = batch.depth is not None and settings.lambda_depth + settings.lambda_slope > 0
         rendered = nmr.render(
@@ -114,7 +109,9 @@ class ManyViews(MeshMethod):
             outputs=("alpha", "depth") if uses_depth else ("alpha",),
             image_size=MASK_SIZE,
         )
-        losses["projection"] = nmr.losses.soft_iou_loss(rendered.alpha, batch.masks)
+        losses["projection"] = (1.0, nmr.losses.soft_iou_loss(rendered.alpha, batch.masks))
         if uses_depth:
-            losses["depth"], losses["slope"] = depth_losses(rendered.depth, batch.depth)
-        return self.backward_and_step(losses | self.surface_losses(vertices), step)
+            depth, slope = depth_losses(rendered.depth, batch.depth)
+            losses["depth"] = (settings.lambda_depth, depth)
+            losses["slope"] = (settings.lambda_slope, slope)
+        return losses | self.surface_losses(vertices, step)

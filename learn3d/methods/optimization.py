@@ -1,8 +1,8 @@
-"""Optimization in every method: learning-rate schedules, EMA, Adam, and the step from losses to gradients."""
+"""Optimization in every method: learning-rate schedules, EMA and Adam."""
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -134,20 +134,3 @@ def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
     state = {name: parameter.detach() for name, parameter in network.named_parameters()}
     state |= {name: buffer.clone() for name, buffer in network.named_buffers()}
     return torch.func.functional_call(network, state, inputs)
-
-
-def backpropagate(losses: Mapping[str, Tensor], weights: Mapping[str, float], step: int) -> dict[str, float]:
-    """Backpropagate the weighted sum of the losses; return the unweighted losses and "total".
-
-    Losses may be on several devices. Raises ValueError if a loss has no weight, FloatingPointError, before any
-    gradient, if a loss is not finite.
-    """
-    if missing := [name for name in losses if name not in weights]:
-        raise ValueError(f"the method's weights lack {', '.join(missing)}; they have {', '.join(weights) or 'none'}")
-    values = {name: float(loss.detach()) for name, loss in losses.items()}
-    values["total"] = sum(weights[name] * value for name, value in values.items())
-    if not all(math.isfinite(value) for value in values.values()):
-        listed = ", ".join(f"{name} {value:g}" for name, value in values.items())
-        raise FloatingPointError(f"the loss is not finite at iteration {step} ({listed})")
-    torch.autograd.backward(list(losses.values()), [torch.full_like(losses[name], weights[name]) for name in losses])
-    return values

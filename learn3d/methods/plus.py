@@ -12,6 +12,7 @@ from torch import Tensor, nn
 import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.losses import silhouette_energy_distance
+from learn3d.methods.method import Losses
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.networks.discriminators import pose_discriminator
 from learn3d.networks.encoders import EncoderName
@@ -99,11 +100,7 @@ class Plus(PoseInvariant):
             networks["mask_bank"] = MaskBank(self.settings.bank_size)
         return networks | self.create_view_classifier()
 
-    @property
-    def weights(self) -> dict[str, float]:
-        return super().weights | {"novel_view": self.settings.lambda_novel_view}
-
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
+    def losses(self, batch: Batch, step: int) -> Losses:
         """The losses of `PoseInvariant`, lambda_view times that of the azimuths, and lambda_novel_view times that at a
         novel view once the mask bank is full. Every second image of symmetric objects is flipped. For the discriminator
         it has another view class then: K + k instead of k.
@@ -112,14 +109,15 @@ class Plus(PoseInvariant):
         codes, vertices = self.predict(images)
         on_codes = self.losses_on_codes(codes, batch.view_ids + self.info.num_views * flipped, step)
         vertices = vertices.cpu()
-        losses = {"projection": nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)}
+        projection = nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)
+        losses: Losses = {"projection": (1.0, projection)}
         if self.settings.lambda_view > 0:
-            losses["view"] = self.view_loss(batch.images, batch.poses)
+            losses["view"] = (self.settings.lambda_view, self.view_loss(batch.images, batch.poses))
         if self.settings.lambda_novel_view > 0:
             losses |= self.novel_view_loss(vertices, batch)
-        return self.backward_and_step(losses | self.surface_losses(vertices) | on_codes, step)
+        return losses | self.surface_losses(vertices, step) | on_codes
 
-    def novel_view_loss(self, vertices: Tensor, batch: Batch) -> dict[str, Tensor]:
+    def novel_view_loss(self, vertices: Tensor, batch: Batch) -> Losses:
         """Render all shapes of the batch at one of its cameras. The loss is the energy distance between these
         silhouettes and the masks of this view class in the mask bank, mostly of other objects.
         """
@@ -129,7 +127,7 @@ class Plus(PoseInvariant):
             return {}
         silhouettes = _reduced(self.render(vertices, batch.poses[torch.full((len(vertices),), seen_by)]))
         masks = self.mask_bank.of_view(int(batch.view_ids[seen_by])).to(silhouettes.device)
-        return {"novel_view": silhouette_energy_distance(silhouettes, masks)}
+        return {"novel_view": (self.settings.lambda_novel_view, silhouette_energy_distance(silhouettes, masks))}
 
 
 def _reduced(silhouettes: Tensor) -> Tensor:

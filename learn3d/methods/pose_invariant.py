@@ -11,6 +11,7 @@ import nmr
 from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.losses import domain_confusion_loss, gaussian_prior_loss, pose_classification_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings, is_compact
+from learn3d.methods.method import Losses
 from learn3d.methods.optimization import frozen
 from learn3d.networks.discriminators import pose_discriminator
 from learn3d.settings import Positive, Weight, checked
@@ -72,45 +73,45 @@ class PoseInvariant(MeshMethod):
             networks["discriminator"] = pose_discriminator(self.info.num_views)
         return networks
 
-    @property
-    def weights(self) -> dict[str, float]:
-        settings = self.settings
-        return super().weights | {
-            "area": settings.lambda_area,
-            "classification": settings.lambda_classification,
-            "confusion": settings.lambda_adversarial,
-            "prior": settings.lambda_prior,
-        }
-
-    def weights_at(self, step: int) -> dict[str, float]:
-        if self.settings.varies_over_run is None:
-            return self.weights
-        first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
-        done = min(1.0, (step - 1) / max(1, self.schedule.iterations - 1))
-        return self.weights | {"smoothness": first ** (1 - done) * last**done}
-
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Train encoder and generator in every step on projection + lambda_1 smoothness + lambda_area area + lambda_4
-        prior, and encoder and discriminator by turns (see `losses_on_codes`).
+    def losses(self, batch: Batch, step: int) -> Losses:
+        """Encoder and generator learn in every step from projection + lambda_1 smoothness + lambda_area area + lambda_4
+        prior; encoder and discriminator learn by turns (see `losses_on_codes`).
         """
         codes, vertices = self.predict(batch.images)
         on_codes = self.losses_on_codes(codes, batch.view_ids, step)
         vertices = vertices.cpu()
-        losses = {"projection": nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)}
-        return self.backward_and_step(losses | self.surface_losses(vertices) | on_codes, step)
+        projection = nmr.losses.soft_iou_loss(self.render(vertices, batch.poses), batch.masks)
+        return {"projection": (1.0, projection), **self.surface_losses(vertices, step), **on_codes}
 
-    def losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> dict[str, Tensor]:
+    def surface_losses(self, vertices: Tensor, step: int) -> Losses:
+        losses = super().surface_losses(vertices, step)
+        if self.settings.varies_over_run is not None:
+            losses["smoothness"] = (self.smoothness_weight(step), losses["smoothness"][1])
+        if self.settings.lambda_area > 0:
+            losses["area"] = (self.settings.lambda_area, nmr.losses.area_loss(vertices, self.faces))
+        return losses
+
+    def smoothness_weight(self, step: int) -> float:
+        """The weight of the smoothness loss in step `step`: it decays exponentially to `lambda_smooth_end`."""
+        first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
+        done = min(1.0, (step - 1) / max(1, self.schedule.iterations - 1))
+        return first ** (1 - done) * last**done
+
+    def losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> Losses:
         """The prior; in odd steps classification on detached codes, which trains the discriminator alone; in even steps
         confusion, which trains the encoder through the discriminator, which itself does not learn.
         """
-        settings, losses = self.settings, {}
+        settings = self.settings
+        losses: Losses = {}
         if settings.lambda_prior > 0:
-            losses["prior"] = gaussian_prior_loss(codes, settings.prior_form)
+            losses["prior"] = (settings.lambda_prior, gaussian_prior_loss(codes, settings.prior_form))
         discriminator_turn = step % 2 == 1
         if discriminator_turn and settings.lambda_classification > 0:
-            logits, views = self.discriminator(codes.detach()), view_ids.to(self.device, non_blocking=True)
-            losses["classification"] = pose_classification_loss(logits, views)
+            logits = self.discriminator(codes.detach())
+            loss = pose_classification_loss(logits, view_ids.to(self.device, non_blocking=True))
+            losses["classification"] = (settings.lambda_classification, loss)
         if not discriminator_turn and settings.lambda_adversarial > 0:
             logits = frozen(self.discriminator, codes)
-            losses["confusion"] = domain_confusion_loss(logits, settings.adversarial_form)
+            loss = domain_confusion_loss(logits, settings.adversarial_form)
+            losses["confusion"] = (settings.lambda_adversarial, loss)
         return losses

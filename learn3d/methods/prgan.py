@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import Annotated
 
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
-from learn3d.methods.method import Grids, Method, MethodSettings
+from learn3d.methods.method import Grids, Losses, Method, MethodSettings
 from learn3d.methods.optimization import adam, frozen
 from learn3d.networks.encoders import network_input
 from learn3d.networks.voxel_gan import (
@@ -102,10 +103,6 @@ class PrGAN(Method):
             "encoder": adam(self.encoder, settings.encoder_learning_rate),
         }
 
-    @property
-    def weights(self) -> dict[str, float]:
-        return dict.fromkeys(self.optimizers, 1.0)  # one loss for each optimizer
-
     @functools.cached_property
     def views(self) -> ViewCircle:
         """The K views of the projected silhouettes."""
@@ -138,58 +135,60 @@ class PrGAN(Method):
         with torch.autocast(self.device.type, enabled=False):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
 
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """A step of the GAN before `encoder_from_step`, afterwards one of the encoder."""
+    def phases(self, batch: Batch, step: int) -> Iterator[tuple[Losses, tuple[str, ...]]]:
+        """One phase for the encoder from step `encoder_from_step` on, before it those of the GAN.
+
+        The discriminator learns if its accuracy is at most `accuracy_margin`; then the generator learns from the
+        discriminator's logits, and then from statistics of the discriminator's first layer. All three use the same z,
+        as in the published code.
+        """
         z = self.sample_z(len(batch))
         if step >= self.settings.encoder_from_step:
-            return self._encoder_step(z, step)
-        return self._gan_step(batch.masks.to(self.device, non_blocking=True), z, step)
-
-    def _gan_step(self, real: Tensor, z: Tensor, step: int) -> dict[str, float]:
-        """Train the discriminator, if its accuracy is at most `accuracy_margin`; then the generator on the
-        discriminator's logits; then the generator on statistics of its first layer. All three use the same z, as in the
-        published code.
-        """
-        values = {"accuracy": self.accuracy(real, z)}
-
-        def minimize(name: str, loss: Tensor) -> None:
-            values[name] = self.backward_and_step({name: loss}, step, name)[name]
-
+            yield {"encoder": (1.0, self.encoder_loss(z))}, ("encoder",)
+            return
+        real = batch.masks.to(self.device, non_blocking=True)
+        accuracy = self.accuracy(real, z)
         self.networks.train()
         fake = self.generate(z)
-        if values["accuracy"] <= self.settings.accuracy_margin:
+        losses: Losses = {"accuracy": (0.0, accuracy)}  # it is logged with the first phase, and has no gradient
+        if accuracy <= self.settings.accuracy_margin:
             with self.autocast():
-                of_real, of_fake = self.discriminator(real).float(), self.discriminator(fake.detach()).float()
-            minimize("discriminator", _bce(of_real, 1.0) + _bce(of_fake, 0.0))
+                of_real = self.discriminator(real).float()
+                of_fake = self.discriminator(fake.detach()).float()
+            losses["discriminator"] = (1.0, _bce(of_real, 1.0) + _bce(of_fake, 0.0))
+            yield losses, ("discriminator",)
+            losses = {}
 
         with self.autocast():
             logits = frozen(self.discriminator, fake).float()
-        minimize("generator", _bce(logits, 1.0))
+        losses["generator"] = (1.0, _bce(logits, 1.0))
+        yield losses, ("generator",)
 
         with self.autocast():
             first = self.discriminator.first
-            of_real, of_fake = (frozen(first, images[:, None]).float() for images in (real, self.generate(z)))
-        minimize("generator_statistics", statistics_loss(of_real, of_fake))
-        values["total"] = sum(values.get(name, 0.0) for name in self.optimizers)
-        return values
+            of_real = frozen(first, real[:, None]).float()
+            of_fake = frozen(first, self.generate(z)[:, None]).float()
+        yield {"generator_statistics": (1.0, statistics_loss(of_real, of_fake))}, ("generator_statistics",)
 
-    def _encoder_step(self, z: Tensor, step: int) -> dict[str, float]:
-        """Train the encoder to predict z from new samples of the generator, which is in evaluation mode."""
+    def encoder_loss(self, z: Tensor) -> Tensor:
+        """Summed squared error of the z that the encoder predicts from samples of the generator, which is in evaluation
+        mode.
+        """
         self.networks.eval()
         with torch.no_grad():
             images = self.generate(z)
         with self.autocast():
             estimate = self.encoder(images)
         difference = estimate.float() - z.to(self.device, non_blocking=True)
-        return self.backward_and_step({"encoder": difference.square().sum()}, step, "encoder")
+        return difference.square().sum()
 
     @torch.no_grad()
-    def accuracy(self, real: Tensor, z: Tensor) -> float:
-        """Mean probability, in evaluation mode, that the discriminator assigns to the right answers."""
+    def accuracy(self, real: Tensor, z: Tensor) -> Tensor:
+        """Mean probability, in evaluation mode, that the discriminator assigns to the right answers: a scalar."""
         self.networks.eval()
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
-        return float((of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2)
+        return (of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from learn3d.data.dataset import MASK_SIZE, Batch
 from learn3d.data.poses import Poses
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
+from learn3d.methods.method import Losses
 from learn3d.methods.optimization import frozen
 from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
 from learn3d.networks.encoders import ENCODERS, PreactResNet18
@@ -134,17 +135,8 @@ class VPL(MeshMethod):
             discriminator = OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
         return networks | {"discriminator": discriminator}
 
-    @property
-    def weights(self) -> dict[str, float]:
-        settings = self.settings
-        return super().weights | {
-            "inflation": settings.lambda_inflation,
-            "discrimination": 1.0,
-            "adversarial": settings.lambda_discriminator,
-        }
-
-    def training_step(self, batch: Batch, step: int) -> dict[str, float]:
-        """Train encoder and generator on projection + smoothness + inflation in every step.
+    def losses(self, batch: Batch, step: int) -> Losses:
+        """Encoder and generator learn from projection + smoothness + inflation in every step.
 
         With a discriminator D each shape is also rendered at another view. Alternating: odd steps train D on
         softplus(-D(input view)) + softplus(D(other view)) of detached silhouettes. Even steps train encoder and
@@ -157,21 +149,28 @@ class VPL(MeshMethod):
         vertices = self.predict(batch.images)[1].cpu()
         both = torch.cat([vertices, vertices[: len(others)]])  # both views of each shape in one call
         silhouettes, elsewhere = self.render(both, batch.poses[torch.cat([own, others])]).tensor_split([len(batch)])
-        losses = {"projection": self._projection_loss(silhouettes, batch)} | self.surface_losses(vertices)
+        projection = self._projection_loss(silhouettes, batch)
+        losses: Losses = {"projection": (1.0, projection), **self.surface_losses(vertices, step)}
         if is_baseline:
-            return self.backward_and_step(losses, step)
+            return losses
         if settings.adversary == "reversal":
             real, fake = (reverse_gradient(s, settings.lambda_discriminator) for s in (silhouettes, elsewhere))
         elif step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
         else:
             logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, batch)
-            losses["adversarial"] = F.softplus(-logits).mean()
-            return self.backward_and_step(losses, step)
+            losses["adversarial"] = (settings.lambda_discriminator, F.softplus(-logits).mean())
+            return losses
         of_real = self._discriminate(self.discriminator, real, own, batch)
         of_fake = self._discriminate(self.discriminator, fake, others, batch)
-        losses["discrimination"] = F.softplus(-of_real).mean() + F.softplus(of_fake).mean()
-        return self.backward_and_step(losses, step)
+        losses["discrimination"] = (1.0, F.softplus(-of_real).mean() + F.softplus(of_fake).mean())
+        return losses
+
+    def surface_losses(self, vertices: Tensor, step: int) -> Losses:
+        losses = super().surface_losses(vertices, step)
+        if self.settings.lambda_inflation > 0:
+            losses["inflation"] = (self.settings.lambda_inflation, nmr.losses.inflation_loss(vertices, self.faces))
+        return losses
 
     def render(self, vertices: Tensor, poses: Poses) -> Tensor:
         """Silhouettes float32 [B,s,s] with the settings' size, anti-aliasing and gradient."""

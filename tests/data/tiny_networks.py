@@ -54,4 +54,4 @@ class FixedMethod(Method):
     def create_networks(self):
         raise NotImplementedError
 
-    create_optimizers = training_step = create_networks
+    create_optimizers = create_networks

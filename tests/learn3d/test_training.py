@@ -8,6 +8,7 @@ import signal
 
 import pytest
 import torch
+from steps import backpropagate
 
 import nmr
 from learn3d import training
@@ -15,10 +16,9 @@ from learn3d.config import TrainConfig
 from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.sampling import shuffled_epochs
 from learn3d.methods import create_method
-from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
-from learn3d.training import train
+from learn3d.training import take_step, train
 
 VANILLA = "peng2020-kato-vanilla"
 
@@ -31,11 +31,11 @@ def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
     return any(not torch.equal(p, q) for p, q in zip(network.parameters(), before, strict=True))
 
 
-def make_step(config: TrainConfig, data: ViewDataset):
+def make_step(config: TrainConfig, data: ViewDataset, step=take_step):
     """Networks by name, and a function that takes one step with them."""
     method = create_method(config.settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
     batch = data.batch(torch.tensor([0, 25, 50, 7]))
-    return method.networks, lambda iteration: method.take_step(batch, iteration)
+    return method.networks, lambda iteration: step(method, batch, iteration)
 
 
 def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
@@ -48,12 +48,10 @@ def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
         odd = iteration % 2 == 1
         assert changed(networks["discriminator"], before["discriminator"]) == odd
         assert ("classification" in losses, "confusion" in losses) == (odd, not odd)
-        if not odd:
-            assert all(p.grad is None for p in networks["discriminator"].parameters())
 
 
 def gradients(config: TrainConfig, data: ViewDataset, iteration: int) -> dict[str, list[torch.Tensor]]:
-    networks, step = make_step(config, data)
+    networks, step = make_step(config, data, backpropagate)
     step(iteration)
     return {name: [p.grad for p in n.parameters() if p.grad is not None] for name, n in networks.items()}
 
@@ -109,7 +107,7 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(PoseInvariant, "take_step", twice)
+    monkeypatch.setattr(training, "take_step", twice)
     with pytest.raises(KeyboardInterrupt):
         train(tiny_config(run_folder, preset=VANILLA))
 

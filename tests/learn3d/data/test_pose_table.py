@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from learn3d import training
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.layouts import load_dataset
@@ -100,15 +101,15 @@ def test_weights_of_poses_survive_a_stop(
     """Reweighted after the steps 1 and 3, stopped after step 4."""
     options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2}
     assert train(tiny_config(tmp_path / "whole", **options)).finished
-    step_of = Plus.take_step
+    take_step = training.take_step
 
     def stop(method: Plus, batch: Batch, step: int) -> dict[str, float]:
         if step == 4:
             signal.raise_signal(signal.SIGINT)
-        return step_of(method, batch, step)
+        return take_step(method, batch, step)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Plus, "take_step", stop)
+        patch.setattr(training, "take_step", stop)
         assert not train(tiny_config(tmp_path / "stopped", **options)).finished
     assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
     whole, stopped = (checkpoint.load(tmp_path / name / "last.safetensors")[0] for name in ("whole", "stopped"))

@@ -18,6 +18,7 @@ from learn3d.methods import create_method
 from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.presets import PRESETS
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
+from learn3d.training import take_step
 
 SIDES = (0, 6, 12, 18)  # views from the four sides
 
@@ -60,5 +61,5 @@ def test_pose_confusion_takes_the_view_out_of_the_codes(dataset: kato.ViewDatase
     assert loss.item() < 0.4 * np.log(len(SIDES))  # it has learnt to tell them apart
     sure = confusion(method, batch)
     for _ in range(30):
-        method.take_step(batch, 2)  # even steps train the encoder against the discriminator, which stays as it is
+        take_step(method, batch, 2)  # even steps train the encoder against the discriminator, which stays as it is
     assert (confusion(method, batch) < 0.1 * sure) == unsure

@@ -13,10 +13,11 @@ import tiny_networks
 import torch
 from torch import nn
 
+from learn3d import training
 from learn3d.data.dataset import DatasetInfo
 from learn3d.methods import _METHODS, create_method
 from learn3d.methods.method import Method
-from learn3d.methods.optimization import EMA, LRSchedule, TrainingSchedule, adam, backpropagate
+from learn3d.methods.optimization import EMA, LRSchedule, TrainingSchedule, adam
 from learn3d.networks.encoders import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
@@ -35,25 +36,51 @@ TINY_RUNS = {
 }
 
 
+class Scripted:
+    """A method of one parameter, x = 3, whose steps have the phases that a test gives."""
+
+    schedule = TrainingSchedule(10, "linear")
+    ema = None
+
+    def __init__(self, *phases: tuple[str, ...]) -> None:
+        self.x = torch.tensor(3.0, requires_grad=True)
+        self.optimizers = {name: torch.optim.SGD([self.x], lr=0.1) for name in ("first", "second")}
+        self.phases = lambda batch, step: ((self.losses(names), (name,)) for name, names in phases)
+        self.seen = []
+
+    def losses(self, names: tuple[str, ...]) -> dict[str, tuple[float, torch.Tensor]]:
+        self.seen.append(float(self.x))
+        known = {"b": (1.0, self.x.square()), "a": (0.5, 2 * self.x), "c": (0.0, -self.x)}
+        return {name: known.get(name, (1e-3, self.x * torch.inf)) for name in names}
+
+
 def test_losses_are_weighted_added_up_and_returned_in_their_order() -> None:
-    x = torch.tensor(3.0, requires_grad=True)
-    values = backpropagate({"b": x.square(), "a": 2 * x, "c": -x}, {"a": 0.5, "b": 1.0, "c": 0.0}, step=1)
+    method = Scripted(("first", ("b", "a", "c")))
+    values = training.take_step(method, None, 1)
     assert list(values.items()) == [("b", 9.0), ("a", 6.0), ("c", -3.0), ("total", 12.0)]
-    assert x.grad == 7.0
+    assert float(method.x) == pytest.approx(3 - 0.1 * 7)
+    assert method.x.grad is None
 
 
-@pytest.mark.parametrize("name", ["projection", "prior"])
-def test_a_loss_that_is_not_finite_stops_before_any_gradient(name: str) -> None:
-    x = torch.tensor(1.0, requires_grad=True)
-    losses = {"projection": x, "prior": x, name: x * torch.inf}
-    with pytest.raises(FloatingPointError, match=rf"iteration 7 .*{name} inf"):
-        backpropagate(losses, {"projection": 1.0, "prior": 1e-3}, step=7)
-    assert x.grad is None
+def test_phases_follow_each_other_and_the_schedule() -> None:
+    method = Scripted(("first", ("a",)), ("second", ("b",)))
+    values = training.take_step(method, None, 6)  # the learning rate is half of 0.1
+    assert method.seen == pytest.approx([3.0, 2.95])
+    assert values == pytest.approx({"a": 6.0, "b": 2.95**2, "total": 3 + 2.95**2})
+    assert float(method.x) == pytest.approx(2.95 - 0.05 * 2 * 2.95)
 
 
-def test_a_loss_without_a_weight_is_an_error() -> None:
-    with pytest.raises(ValueError, match="lack norm; they have nrom"):
-        backpropagate({"norm": torch.tensor(1.0)}, {"nrom": 0.1}, step=1)
+@pytest.mark.parametrize("names", [("infinite", "a"), ("a", "infinite")])
+def test_a_loss_that_is_not_finite_stops_before_any_gradient(names: tuple[str, str]) -> None:
+    method = Scripted(("first", names))
+    with pytest.raises(FloatingPointError, match=r"iteration 7 .*infinite inf"):
+        training.take_step(method, None, 7)
+    assert method.x.grad is None
+
+
+def test_a_method_without_losses_says_so() -> None:
+    with pytest.raises(NotImplementedError, match="Scripted must define losses"):
+        Method.losses(Scripted(), None, 1)
 
 
 def test_moments_of_dead_units_vanish_and_change_no_weight() -> None:
@@ -133,7 +160,7 @@ def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) 
             settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0, schedule=schedule
         )
         for step in (1, 2, 3):
-            method.take_step(tiny_set.batch(torch.arange(4)), step)
+            training.take_step(method, tiny_set.batch(torch.arange(4)), step)
             assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3
             with method.in_use():
                 method.encode(tiny_set.batch(torch.arange(2)).images)
@@ -143,15 +170,15 @@ def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) 
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     """Let a signal end the run after this step."""
-    take_step = Method.take_step
+    take_step = training.take_step
 
-    def step_and_signal(self: Method, batch, now: int) -> dict[str, float]:
-        losses = take_step(self, batch, now)
+    def step_and_signal(method: Method, batch, now: int) -> dict[str, float]:
+        losses = take_step(method, batch, now)
         if now == step:
             signal.raise_signal(signal.SIGTERM)
         return losses
 
-    monkeypatch.setattr(Method, "take_step", step_and_signal)
+    monkeypatch.setattr(training, "take_step", step_and_signal)
 
 
 def test_every_method_has_a_tiny_run() -> None:

@@ -17,6 +17,7 @@ from learn3d.methods.optimization import TrainingSchedule
 from learn3d.methods.plus import MaskBank, Plus, PlusSettings
 from learn3d.networks.generators import SmoothSphereGenerator, SphereGenerator
 from learn3d.presets import PRESETS
+from learn3d.training import take_step
 
 SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", bank_size=4)
 
@@ -64,11 +65,12 @@ def test_shapes_end_at_the_box_where_it_is_known(preset: str) -> None:
 
 def test_losses(batch) -> None:
     method = make(lambda_smooth_end=1e-4)
-    first, second = method.take_step(batch, 1), method.take_step(batch, 2)
+    first, second = take_step(method, batch, 1), take_step(method, batch, 2)
     assert {"projection", "smoothness", "prior", "classification", "novel_view"} <= set(first)
     assert {"confusion", "novel_view"} <= set(second)
     for step, losses in enumerate((first, second), 1):
-        total = sum(method.weights_at(step)[name] * value for name, value in losses.items() if name != "total")
+        weights = {name: weight for name, (weight, _) in method.losses(batch, step).items()}
+        total = sum(weights[name] * value for name, value in losses.items() if name != "total")
         assert losses["total"] == pytest.approx(total, rel=1e-5)
 
 
@@ -76,7 +78,7 @@ def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
     method, without = make(lambda_view=1.0), make()
     assert without.view_probabilities(batch.images) is None
     for step in range(1, 41):
-        method.take_step(batch, step)
+        take_step(method, batch, step)
     found = method.view_probabilities(batch.images).argmax(1)
     assert torch.equal(found, ((batch.poses.azimuth_deg + 180) % 360 / 15).long())
     rotations = dataclasses.replace(batch, poses=None)
@@ -84,29 +86,30 @@ def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
         method.check_batch(rotations)
 
 
-def test_the_weight_of_the_smoothness_falls_over_the_run() -> None:
+def test_the_weight_of_the_smoothness_falls_over_the_run(batch) -> None:
     settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
     options = {"device": "cpu", "precision": "fp32", "seed": 0, "schedule": TrainingSchedule(iterations=5)}
     method = create_method(settings, DatasetInfo(24, inverted=False), **options)
-    weights = [method.weights_at(step)["smoothness"] for step in (1, 3, 5, 6)]
+    weights = [method.losses(batch, step)["smoothness"][0] for step in (1, 3, 5, 6)]
     assert weights == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
-    assert make(lambda_smooth_end=None).weights_at(5) == make().weights
+    constant = make(lambda_smooth=0.25, lambda_smooth_end=None)
+    assert constant.losses(batch, 5)["smoothness"][0] == 0.25
 
 
 def test_the_loss_at_novel_views_waits_for_a_full_mask_bank(batch) -> None:
     method = make(bank_size=6)
-    assert "novel_view" not in method.take_step(batch, 1)
-    assert "novel_view" in method.take_step(batch, 2)
+    assert "novel_view" not in take_step(method, batch, 1)
+    assert "novel_view" in take_step(method, batch, 2)
     without = make(lambda_novel_view=0.0)
     assert "mask_bank" not in without.networks
-    assert "novel_view" not in without.take_step(batch, 1)
+    assert "novel_view" not in take_step(without, batch, 1)
 
 
 def test_the_loss_at_novel_views_moves_vertices_where_the_projection_does_not(batch) -> None:
     method = make()
     method.novel_view_loss(0.5 * method.generator.sphere.expand(4, -1, -1), batch)
     vertices = (0.5 * method.generator.sphere).repeat(4, 1, 1).requires_grad_()
-    (gradient,) = torch.autograd.grad(method.novel_view_loss(vertices, batch)["novel_view"], vertices)
+    (gradient,) = torch.autograd.grad(method.novel_view_loss(vertices, batch)["novel_view"][1], vertices)
     assert torch.isfinite(gradient).all()
     assert gradient.abs().sum() > 0
 
@@ -123,7 +126,7 @@ def test_every_second_image_is_flipped_to_a_view_of_its_own_if_shapes_are_symmet
         method, images = make(plane), batch.images.clone()
         images[flipped] = images[flipped].flip(3)
         method.predict = lambda given, predict=method.predict: pictures.append(given) or predict(given)
-        method.take_step(batch, 1)
+        take_step(method, batch, 1)
         assert seen.pop().tolist() == views
         assert torch.equal(pictures.pop(), images)
 
@@ -158,8 +161,10 @@ def test_compact_objects_get_the_smooth_sphere_and_a_small_area(tiny_set) -> Non
         method = create_method(
             settings, DatasetInfo(24, inverted=False, solidity=solidity), device="cpu", precision="fp32", seed=0
         )
-        assert type(method.generator) is kind and method.weights["area"] == weight
+        assert type(method.generator) is kind and method.settings.lambda_area == weight
     settings = dataclasses.replace(settings, lambda_area=0.5)
     method = create_method(settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
     vertices = method.generator(torch.zeros(2, 512))
-    torch.testing.assert_close(method.surface_losses(vertices)["area"], nmr.losses.area_loss(vertices, method.faces))
+    weight, area = method.surface_losses(vertices, 1)["area"]
+    assert weight == 0.5
+    torch.testing.assert_close(area, nmr.losses.area_loss(vertices, method.faces))

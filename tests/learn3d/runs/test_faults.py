@@ -19,23 +19,22 @@ import pytest
 from runs import check_same
 
 from learn3d import training
-from learn3d.methods.pose_invariant import PoseInvariant
 from learn3d.runs import checkpoint, log
 from learn3d.training import train
 
-TRAIN_STEP = PoseInvariant.take_step
+TAKE_STEP = training.take_step
 
 
 def before_step(monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], object]) -> None:
     """Let something happen before a training step, once."""
     left = [action]
 
-    def take_step(self, batch, now: int):
+    def take_step(method, batch, now: int):
         if now == step and left:
             left.pop()()
-        return TRAIN_STEP(self, batch, now)
+        return TAKE_STEP(method, batch, now)
 
-    monkeypatch.setattr(PoseInvariant, "take_step", take_step)
+    monkeypatch.setattr(training, "take_step", take_step)
 
 
 def full(*_: object, **__: object) -> None:
