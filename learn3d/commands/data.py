@@ -11,7 +11,8 @@ from learn3d.data.layouts import Layout, check_folder, load_dataset
 from learn3d.data.readers import READERS
 from learn3d.files.writing import check_target, write_json
 from learn3d.settings import Count, split_names
-from learn3d.terminal import align, say
+from learn3d.tasks import Task, Workers, run_tasks
+from learn3d.terminal import INTERRUPTED, align, note, say
 
 
 class CheckDataset(Command):
@@ -72,13 +73,15 @@ class ConvertDataset(Command):
     """Side of the images in pixels, for the method's encoder; larger images are scaled down."""
     views_per_object: Count | None = None
     """Number of training images to keep of each object (default: the layout's protocol, one for kar, else all)."""
+    workers: Workers
 
-    def run(self) -> None:
+    def run(self) -> int:
         check_target(self.output, "--output", folder=True)
         found = READERS[self.layout].contents(self.data)
         splits_of = {synset_of(category): splits for category, splits in found.items()}
         if not (wanted := split_names(self.category) or found):
             raise ValueError(f"{self.data} holds nothing of the layout {self.layout!r}")
+        tasks = {}
         for category in wanted:
             splits = splits_of.get(synset_of(category), ("train",))
             if self.layout == "pascal3d" and "val" in splits:
@@ -88,8 +91,23 @@ class ConvertDataset(Command):
                 if shards.holds(self.output, category, split):
                     say(f"{folder}: exists; remove it to convert it again")
                     continue
-                few = {"views_per_object": self.views_per_object} if split == "train" else {}
-                dataset = load_dataset(self.layout, self.data, category, split, image_size=self.image_size, **few)
-                shards.remove(folder)  # an unfinished conversion
-                count = shards.write_set(folder, self.layout, dataset)
-                say(f"{folder}: {len(dataset)} images of {dataset.num_objects} objects in {count} shards")
+                few = self.views_per_object if split == "train" else None
+                arguments = (self.layout, self.data, category, split, folder, self.image_size, few)
+                tasks[folder] = Task(f"{category} {split}", convert_split, arguments, folder.with_suffix(".log"))
+        failed = run_tasks(list(tasks.values()), self.workers)
+        if missing := [folder for folder in tasks if not (folder / shards.SET_FILE).is_file()]:
+            note(f"{len(missing)} of {len(tasks)} splits are missing; the same command converts them")
+            return 1 if failed else INTERRUPTED
+        return 0
+
+
+def convert_split(
+    layout: Layout, data: Path, category: str, split: str, folder: Path, image_size: int, views_per_object: int | None
+) -> bool:
+    """Write a split of a data set as shards into `folder`, and print a line about them."""
+    options = {"image_size": image_size, "views_per_object": views_per_object}
+    dataset = load_dataset(layout, data, category, split, **options)
+    shards.remove(folder)  # an unfinished conversion
+    count = shards.write_set(folder, layout, dataset)
+    say(f"{folder}: {len(dataset)} images of {dataset.num_objects} objects in {count} shards")
+    return True

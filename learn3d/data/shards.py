@@ -20,6 +20,8 @@ alone. Axes and colours are those of the layout (`kato`, `kar` ...).
 import dataclasses
 import itertools
 import json
+import os
+import socket
 import zlib
 from pathlib import Path
 from typing import Annotated, BinaryIO, Literal
@@ -44,6 +46,7 @@ SET_FILE = "set.json"
 SHARD_BYTES = 2**28  # approximate size of the images in a shard
 _FILES = 5 * "[0-9]" + "*.safetensors"
 _REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes from `make_data.render`
+_PARTIALS = (".*.partial", ".tmp??????")  # half-written files; safetensors uses the second name
 _ARRAYS = ("images", "masks", "depth", "voxels", "points")
 _DTYPES = {  # by tensor; all others are float32
     **dict.fromkeys(("images", "masks", "depth"), np.uint8),
@@ -98,12 +101,15 @@ def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
         tensors[f"{name}.checksums"] = np.array([zlib.crc32(row) for row in array], np.uint32)
     metadata = {"objects": list(part.object_names), "crc": _crc(part.object_names, tensors)}
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(shard_path(folder, number), sync=True) as path:
+    writer = f".{socket.gethostname()}-{os.getpid()}"  # another machine may have lost its worker, and still write it
+    with replacing(shard_path(folder, number), sync=True, writer=writer) as path:
         save_file(tensors | arrays, path, {"shard": json.dumps(metadata)})
 
 
 def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> None:
-    """Mark a split of `shards` shards as complete. `part`: any part of the data set."""
+    """Mark a split of `shards` shards as complete, and remove what killed processes left. `part`: any part of it."""
+    for path in itertools.chain(*(folder.glob(pattern) for pattern in _PARTIALS)):
+        path.unlink(missing_ok=True)
     facts = SetFile(
         layout=layout,
         shards=shards,

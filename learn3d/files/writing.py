@@ -13,15 +13,16 @@ from learn3d.terminal import stop_on_signal
 
 
 @contextlib.contextmanager
-def replacing(path: Path, *, sync: bool = False) -> Iterator[Path]:
+def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; at the end the file there is renamed to `path`.
 
     After an exception the temporary file is removed; a killed process leaves it. sync: the file is complete even after
-    a power failure. Raises OSError if `path` is a folder, a pipe or a device.
+    a power failure. writer: part of the temporary name, if several processes may write the same file. Raises OSError
+    if `path` is a folder, a pipe or a device.
     """
     path = Path(path)
     _require_regular(path)
-    temporary = path.with_name(f".{path.name}.partial")
+    temporary = path.with_name(f".{path.name}{writer}.partial")
     temporary.unlink(missing_ok=True)  # a killed process may have left a hard link, which must not be overwritten
     try:
         temporary.touch()

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from learn3d.config import config_to_dict
@@ -16,7 +13,7 @@ from learn3d.files.writing import write_json
 from learn3d.runs.folder import CONFIG
 from learn3d.runs.measurement import CurvePoint, ObjectMeans, Result
 from learn3d.studio.tables.plan import PlannedRun
-from learn3d.studio.tasks import Task
+from learn3d.tasks import Task, Workers
 from learn3d.terminal import stop_on_signal
 
 
@@ -74,33 +71,10 @@ def fail_if_started(run: PlannedRun) -> bool:
     raise ValueError("started")
 
 
-def run_tasks_here(tasks: Sequence[Task], **options: object) -> dict[str, str]:
+def run_tasks_here(tasks: Sequence[Task], workers: Workers) -> list[str]:
     """Run tasks in this process: starting Python and torch takes seconds."""
     for task in tasks:
         task.log.parent.mkdir(parents=True, exist_ok=True)
         with open(task.log, "a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
             assert task.function(*task.arguments)
-    return {}
-
-
-STEPS = 12
-
-
-def steps(folder: Path, name: str, seconds: float = 0.0) -> bool:
-    """Twelve steps, a line each in a file; goes on after those that are there. A task called "dies" kills itself."""
-    path = folder / f"{name}.txt"
-    done = len(path.read_text().split()) if path.exists() else 0
-    print("pid", os.getpid(), "from step", done, flush=True)
-    if name == "fails":
-        raise ValueError("no such thing")
-    with stop_on_signal() as stop:
-        for step in range(done, STEPS):
-            if name == "dies" and step == 2:
-                os.kill(os.getpid(), signal.SIGKILL)
-            if stop.name:
-                print("saved", flush=True)
-                return False
-            time.sleep(seconds)
-            with open(path, "a") as file:
-                file.write(f"{step}\n")
-    return True
+    return []

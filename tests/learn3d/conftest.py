@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tiny_networks
 import torch
+from dask_cluster import dask_cluster
 
 from learn3d import commands, training
 from learn3d.config import TrainConfig
@@ -22,6 +23,7 @@ from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.networks.encoders import ENCODERS
 from learn3d.networks.generators import GENERATORS
 from learn3d.presets import PRESETS
+from learn3d.tasks import Workers
 from learn3d.training import train
 
 
@@ -136,6 +138,14 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         return status, *capsys.readouterr()
 
     return call
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[Workers]:
+    """A Dask cluster with two workers."""
+    pytest.importorskip("distributed")
+    with dask_cluster() as (address, _):
+        yield Workers(cluster=address)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -19,12 +19,13 @@ from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
 from learn3d.settings import Count, FilePath, Rare, Weight, checked
 from learn3d.studio.make_data.writers import WRITERS, WrittenLayout
 from learn3d.studio.shapes import CATEGORIES, numbered_shape
+from learn3d.tasks import ONE_WORKER, Workers
 
 MAX_FACES = 1_000_000
 _PACK = "an npz file with v0, f0, v1, f1, ... and no pickled objects"
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Amount = Annotated[int, Field(ge=0)]
-WITHOUT_EFFECT = {"output", "overwrite", "shards", "jobs"}  # options that do not change the content of the files
+WITHOUT_EFFECT = {"output", "overwrite", "shards", "workers"}  # options that do not change the content of the files
 
 
 @checked
@@ -62,8 +63,7 @@ class DatasetConfig:
     shards: bool = False
     """Write shards, for data sets that exceed the memory (docs/scale.md). Only for the layouts kato and around. If the
     command is interrupted, run it again: it continues."""
-    jobs: Count = 1
-    """Number of processes, each of which makes one shard at a time."""
+    workers: Workers = ONE_WORKER
 
     def __post_init__(self) -> None:
         if self.source is None and self.procedural == 0:
@@ -76,8 +76,8 @@ class DatasetConfig:
                 f"shards need the layout kato or around, not {self.layout}; make the data set without --shards, and "
                 "convert it (learn3d convert-dataset)"
             )
-        if not self.shards and (self.jobs > 1 or writer.write is None):
-            raise ValueError("--jobs and the layout around are for shards: add --shards")
+        if not self.shards and (self.workers != ONE_WORKER or writer.write is None):
+            raise ValueError("--jobs, --cluster and the layout around are for shards: add --shards")
         synset_of(self.category)
         conventions.mesh_to_object(self.up, self.front_axis)
         for name in ("views", "test", "val", "augment"):

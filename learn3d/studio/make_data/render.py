@@ -19,7 +19,7 @@ from learn3d.pictures.sheets import LEGEND, ROWS, draw_sheet, make_row
 from learn3d.studio.make_data.meshes import DatasetConfig, Item, check, fit_to_box, split_items
 from learn3d.studio.make_data.writers import WRITERS
 from learn3d.studio.make_data.writers.writer import RenderedObject, write_png
-from learn3d.studio.tasks import Task, run_tasks
+from learn3d.tasks import Task, run_tasks
 from learn3d.terminal import INTERRUPTED, is_watched, note, say, stop_on_signal
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
@@ -139,7 +139,7 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
 
 
 def make_shards(config: DatasetConfig) -> int:
-    """Make the data set that `config` describes as shards in `output/SYNSET/SPLIT`, each in its own process.
+    """Make the data set that `config` describes as shards in `output/SYNSET/SPLIT`, each by a worker.
 
     A shard depends on the settings and its meshes alone, so those of a killed call are kept. The report has the same
     files as that of `make_dataset`. Returns the exit status: 0, 1 if a shard failed (the next call tries it again), 130
@@ -147,14 +147,14 @@ def make_shards(config: DatasetConfig) -> int:
     """
     folder, splits = config.output / synset_of(config.category), split_items(config)
     _check_settings(config, folder, splits)
-    threads, tasks = max(1, torch.get_num_threads() // config.jobs), {}
+    threads, tasks = config.workers.threads, {}
     for split, items in splits.items():
         for number, part in enumerate(_parts(items)):
             path, log = shard_path(folder / split, number), folder / f"{split}-{number:05d}.log"
             tasks[path] = Task(f"{split} {number}", make_shard, (config, path, number, part, threads), log)
     missing = [task for path, task in tasks.items() if not path.is_file()]
     note(f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}")
-    failed = run_tasks(missing, jobs=config.jobs)
+    failed = run_tasks(missing, config.workers)
     if count := sum(not path.is_file() for path in tasks):
         note(f"{count} shards are missing; the same command makes them")
         return 1 if failed else INTERRUPTED

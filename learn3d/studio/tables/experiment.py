@@ -22,7 +22,7 @@ from learn3d.studio.poses.views import CameraOptions, estimate_views, load_views
 from learn3d.studio.tables.comparison import make_report, read_pose_errors
 from learn3d.studio.tables.plan import PlannedRun, Request, plan_runs
 from learn3d.studio.tables.tables import TABLES, VARIANTS
-from learn3d.studio.tasks import Task, run_tasks
+from learn3d.tasks import Task, run_tasks
 from learn3d.terminal import INTERRUPTED, align, note, say
 from learn3d.training import train
 
@@ -90,7 +90,7 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
     written in any case. work: trains and tests a run, and returns False if a signal stopped it. Raises ValueError for
     an unknown method or option, for runs with other options in the output folder, and for damaged files.
     """
-    threads = request.threads or max(1, torch.get_num_threads() // request.jobs)
+    threads = request.threads or request.workers.threads
     runs, failed = plan_runs(dataclasses.replace(request, threads=threads)), []
     if conflicts := [text for run in runs if (text := find_conflict(run))]:
         advice = "ask for the same options, choose another --output, or remove these folders"
@@ -98,10 +98,10 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
     results = read_results(runs)
     if not request.report_only:
         logs = request.output / "runs/*/*" / LOG_FILE
-        note(f"{request.table}: {len(runs)} runs, {len(results)} of them done; {request.jobs} at a time; logs: {logs}")
+        note(f"{request.table}: {len(runs)} runs, {len(results)} of them done; logs: {logs}")
         missing = [run for run in runs if run.folder not in results]
         tasks = [Task(run.name, work, (run,), run.folder / LOG_FILE) for run in missing]
-        failed = run_tasks(tasks, jobs=request.jobs)
+        failed = run_tasks(tasks, request.workers)
         results = read_results(runs)
     tables, text = make_report(request, runs, results)
     path = request.output / f"{request.table}.md"

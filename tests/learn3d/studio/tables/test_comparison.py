@@ -16,6 +16,7 @@ from learn3d.studio.tables.comparison import percentile_interval, resampled_mean
 from learn3d.studio.tables.experiment import describe_tables, run_experiment
 from learn3d.studio.tables.plan import plan_runs
 from learn3d.studio.tables.tables import MEAN, TABLES, VARIANTS
+from learn3d.tasks import Workers
 
 NUMBER = r"-?\+?\d\.\d{3}"
 
@@ -44,7 +45,7 @@ def test_rows_name_variants_and_baselines() -> None:
 
 def test_the_page_shows_our_figures_beside_the_papers(make, request_for, read_report, tmp_path, capsys) -> None:
     """Objects have .40 to .48, and seeds differ by .01; the baseline has .1 less everywhere."""
-    assert make(request_for(category="airplane,chair", seeds=3, jobs=2)) == 0
+    assert make(request_for(category="airplane,chair", seeds=3, workers=Workers(2))) == 0
     text = read_report()
     assert "| Proposed | paper (kato18) | 0.565 | 0.415 | 0.490 |" in text, "the paper's mean over the same categories"
     (line,) = (line for line in text.splitlines() if line.startswith("| Proposed | here (kato18) |"))

@@ -28,6 +28,7 @@ from learn3d.studio.tables import experiment
 from learn3d.studio.tables.experiment import find_conflict, read_results, run_experiment, train_and_test
 from learn3d.studio.tables.plan import Request, plan_runs
 from learn3d.studio.tables.tables import BINS, TABLES, VARIANTS
+from learn3d.tasks import Workers
 
 
 def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
@@ -93,7 +94,7 @@ def test_changes_reach_the_methods_that_they_name(request_for) -> None:
         ({"set": ("seed=1",)}, "that neither the table nor another option decides"),
         ({"set": ("lambda_prior=-1",)}, "lambda_prior must be"),
         ({"table": "prgan", "methods": ("prgan",), "set": ("discriminator_channels=8,a",)}, "discriminator_chan"),
-        ({"seeds": 0}, "jobs and seeds must be at least 1"),
+        ({"seeds": 0}, "seeds must be at least 1"),
         ({"iterations": -1}, "iterations must be"),
         ({"layout": "dvr"}, "the layout 'dvr' has no true voxels"),
     ],
@@ -146,7 +147,7 @@ def test_runs_made_by_hand_are_adopted_and_others_are_named(make, request_for) -
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, request_for, read_report) -> None:
-    call = request_for(category="fails,airplane", methods=("vanilla",), threads=3, jobs=2)
+    call = request_for(category="fails,airplane", methods=("vanilla",), threads=3, workers=Workers(2))
     assert run_experiment(call, work=stub_work.work) == 1
     shown = capsys.readouterr().err
     assert "FAILED fails/vanilla-seed0; the end of its log:" in shown
@@ -159,7 +160,7 @@ def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, request_for, r
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, request_for) -> None:
-    call = request_for(category="waits,airplane", jobs=2)
+    call = request_for(category="waits,airplane", workers=Workers(2))
     logs = [tmp_path / f"out/runs/waits/{name}-seed0/log.txt" for name in ("vanilla", "proposed")]
 
     def interrupt() -> None:

@@ -1,0 +1,119 @@
+"""Tasks, each in a process of its own, on this machine and on the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import stub_steps
+from dask_cluster import dask_cluster
+
+from learn3d import tasks
+from learn3d.tasks import Task, Workers, run_tasks
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+
+
+@pytest.fixture(params=["here", "cluster"])
+def workers(request) -> Workers:
+    return request.getfixturevalue("cluster") if request.param == "cluster" else Workers(jobs=2)
+
+
+def steps(folder: Path, *names: str, seconds: float = 0.0) -> list[Task]:
+    return [Task(name, stub_steps.steps, (folder, name, seconds), folder / f"{name}.log") for name in names]
+
+
+def finished(folder: Path, *names: str) -> bool:
+    """Every step of the tasks was taken, and none twice."""
+    wanted = [str(step) for step in range(stub_steps.STEPS)]
+    return all((folder / f"{name}.txt").read_text().split() == wanted for name in names)
+
+
+def wait_for(condition: Callable[[], bool], what: str, seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"waited for {what}"
+        time.sleep(0.05)
+
+
+def begun(folder: Path, *names: str) -> bool:
+    return all((folder / f"{name}.txt").exists() for name in names)
+
+
+def test_tasks_of_all_kinds(workers, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(tasks, "RESTARTS", 1)
+    no_log = Task("no log", stub_steps.steps, (), tmp_path)
+    failed = run_tasks([no_log, *steps(tmp_path, "a", "fails", "dies", "b", "c")], workers)
+    assert sorted(failed) == ["dies", "fails", "no log"]
+    assert finished(tmp_path, "a", "b", "c")
+    said = capsys.readouterr().err
+    assert all(text in said for text in ("FAILED no log;", "[Errno 21]", "error: no such thing"))
+    assert said.count("dies is started again: (ended by SIGKILL)") == 1
+    assert said.count("/6] ") == 6 and "\n[6/6] " in said
+
+
+def test_an_interruption_lets_tasks_save_and_the_next_call_goes_on(workers, tmp_path, capsys) -> None:
+    def interrupt() -> None:
+        wait_for(lambda: begun(tmp_path, "a"), "the task")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    assert run_tasks(steps(tmp_path, "a", "b", "c", seconds=0.5), workers) == []
+    assert "saved" in (tmp_path / "a.log").read_text()
+    assert not (tmp_path / "c.txt").exists(), "nothing new is started"
+    assert capsys.readouterr().err.startswith("stopping:")
+    assert run_tasks(steps(tmp_path, "a", "b", "c"), workers) == []
+    assert finished(tmp_path, "a", "b", "c")
+
+
+def test_a_task_goes_on_when_its_worker_is_killed(cluster, tmp_path, capsys) -> None:
+    def kill() -> None:
+        wait_for(lambda: begun(tmp_path, "a"), "the task")
+        worker = (tmp_path / "a.log").read_text().split(" of ")[1].split()[0]
+        os.kill(int(worker), signal.SIGKILL)
+
+    threading.Thread(target=kill).start()
+    assert run_tasks(steps(tmp_path, "a", "b", seconds=0.3), cluster) == []
+    assert finished(tmp_path, "a", "b")
+    assert "a is started again: its worker died (KilledWorker" in capsys.readouterr().err
+
+
+def test_a_scheduler_that_is_missing_or_ends(tmp_path, capsys) -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(OSError, match="no Dask scheduler answers at nonsense"):
+        run_tasks([], Workers(cluster="nonsense"))
+    with pytest.raises(ValueError, match="--jobs 2 does not go with --cluster"):
+        Workers(2, "tcp://localhost:8786")
+    with dask_cluster() as (address, process):
+
+        def kill() -> None:
+            wait_for(lambda: begun(tmp_path, "a"), "the task")
+            process.kill()
+
+        threading.Thread(target=kill).start()
+        assert run_tasks(steps(tmp_path, "a", seconds=0.5), Workers(cluster=address)) == ["a"]
+    assert "the Dask scheduler ended; start it, and the same command goes on" in capsys.readouterr().err
+    wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
+
+
+def test_tasks_stop_when_their_parent_is_killed(tmp_path) -> None:
+    code = f"""
+import sys
+sys.path[:0] = {sys.path!r}
+from pathlib import Path
+import stub_steps
+from learn3d.tasks import ONE_WORKER, Task, run_tasks
+folder = Path({str(tmp_path)!r})
+run_tasks([Task("a", stub_steps.steps, (folder, "a", 0.3), folder / "a.log")], ONE_WORKER)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL) as parent:
+        wait_for(lambda: begun(tmp_path, "a"), "the task")
+        parent.kill()
+    wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
