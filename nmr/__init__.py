@@ -17,6 +17,7 @@ sample_texture      the colours of an image at uv coordinates of your own
 Lights              ambient, directional and point lights, spherical harmonics; NormalMap: normals from an image
 LookAt, Look, Pinhole, Orthographic, Camera   cameras: world space -> renderer space; ``nmr.cameras`` converts them
 voxelize            meshes -> filled occupancy grids (kato18 or kato19, the published voxel IoU)
+load_obj            an OBJ file -> vertices, faces, texture coordinates, materials, vertex colours
 icosphere, edge_table, unique_edges, losses   a sphere to deform, its edges, loss functions
 metrics             points on surfaces, Chamfer distance, F-score, IoU of grids
 face_normals, vertex_normals    unit normals, differentiable
@@ -37,7 +38,7 @@ from .fragments import Fragments
 from .images import Images
 from .layers import render_soft, render_transparent
 from .lights import Lights
-from .mesh import edge_table, face_normals, icosphere, unique_edges, vertex_normals
+from .mesh import edge_table, face_normals, icosphere, load_obj, unique_edges, vertex_normals
 from .render import (
     render,
     render_depth,
@@ -72,6 +73,7 @@ __all__ = [
     "edge_table",
     "face_normals",
     "icosphere",
+    "load_obj",
     "losses",
     "metrics",
     "render",

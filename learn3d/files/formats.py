@@ -1,16 +1,16 @@
 """Reads untrusted meshes, voxel grids and pretrained weights in the sandbox."""
 
-import io
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import DamagedFile, open_file, read_bytes
+from learn3d.files.reading import DamagedFile, faults_of, open_file, read_bytes
 
-EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")  # trimesh reads these without further packages
+EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".3mf", ".dae")  # the last two need further packages
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,46 +24,59 @@ class RawMesh:
 def read_mesh(path: Path) -> RawMesh:
     """Read all triangles of a mesh file; the meshes of a scene are transformed and concatenated.
 
-    Other files that it refers to must be in its folder or below. Raises MissingFile, and DamagedFile if it cannot be
-    read, has no triangle, or has over 256 MiB.
+    Polygons are cut into triangles, concave ones, too. Other files that it refers to must be in its folder or below.
+    Raises MissingFile, and DamagedFile if it cannot be read as a whole, has no triangle or over 256 MiB, or if a corner
+    is not finite, or if all are at one place.
     """
     return sandbox.read(_read, path, wanted="a mesh file")
 
 
 def _read(path: Path) -> RawMesh:
-    import trimesh
-
-    content, kind = io.BytesIO(_content(path)), path.suffix.lower().lstrip(".")
-    how = {"force": "scene", "process": False, "skip_materials": True}
-    scene = trimesh.load(content, file_type=kind, resolver=_FilesBelow(path.parent), **how)
-    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if not parts:
-        raise DamagedFile(path, "no faces")
-    vertices, faces = trimesh.util.append_faces([part.vertices for part in parts], [part.faces for part in parts])
+    with open_file(path, limits.MESH_FILE_BYTES, "a mesh file") as file, faults_of(path, "a mesh file", advice=""):
+        size = os.fstat(file.fileno()).st_size
+        sandbox.allow(30 * size, size / 1e6)
+        vertices, faces = _triangles(path, file)
+        if not len(faces):
+            raise DamagedFile(path, "no faces")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}; there are {len(vertices)}")
+        used = vertices[np.unique(faces)]
+        if not np.isfinite(used).all():
+            raise ValueError(f"{np.count_nonzero(~np.isfinite(used).all(axis=1))} of its corners are not finite")
+        if (used == used[0]).all():
+            raise ValueError("all its corners are at one place: its longest side is 0")
     return RawMesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
 
 
-class _FilesBelow:
-    """A resolver for trimesh that reads files in a folder or below it."""
+def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3]. Modules are imported here, so that a worker imports only those it needs."""
+    kind = path.suffix.lower()
+    if kind == ".obj":
+        from nmr.obj import read_obj
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder.resolve()
+        mesh = read_obj(file, with_uv=False)
+        return mesh.vertices, mesh.faces
+    if kind in (".glb", ".gltf"):
+        from learn3d.files.gltf import read_gltf
 
-    def get(self, name: str) -> bytes:
-        path = (self.folder / str(name).strip()).resolve()
-        if not path.is_relative_to(self.folder):
-            raise ValueError(f"it refers to {name!r}, which is outside of {self.folder}")
-        return _content(path)
+        return read_gltf(file.read(), lambda name: _file_below(path.parent, name))
+    if kind in (".3mf", ".dae"):
+        from learn3d.files.meshes import read_3mf, read_dae
 
-    __getitem__ = get
+        return (read_3mf if kind == ".3mf" else read_dae)(file)
+    from learn3d.files.meshes import read_off, read_ply, read_stl
+
+    return {".off": read_off, ".ply": read_ply, ".stl": read_stl}[kind](file.read())
 
 
-def _content(path: Path) -> bytes:
-    """The content of a file; of an OBJ or OFF file as valid UTF-8, since comments may be in Latin-1."""
-    content = read_bytes(path, limits.MESH_FILE_BYTES, "a mesh file, or a file that a mesh refers to")
-    sandbox.allow(30 * len(content), len(content) / 1e6)  # for text, trimesh takes two thirds of that
-    is_text = path.suffix.lower() in (".obj", ".off")
-    return content.decode("utf-8", "replace").encode() if is_text else content
+def _file_below(folder: Path, name: str) -> bytes:
+    """The content of a file in a folder or below it."""
+    path = (folder / name.strip()).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise ValueError(f"it refers to {name!r}, which is outside of {folder.resolve()}")
+    content = read_bytes(path, limits.MESH_FILE_BYTES, "a file that a mesh refers to")
+    sandbox.allow(30 * len(content), len(content) / 1e6)
+    return content
 
 
 def read_matlab(path: Path, name: str, size: int) -> np.ndarray:

@@ -79,10 +79,10 @@ STRICT = Findings(strict=True)
 
 
 @contextlib.contextmanager
-def faults_of(path: Path | str, wanted: str) -> Iterator[None]:
+def faults_of(path: Path | str, wanted: str, advice: str = FETCH_AGAIN) -> Iterator[None]:
     """Turn errors into a DamagedFile or MissingFile: libraries raise various ones for damaged files.
 
-    wanted: description of the file, for messages.
+    wanted: description of the file, for messages. advice: what to do; after an EOFError always to fetch it again.
     """
     try:
         yield
@@ -94,10 +94,11 @@ def faults_of(path: Path | str, wanted: str) -> Iterator[None]:
         reason = (str(error).strip().splitlines() or [""])[0][:300]
         if isinstance(error, MemoryError):
             reason = "it takes too much memory"
-        elif type(error) is not ValueError:
+        elif type(error) not in (ValueError, EOFError):
             reason = f"{type(error).__name__}: {reason}".removesuffix(": ")
-        advice = "" if getattr(error, "errno", None) else f". {FETCH_AGAIN}"  # the system has named the cause
-        raise DamagedFile(Path(path), f"cannot be read ({reason}); expected {wanted}{advice}") from error
+        advice = FETCH_AGAIN if isinstance(error, EOFError) else advice
+        end = "" if getattr(error, "errno", None) or not advice else f". {advice}"  # errno: the system names the cause
+        raise DamagedFile(Path(path), f"cannot be read ({reason}); expected {wanted}{end}") from error
 
 
 def open_file(path: Path | str, max_bytes: int, wanted: str) -> BinaryIO:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from learn3d.files.reading import FETCH_AGAIN, DamagedFile, MissingFile, faults_of
@@ -155,6 +156,9 @@ def _serve(end: int) -> None:
     """Run the requests, each a current folder and a list of calls, until the connection is closed."""
     global _working
     _working = True
+    package = ModuleType("nmr")  # for nmr.obj: nmr's __init__ would import torch
+    package.__path__ = [str(Path(__file__).parents[2] / "nmr")]
+    sys.modules["nmr"] = package
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent kills workers after an interruption
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     start = _memory()

@@ -46,6 +46,8 @@ def test_example(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     vertices, faces = nmr.icosphere(1)
     example.globs.update(torch=torch, nmr=nmr, nr=nr, dr=dr)
+    if example.name.endswith("mesh.load_obj"):
+        nr.save_obj("chair.obj", vertices, faces)
     if "neural_renderer" in example.name:
         textures = torch.rand(1, len(faces), 4, 4, 4, 3)
         if "load_obj" in example.name:

@@ -17,7 +17,8 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from learn3d.files.formats import RawMesh
-from learn3d.studio.make_data.debian.formats import read_ac3d, read_obj
+from learn3d.studio.make_data.debian.formats import read_ac3d
+from nmr.obj import read_obj
 
 #: Facts about a model of a package, which are columns of index.csv, with `stem`, the file name to use without suffix;
 #: and a function that reads it (y up, front +z), or raises ValueError.
@@ -96,7 +97,7 @@ def furniture_models(files: Mapping[str, bytes]) -> Iterator[Model]:
 def _read_furniture(archive: zipfile.ZipFile, model: str, entry: Mapping[str, str]) -> RawMesh:
     if not model.lower().endswith(".obj") or model not in archive.namelist():
         raise ValueError("the catalogue has no OBJ file of it")
-    mesh = read_obj(archive.read(model).decode("latin-1"))
+    mesh = read_obj(io.BytesIO(archive.read(model)), with_uv=False)
     return RawMesh(place_furniture(mesh.vertices, entry), mesh.faces)
 
 

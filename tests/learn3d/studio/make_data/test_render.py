@@ -241,7 +241,7 @@ def test_meshes_without_faces_and_broken_files_are_skipped_and_listed(tmp_path: 
     bad = {
         "empty.off": ("OFF\n0 0 0\n", "no faces"),
         "points.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
-        "nan.obj": ("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", "longest side is nan"),
+        "nan.obj": ("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", "line 2: 'v 1 0 nan' cannot be read"),
         "point.obj": ("v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "longest side is 0"),
         "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no view shows"),
         "index.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", ""),

@@ -14,7 +14,7 @@ from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text,
 
 from learn3d.files.formats import RawMesh
 from learn3d.studio.make_data.debian import models
-from learn3d.studio.make_data.debian.formats import read_ac3d, read_obj, triangulate
+from learn3d.studio.make_data.debian.formats import read_ac3d
 from learn3d.studio.make_data.debian.models import clean_mesh, surface_grid
 from learn3d.studio.make_data.debian.packages import (
     NOT_AIRPLANES,
@@ -23,6 +23,13 @@ from learn3d.studio.make_data.debian.packages import (
     read_catalogue,
     remove_effects,
 )
+from nmr.obj import triangulate
+
+
+def cut(vertices: np.ndarray, polygons: np.ndarray) -> RawMesh:
+    """The mesh of polygons [P, N] of one size."""
+    sizes = np.full(len(polygons), np.shape(polygons)[1])
+    return RawMesh(vertices, np.ravel(polygons)[triangulate(vertices, np.ravel(polygons), sizes)])
 
 
 @pytest.fixture
@@ -130,7 +137,7 @@ def test_packages_are_downloaded_if_they_are_not_there(
 
 def test_clean_mesh_welds_and_drops() -> None:
     corners, quads = box((0, 0, 0), (2, 1, 1))
-    vertices = np.concatenate([corners[triangulate(corners, quads).faces].reshape(-1, 3), [[99, 99, 99]]])
+    vertices = np.concatenate([corners[cut(corners, quads).faces].reshape(-1, 3), [[99, 99, 99]]])
     mesh = clean_mesh(RawMesh(vertices, np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]])))
     assert (mesh.vertices.shape, mesh.faces.shape, mesh.is_watertight) == ((8, 3), (12, 3), True)
     np.testing.assert_allclose(mesh.bounds, [[-0.5, -0.25, -0.25], [0.5, 0.25, 0.25]], atol=1e-12)
@@ -141,7 +148,7 @@ def test_clean_mesh_welds_and_drops() -> None:
 
 def test_surface_grid_of_a_box() -> None:
     corners, quads = box((0, 0, 0), (2, 1.2, 0.8))
-    faces = triangulate(corners, quads).faces
+    faces = cut(corners, quads).faces
     shell = np.ones((8, 8, 8), bool)
     shell[1:-1, 1:-1, 1:-1] = False
     np.testing.assert_array_equal(surface_grid(corners / [2, 1.2, 0.8] - 0.5, faces, 8), shell)
@@ -194,7 +201,7 @@ def test_furniture_is_turned_and_stretched() -> None:
 
 
 def part(low: tuple, high: tuple) -> RawMesh:
-    return triangulate(*box(low, high))
+    return cut(*box(low, high))
 
 
 def test_effects_are_found_by_shape() -> None:
@@ -226,31 +233,3 @@ def test_ac3d_tree_names_and_transforms() -> None:
 def test_bad_ac3d(text: str) -> None:
     with pytest.raises(ValueError, match="AC3D"):
         read_ac3d(text, skip=lambda name: False)
-
-
-def area(vertices: np.ndarray, faces: np.ndarray) -> float:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-
-
-@pytest.mark.parametrize("start", range(6))
-def test_concave_polygons_keep_their_area(start: int) -> None:
-    arrow = np.roll([[0, 0], [4, 0], [1, 1], [0, 4]], start, axis=0)
-    ell = np.roll([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]], start, axis=0)
-    for outline, expected in ((arrow, 4.0), (ell, 5.0), (ell[::-1], 5.0)):
-        vertices = np.column_stack([outline, outline[:, 0]]).astype(float)  # in the plane z = x
-        faces = triangulate(vertices, [list(range(len(outline)))]).faces
-        assert len(faces) == len(outline) - 2
-        assert area(vertices, faces) == pytest.approx(expected * np.sqrt(2))
-        before = np.cross(vertices, np.roll(vertices, -1, axis=0)).sum(axis=0)
-        after = np.cross(vertices[faces[0, 1]] - vertices[faces[0, 0]], vertices[faces[0, 2]] - vertices[faces[0, 0]])
-        assert before @ after > 0  # the winding stays
-
-
-def test_obj_text() -> None:
-    mesh = read_obj("# c\nv 0 0 0\nv 1 0 0 1 1 1\nv 0 1 0\ng x\nf 1/2/3 -2//1 3\nf 1 2\nl 1 2\n")
-    np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2]])
-    for text in ("v 0 0\nv 1 2 3", "v 0 0 0\nf 1 2 4", "v 0 0 0\nf 1 1 -9", "f 1 2 x"):
-        with pytest.raises(ValueError, match=r"inhomogeneous|refers to a missing vertex|invalid literal"):
-            read_obj(text)

@@ -1,0 +1,188 @@
+"""Reads glTF 2.0, as JSON (.gltf) or binary (.glb): the triangles of the default scene in their rest pose."""
+
+import base64
+import re
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from learn3d.files.reading import parse_json
+
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+# Required extensions with no effect on the triangles, or read here.
+_HARMLESS = re.compile(r"KHR_mesh_quantization|(KHR|EXT|MSFT)_(materials|texture|lights|animation|xmp)\w*")
+_REFUSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
+
+
+def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices float64 [V, 3] and faces int64 [F, 3] of all meshes of a scene.
+
+    Points and lines are skipped. read_other: content of a file by its name. Raises EOFError if the file is cut short,
+    and ValueError if it needs an extension that is not supported.
+    """
+    text, binary = _chunks(content) if content[:4] == b"glTF" else (content, None)
+    tree = parse_json(text)
+    if not str(tree["asset"]["version"]).startswith("2"):
+        raise ValueError(f"it is glTF {tree['asset']['version']}; version 2 is read")
+    for name in tree.get("extensionsRequired", []):
+        if not _HARMLESS.fullmatch(name):
+            raise ValueError(f"it needs the extension {name}, which is not supported; save it without")
+    accessors = _Accessors(tree, binary, read_other)
+    vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
+    for number, matrix in _placed_meshes(tree):
+        for primitive in tree["meshes"][number]["primitives"]:
+            if primitive.get("mode", 4) < 4 or "POSITION" not in primitive["attributes"]:
+                continue
+            _refuse(primitive)
+            points = accessors.read(primitive["attributes"]["POSITION"])
+            indices = np.arange(len(points))
+            if "indices" in primitive:
+                indices = accessors.read(primitive["indices"])[:, 0].astype(np.int64)
+            faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
+            if len(indices) and indices.max() >= len(points):
+                raise ValueError(f"a face refers to vertex {indices.max()}, but its mesh has {len(points)}")
+            vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
+            total += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
+    """The JSON text and the binary chunk of a GLB file."""
+    _, version, length = struct.unpack_from("<4sII", content)
+    if version != 2:
+        raise ValueError(f"it is glTF {version}; version 2 is read")
+    if length > len(content):
+        raise EOFError(f"it has {len(content)} bytes; its header promises {length}")
+    chunks, at = {}, 12
+    while at + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", content, at)
+        chunks.setdefault(kind, content[at + 8 : at + 8 + size])
+        at += 8 + size
+    return chunks[b"JSON"], chunks.get(b"BIN\0")
+
+
+def _refuse(item: dict[str, Any]) -> None:
+    """Raise ValueError if an object has an extension that holds its geometry."""
+    for name in _REFUSED:
+        if name in item.get("extensions", {}):
+            raise ValueError(f"it uses the extension {name}, which is not supported; save it without")
+
+
+class _Accessors:
+    """The arrays of a file."""
+
+    def __init__(self, tree: dict[str, Any], binary: bytes | None, read_other: Callable[[str], bytes]) -> None:
+        self.tree, self.binary, self.read_other = tree, binary, read_other
+        self.buffers: dict[int, bytes] = {}
+
+    def read(self, number: int) -> np.ndarray:
+        """Accessor `number` as [count, components]; float64 for floats and normalised integers."""
+        accessor = self.tree["accessors"][_index(number)]
+        kind, shape = _COMPONENTS[accessor["componentType"]], (accessor["count"], _WIDTHS[accessor["type"]])
+        sparse = accessor.get("sparse")
+        if "bufferView" in accessor:
+            values = self._view(accessor["bufferView"], accessor.get("byteOffset", 0), kind, shape)
+        elif sparse is None:
+            raise ValueError(f"accessor {number} has no data")
+        else:
+            values = np.zeros(shape, kind)
+        if sparse is not None:
+            count, values = sparse["count"], values.copy()
+            rows, new = sparse["indices"], sparse["values"]
+            kind_of_rows = _COMPONENTS[rows["componentType"]]
+            at = self._view(rows["bufferView"], rows.get("byteOffset", 0), kind_of_rows, (count, 1))[:, 0]
+            values[at] = self._view(new["bufferView"], new.get("byteOffset", 0), kind, (count, shape[1]))
+        if accessor.get("normalized") and values.dtype.kind != "f":
+            return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
+        return values.astype(np.float64) if values.dtype.kind == "f" else values
+
+    def _view(self, number: int, offset: int, kind: str, shape: tuple[int, int]) -> np.ndarray:
+        view, dtype = self.tree["bufferViews"][_index(number)], np.dtype(kind)
+        _refuse(view)
+        width = shape[1] * dtype.itemsize
+        stride, offset = view.get("byteStride") or width, _index(offset)
+        data = self._buffer(view.get("buffer", 0))
+        start = _index(view.get("byteOffset", 0))
+        needed = offset + stride * (shape[0] - 1) + width if shape[0] else 0
+        if needed > view["byteLength"] or start + needed > len(data):
+            raise ValueError(f"an array of {shape[0]} elements exceeds its buffer")
+        return np.ndarray(shape, dtype, data, start + offset, (stride, dtype.itemsize))
+
+    def _buffer(self, number: int) -> bytes:
+        if number not in self.buffers:
+            buffer = self.tree["buffers"][_index(number)]
+            uri = buffer.get("uri")
+            if uri is None and self.binary is None:
+                raise ValueError(f"buffer {number} has no data")
+            if uri is None:
+                data = self.binary
+            elif uri.startswith("data:"):
+                data = base64.b64decode(uri.partition(",")[2])
+            else:
+                data = self.read_other(unquote(uri))
+            if len(data) < buffer["byteLength"]:
+                raise EOFError(f"buffer {number} has {len(data)} bytes; {buffer['byteLength']} are promised")
+            self.buffers[number] = data
+        return self.buffers[number]
+
+
+def _index(number: int) -> int:
+    if number < 0:
+        raise ValueError(f"it has the negative index {number}")
+    return number
+
+
+def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
+    """Each mesh of the default scene (of all nodes, if there is no scene), and its matrix [4, 4]."""
+    nodes = tree.get("nodes", [])
+    children = {child for node in nodes for child in node.get("children", [])}
+    roots = [number for number in range(len(nodes)) if number not in children]
+    if tree.get("scenes"):
+        roots = tree["scenes"][_index(tree.get("scene", 0))].get("nodes", [])
+    waiting, seen = [(number, np.eye(4)) for number in reversed(roots)], set()
+    while waiting:
+        number, parent = waiting.pop()
+        if number in seen:
+            raise ValueError(f"node {number} has several parents")
+        seen.add(number)
+        node = nodes[_index(number)]
+        _refuse(node)
+        matrix = parent @ _matrix(node)
+        if "mesh" in node:
+            yield _index(node["mesh"]), matrix
+        waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+
+
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    """The matrix [4, 4] of a node."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    length = np.sqrt(x * x + y * y + z * z + w * w) or 1.0
+    x, y, z, w = x / length, y / length, z / length, w / length
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
+    """Faces [F, 3] of indices [N] as triangles (mode 4), a strip (5) or a fan (6)."""
+    if mode == 4:
+        return indices.reshape(-1, 3)
+    if mode == 5:
+        faces = np.stack([indices[:-2], indices[1:-1], indices[2:]], axis=1)
+        faces[1::2] = faces[1::2, ::-1]
+        return faces
+    if mode == 6:
+        return np.stack([np.broadcast_to(indices[:1], len(indices[2:])), indices[1:-1], indices[2:]], axis=1)
+    raise ValueError(f"it has a primitive of the unknown mode {mode}")

@@ -1,0 +1,188 @@
+"""Reads OFF, PLY and STL files: the corners and triangles of their content.
+
+Each reader takes the bytes of a file and returns vertices float64 [V, 3] and faces [F, 3]. It raises EOFError if the
+file is cut short, and ValueError or another error if it is wrong.
+"""
+
+import re
+import struct
+from typing import BinaryIO
+
+import numpy as np
+
+from nmr.obj import triangulate
+
+Triangles = tuple[np.ndarray, np.ndarray]
+_PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
+_PLY_TYPES |= {"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
+_PLY_TYPES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
+_PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def read_stl(content: bytes) -> Triangles:
+    """Read an STL file, binary (bytes behind the last triangle are ignored) or text."""
+    count = int.from_bytes(content[80:84], "little")
+    is_text = content.lstrip()[:5].lower() == b"solid" and re.search(rb"(?i)\bfacet\b|endsolid", content[: 2**16])
+    if len(content) == 84 + 50 * count or not is_text:
+        if len(content) < 84 + 50 * count or len(content) < 84:
+            raise EOFError(f"it has {len(content)} bytes; its header promises {count} triangles of 50")
+        rows = np.frombuffer(content, "u1", 50 * count, 84).reshape(count, 50)
+        corners = rows[:, 12:48].copy().view("<f4").reshape(-1, 3)
+    else:
+        lines = re.findall(rb"(?im)^\s*vertex[ \t]+([^\r\n]*)", content.replace(b"\r", b"\n"))
+        facets = len(re.findall(rb"(?im)^\s*facet\b", content.replace(b"\r", b"\n")))
+        if content.lower().rfind(b"endsolid") < content.lower().rfind(b"vertex"):
+            raise EOFError("its last solid does not end")
+        corners = np.fromstring(b" ".join(lines), sep=" ").reshape(-1, 3)
+        if len(corners) != 3 * facets or len(lines) != len(corners):
+            raise ValueError(f"it has {facets} facets and {len(corners)} corners; each facet needs three")
+    return corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3)
+
+
+def read_off(content: bytes) -> Triangles:
+    """Read an OFF file, also with colours, normals or texture coordinates behind the corners."""
+    lines = [line for line in re.sub(rb"#[^\r\n]*", b"", content).splitlines() if line.strip()]
+    head, *counts = lines[0].split() if lines else [b""]
+    if not re.fullmatch(rb"(ST)?C?N?OFF", head.removeprefix(b"\xef\xbb\xbf")) or b"BINARY" in counts:
+        raise ValueError("it does not begin with OFF (or COFF, NOFF, STOFF), as a text file does")
+    first = 1
+    if not counts:
+        first, counts = 2, lines[1].split()
+    num_vertices, num_faces = int(counts[0]), int(counts[1])
+    rows = lines[first : first + num_vertices + num_faces]
+    if len(rows) < num_vertices + num_faces:
+        raise EOFError(f"it has {len(rows)} lines; its header promises {num_vertices} corners and {num_faces} faces")
+    vertices = np.array([line.split()[:3] for line in rows[:num_vertices]], np.float64).reshape(-1, 3)
+    sizes, corners = [], []
+    for line in rows[num_vertices:]:
+        size, *words = line.split()
+        sizes.append(int(size))
+        corners += [int(word) for word in words[: sizes[-1]]]
+    return _cut(vertices, np.array(corners, np.int64), np.array(sizes, np.int64))
+
+
+def read_ply(content: bytes) -> Triangles:
+    """Read a PLY file: the elements `vertex` and `face`; others are skipped."""
+    if not content.startswith(b"ply"):
+        raise ValueError("it does not begin with the line `ply`")
+    header = re.match(rb".*?[\r\n]end_header[ \t]*(?:\r\n|\n|\r)", content, re.DOTALL)
+    if header is None:
+        raise EOFError("its header does not end")
+    kind, elements = "", []
+    for line in header[0].decode("latin-1").splitlines():
+        words = line.split()
+        if words[:1] == ["format"]:
+            kind = words[1]
+        elif words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            types = [_PLY_TYPES[word] for word in words[1:-1] if word != "list"]
+            elements[-1][2].append((words[-1], ["f8"] * len(types) if kind == "ascii" else types))
+    body = content[header.end() :]
+    if kind == "ascii":  # as a binary file of doubles
+        body = np.fromstring(body, sep=" ").tobytes()
+    vertices, corners, sizes, at = np.empty((0, 3)), np.empty(0, np.int64), np.empty(0, np.int64), 0
+    for name, count, properties in elements:
+        if name == "tristrips" and count:
+            raise ValueError("it has triangle strips (element tristrips); save it with triangles")
+        columns = [(one, [np.dtype(_PLY_ORDERS[kind] + each) for each in types]) for one, types in properties]
+        found, at = _ply_element(body, at, name, count, columns)
+        if name == "vertex":
+            vertices = np.stack([found[axis][0] for axis in "xyz"], axis=1).astype(np.float64)
+        elif name == "face":
+            values, sizes = found["vertex_indices" if "vertex_indices" in found else "vertex_index"]
+            corners = values.astype(np.int64)
+    return _cut(vertices, corners, sizes)
+
+
+def _ply_element(
+    body: bytes, at: int, name: str, count: int, columns: list[tuple[str, list[np.dtype]]]
+) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
+    """The values of each column with the length of each row's list (1 without a list), and the end of the element."""
+    end = EOFError(f"it ends within its {count} elements `{name}`")
+    if count < 0 or count * max(sum(types[0].itemsize for _, types in columns), 1) > len(body) - at:
+        raise end
+    try:
+        starts, sizes = _ply_rows(body, at, count, [types for _, types in columns])
+    except struct.error:
+        raise end from None
+    found, offsets = {}, starts[:-1]
+    if starts[-1] > len(body):
+        raise end
+    content = np.frombuffer(body, np.uint8)
+    for (column, types), lengths in zip(columns, sizes, strict=True):
+        item = types[-1].itemsize
+        offsets = offsets + (types[0].itemsize if len(types) > 1 else 0)
+        bytes_of = np.repeat(offsets - item * (np.cumsum(lengths) - lengths), lengths)
+        bytes_of = bytes_of + item * np.arange(len(bytes_of))
+        found[column] = (content[bytes_of[:, None] + np.arange(item)].view(types[-1])[:, 0], lengths)
+        offsets = offsets + item * lengths
+    return found, int(starts[-1])
+
+
+def _ply_rows(body: bytes, at: int, count: int, columns: list[list[np.dtype]]) -> tuple[np.ndarray, np.ndarray]:
+    """Where each row starts and the last one ends, int64 [count + 1], and the lengths of its lists [columns, count]."""
+
+    def row(at: int) -> tuple[int, list[int]]:
+        lengths = []
+        for types in columns:
+            length = 1
+            if len(types) > 1:
+                length = int(struct.unpack_from(types[0].byteorder.replace("|", "=") + types[0].char, body, at)[0])
+                at += types[0].itemsize
+            if length < 0:
+                raise ValueError("a list has a negative length")
+            lengths.append(length)
+            at += length * types[-1].itemsize
+        return at, lengths
+
+    if count:
+        size = row(at)[0] - at
+        starts = at + size * np.arange(count + 1)
+        lengths = np.array(row(at)[1], np.int64)
+        same, offset = starts[-1] <= len(body), at
+        for types, length in zip(columns, lengths, strict=True):
+            if same and len(types) > 1:
+                same = bool((np.ndarray(count, types[0], body, offset, (size,)) == length).all())
+                offset += types[0].itemsize
+            offset += length * types[-1].itemsize
+        if same:
+            return starts, np.repeat(lengths[:, None], count, axis=1)
+    starts, rows = [at], []
+    for _ in range(count):
+        at, lengths = row(at)
+        starts.append(at)
+        rows.append(lengths)
+    return np.array(starts), np.array(rows, np.int64).reshape(count, len(columns)).T
+
+
+def _cut(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> Triangles:
+    if sizes.sum() != len(corners) or (len(sizes) and sizes.min() < 0):
+        raise ValueError("a face has fewer corners than it says")
+    return vertices, corners[triangulate(vertices, corners, sizes)]
+
+
+def read_3mf(file: BinaryIO) -> Triangles:
+    """Read a 3MF file. Needs lxml and networkx."""
+    import trimesh
+
+    scene = trimesh.load(file, file_type="3mf", force="scene", process=False)
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    return trimesh.util.append_faces([part.vertices for part in parts], [part.faces for part in parts])
+
+
+def read_dae(file: BinaryIO) -> Triangles:
+    """Read a COLLADA file. Needs pycollada."""
+    import collada
+
+    vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
+    for geometry in collada.Collada(file).scene.objects("geometry"):
+        for part in geometry.primitives():
+            if isinstance(part, collada.lineset.BoundLineSet):
+                continue
+            corners = np.asarray(part.vertex_index, np.int64).reshape(-1)
+            sizes = part.polyends - part.polystarts if hasattr(part, "polyends") else np.full(len(part), 3)
+            vertices.append(np.asarray(part.vertex, np.float64))
+            faces.append(_cut(vertices[-1], corners, sizes)[1] + total)
+            total += len(vertices[-1])
+    return np.concatenate(vertices), np.concatenate(faces)

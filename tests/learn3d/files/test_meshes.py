@@ -1,0 +1,236 @@
+"""Random meshes, written in every format by writers of their own and by trimesh, come back with the same triangles.
+
+MESHES=2000 in the environment makes more of them than the usual few.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from learn3d.files.formats import read_mesh
+
+MESHES = int(os.environ.get("MESHES", "12"))
+Parts = list[tuple[np.ndarray, list[list[int]]]]  # vertices [V, 3] and polygons of each part
+
+
+def random_parts(rng: np.random.Generator, polygons: bool) -> Parts:
+    """Up to three parts with shared corners; polygons of up to 9 corners, star-shaped and mostly concave, in planes."""
+    parts = []
+    for _ in range(rng.integers(1, 4)):
+        vertices, faces = (
+            [rng.normal(size=(5, 3))],
+            [rng.permutation(5)[:3].tolist() for _ in range(rng.integers(1, 9))],
+        )
+        for _ in range(rng.integers(1, 4) if polygons else 0):
+            size, first = int(rng.integers(4, 10)), sum(map(len, vertices))
+            turns = 2 * np.pi * (np.arange(size) + rng.uniform(0, 0.5, size)) / size
+            flat = rng.uniform(0.3, 1, (size, 1)) * np.stack([np.cos(turns), np.sin(turns), 0 * turns], axis=1)
+            vertices.append(flat @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + rng.normal(size=3))
+            faces.append(list(range(first, first + size)))
+        order = rng.permutation(len(faces))
+        scale = 10 ** rng.uniform(-2, 2)
+        parts.append((np.round(scale * np.concatenate(vertices), 6), [faces[i] for i in order]))
+    return parts
+
+
+def joined(parts: Parts) -> tuple[np.ndarray, list[list[int]]]:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    polygons = [
+        [i + int(start) for i in one] for (_, faces), start in zip(parts, starts, strict=False) for one in faces
+    ]
+    return np.concatenate([vertices for vertices, _ in parts]), polygons
+
+
+def write_obj(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    lines, total, relative = [], 0, rng.random() < 0.5
+    gap = rng.choice([" ", "\t", "  "])
+    for k, (vertices, polygons) in enumerate(parts):
+        lines.append(f"o part {k}")
+        lines += ["v" + gap + gap.join(map(repr, row)) for row in vertices.tolist()]
+        total += len(vertices)
+        for one in polygons:
+            numbers = [i - len(vertices) if relative else i + 1 + total - len(vertices) for i in one]
+            form = rng.choice(["{}", "{}//1", "{}//"])
+            lines.append(gap.join(["f", *(form.format(i) for i in numbers)]) + rng.choice(["", " # x", " \\\n"]))
+    path.write_bytes(rng.choice(["\n", "\r\n"]).join(lines).encode())
+
+
+def write_off(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    vertices, polygons = joined(parts)
+    colored = rng.random() < 0.5
+    rows = [" ".join(map(repr, row)) + " 255 0 0 255" * colored for row in vertices.tolist()]
+    rows += [" ".join(map(str, [len(one), *one])) + " 0.5 0.5 0.5" * colored for one in polygons]
+    head = f"{'COFF' if colored else 'OFF'}{rng.choice([' ', chr(10)])}{len(vertices)} {len(polygons)} 0"
+    path.write_text("\n\n".join([head, "# comment", *rows]))
+
+
+def write_ply(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    vertices, polygons = joined(parts)
+    kind, order = [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")][rng.integers(3)]
+    count_type, count_code = [("uchar", "B"), ("int", "i"), ("ushort", "H")][rng.integers(3)]
+    with_uv = rng.random() < 0.5
+    head = f"ply\nformat {kind} 1.0\ncomment Größe\nelement vertex {len(vertices)}\nproperty uchar red\n"
+    head += "property double x\nproperty double y\nproperty double z\n" + f"element face {len(polygons)}\n"
+    head += "property list uchar float texcoord\n" * with_uv + f"property list {count_type} int vertex_indices\n"
+    body = [[("B", 7), *(("d", x) for x in row)] for row in vertices.tolist()]
+    for one in polygons:
+        uv = [("B", 2 * len(one)), *[("f", 0.5)] * 2 * len(one)] if with_uv else []
+        body.append([*uv, (count_code, len(one)), *(("i", i) for i in one)])
+    if kind == "ascii":
+        content = "\n".join(" ".join(repr(value) for _, value in row) for row in body).encode()
+    else:
+        content = b"".join(struct.pack(order + code, value) for row in body for code, value in row)
+    path.write_bytes((head + "end_header\n").encode("latin-1") + content)
+
+
+def write_stl(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    vertices, triangles = joined(parts)
+    corners = vertices[np.array(triangles)].astype("<f4")
+    if rng.random() < 0.5:
+        rows = [np.zeros(3, "<f4").tobytes() + one.tobytes() + b"\0\0" for one in corners]
+        path.write_bytes(b"solid b".ljust(80) + struct.pack("<I", len(rows)) + b"".join(rows) + b"\n" * rng.integers(2))
+    else:
+        rows = ["vertex " + " ".join(f"{x:.9g}" for x in row) for one in corners for row in one]
+        facets = [f"facet normal 0 0 0\nouter loop\n{chr(10).join(rows[i : i + 3])}\nendloop\nendfacet" for i in range(0, len(rows), 3)]  # fmt: skip # noqa: E501
+        path.write_bytes("\n".join(["solid Größe", *facets, "endsolid"]).encode("latin-1"))
+
+
+def write_gltf(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    """A part is a mesh of a node, whose parent turns and scales; its triangles are a list, strips or fans."""
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": 1,
+        "scenes": [{"nodes": []}, {"nodes": []}],
+        "nodes": [],
+        "meshes": [],
+    }
+    tree |= {"accessors": [], "bufferViews": []}
+    blob = b""
+
+    def accessor(values: np.ndarray, component: int, width: str) -> int:
+        nonlocal blob
+        blob += b"\0" * (-len(blob) % 4)
+        view = {"buffer": 0, "byteOffset": len(blob), "byteLength": values.nbytes}
+        blob += values.tobytes()
+        tree["bufferViews"].append(view)
+        found = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": component, "count": len(values)}
+        tree["accessors"].append(found | {"type": width})
+        return len(tree["accessors"]) - 1
+
+    for vertices, triangles in parts:
+        mode = int(rng.integers(4, 7))
+        groups = [np.ravel(triangles)] if mode == 4 else [np.array(one) for one in triangles]
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = 2 * turn, rng.normal(size=3)
+        local = ((vertices - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T + [1, 2, 3]) / [2, 1, -1]
+        position = accessor(local.astype("<f4"), 5126, "VEC3")
+        primitives = [
+            {"attributes": {"POSITION": position}, "indices": accessor(one.astype("<u2"), 5123, "SCALAR"), "mode": mode}
+            for one in groups
+        ]
+        tree["meshes"].append({"primitives": [{"attributes": {"POSITION": position}, "mode": 0}, *primitives]})
+        tree["scenes"][1]["nodes"].append(len(tree["nodes"]))
+        tree["nodes"].append({"matrix": matrix.T.ravel().tolist(), "children": [len(tree["nodes"]) + 1]})
+        node = {"mesh": len(tree["meshes"]) - 1, "translation": [-1, -2, -3], "scale": [2, 1, -1]}
+        tree["nodes"].append(node)
+    tree["buffers"] = [{"byteLength": len(blob)}]
+    if path.suffix == ".gltf":
+        tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+        path.write_text(json.dumps(tree))
+        return
+    text, blob = json.dumps(tree).encode(), blob + b"\0" * (-len(blob) % 4)
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def write_trimesh(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    scene = trimesh.Scene()
+    for vertices, triangles in parts:
+        matrix = trimesh.transformations.random_rotation_matrix(rng.random(3))
+        matrix[:3, 3] = rng.normal(size=3)
+        local = (vertices - matrix[:3, 3]) @ matrix[:3, :3]
+        scene.add_geometry(trimesh.Trimesh(local, triangles, process=False), transform=matrix)
+    if path.suffix == ".3mf":
+        pytest.importorskip("lxml"), pytest.importorskip("networkx")
+    if path.suffix == ".gltf":
+        for name, content in scene.export(file_type="gltf").items():
+            (path if name == "model.gltf" else path.parent / name).write_bytes(content)
+    elif path.suffix in (".glb", ".3mf", ".obj"):
+        scene.export(path)
+    else:
+        options = {"encoding": rng.choice(["ascii", "binary"])} if path.suffix == ".ply" else {}
+        scene.to_mesh().export(path, **options)
+
+
+def write_dae(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    collada = pytest.importorskip("collada")
+    document = collada.Collada()
+    nodes = []
+    for k, (vertices, polygons) in enumerate(parts):
+        shift = rng.normal(size=3)
+        source = collada.source.FloatSource(f"v{k}", (vertices - shift).ravel(), ("X", "Y", "Z"))
+        geometry = collada.geometry.Geometry(document, f"g{k}", f"g{k}", [source])
+        inputs = collada.source.InputList()
+        inputs.addInput(0, "VERTEX", f"#v{k}")
+        sizes = np.array([*map(len, polygons)])
+        geometry.primitives.append(geometry.createPolylist(np.concatenate(polygons), sizes, inputs, "m"))
+        document.geometries.append(geometry)
+        move = [collada.scene.TranslateTransform(*shift)]
+        nodes.append(collada.scene.Node(f"n{k}", children=[collada.scene.GeometryNode(geometry)], transforms=move))
+    document.scene = collada.scene.Scene("s", nodes)
+    document.scenes.append(document.scene)
+    document.write(str(path))
+
+
+WRITERS = {  # name of the file: writer, whether it takes polygons
+    "own.obj": (write_obj, True),
+    "own.off": (write_off, True),
+    "own.ply": (write_ply, True),
+    "own.stl": (write_stl, False),
+    "own.glb": (write_gltf, False),
+    "own.gltf": (write_gltf, False),
+    "collada.dae": (write_dae, True),
+    **{f"trimesh.{kind}": (write_trimesh, False) for kind in ("obj", "off", "ply", "stl", "glb", "gltf", "3mf")},
+}
+
+
+def area_vectors(corners: np.ndarray) -> np.ndarray:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def compare(parts: Parts, corners: np.ndarray) -> None:
+    """Compare triangles [F, 3, 3] with the parts: triangles as a set, polygons by their areas."""
+    vertices, polygons = joined(parts)
+    scale, used = np.abs(vertices).max(), np.zeros(len(corners), bool)
+    assert len(corners) == sum(len(one) - 2 for one in polygons)
+    for one in polygons:
+        points = vertices[one]
+        distance = np.abs(corners[:, :, None] - points).max(axis=3).min(axis=2).max(axis=1)  # to its nearest corner
+        inside = np.flatnonzero((distance < 3e-5 * scale) & ~used)[: len(one) - 2]
+        assert len(inside) == len(one) - 2
+        used[inside] = True
+        whole = np.cross(points - points[0], np.roll(points - points[0], -1, axis=0)).sum(axis=0)
+        parts_of = np.linalg.norm(area_vectors(corners[inside]), axis=1).sum()
+        assert parts_of == pytest.approx(np.linalg.norm(whole), rel=2e-2, abs=1e-3 * scale**2)
+    assert used.all()
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_random_meshes_come_back(tmp_path: Path, name: str) -> None:
+    write, polygons = WRITERS[name]
+    rng = np.random.default_rng(sum(name.encode()))
+    for _ in range(MESHES):
+        parts = random_parts(rng, polygons)
+        write(tmp_path / name, parts, rng)
+        mesh = read_mesh(tmp_path / name)
+        compare(parts, mesh.vertices[mesh.faces])
