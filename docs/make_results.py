@@ -1,7 +1,7 @@
-"""Fills the tables of docs/results.md from docs/results/*.json.
+"""Fills the tables of docs/results.md and docs/short-trainings.md from docs/results/*.json.
 
-python docs/make_results.py            # write the page
-python docs/make_results.py --check    # end with status 1 if the page differs from the files
+python docs/make_results.py            # write the pages
+python docs/make_results.py --check    # end with status 1 if a page differs from the files
 
 A file holds tables as rows of cells, the header first: "main", "differences", "runs" with settings and commit of
 each run, and "curves" with its validations, which draw_curves.py draws. `learn3d experiment TABLE` writes such a file
@@ -15,7 +15,7 @@ from itertools import groupby, pairwise
 from pathlib import Path
 
 DOCS = Path(__file__).parent
-PAGE = DOCS / "results.md"
+PAGES = (DOCS / "results.md", DOCS / "short-trainings.md")
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+) -->\n)(?:\|.*\n)*")
 
 
@@ -63,8 +63,9 @@ def table(name: str, part: str) -> str:
     """One table as Markdown. Repeated names in the first column are shown once."""
     header, *body = rows(name, part)
     firsts = [body[0][0], *("" if a[0] == b[0] else b[0] for a, b in pairwise(body))]
-    lines = [header, ["---"] * len(header), *([first, *row[1:]] for first, row in zip(firsts, body, strict=True))]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    lines = [header, *([first, *row[1:]] for first, row in zip(firsts, body, strict=True))]
+    title, *others = (f"| {' | '.join(line)} |\n" for line in lines)
+    return "".join([title, f"|{'---|' * len(header)}\n", *others])
 
 
 def filled(page: str) -> str:
@@ -73,8 +74,9 @@ def filled(page: str) -> str:
 
 
 if __name__ == "__main__":
-    before = PAGE.read_text()
-    after = filled(before)
-    if "--check" in sys.argv and after != before:
-        sys.exit("docs/results.md differs from docs/results/*.json; run python docs/make_results.py")
-    PAGE.write_text(after)
+    for page in PAGES:
+        before = page.read_text()
+        after = filled(before)
+        if "--check" in sys.argv and after != before:
+            sys.exit(f"{page.name} differs from docs/results/*.json; run python docs/make_results.py")
+        page.write_text(after)

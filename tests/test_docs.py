@@ -191,8 +191,9 @@ def test_the_results_in_the_pages_are_in_the_files() -> None:
     files = " ".join(path.read_text() for path in (ROOT / "docs" / "results").glob("*.json"))
     printed = [row.printed.values() for table in TABLES.values() for row in table.rows.values()]
     known = set(re.findall(r"\d\.\d+", files)) | {f"{figure:.3f}" for row in printed for figure in row}
-    page = re.sub(r"<!-- results: .*\n(\|.*\n)*", "", (ROOT / "docs" / "results.md").read_text())
-    for text in (page, (ROOT / "README.md").read_text().partition("## 3. ")[2]):
+    pages = [path.read_text() for path in make_results.PAGES]
+    written = [re.sub(r"<!-- results: .*\n(\|.*\n)*", "", page) for page in pages]
+    for text in (*written, (ROOT / "README.md").read_text().partition("## 3. ")[2]):
         figures = re.findall(r"(?<![\w.])\d\.\d{3}\b", text)
         assert len(figures) >= 9 and not set(figures) - known
 
@@ -205,7 +206,7 @@ def _load(script: str) -> ModuleType:
     return module
 
 
-make_pictures, draw_curves = _load("make_pictures"), _load("draw_curves")
+make_pictures, draw_curves, make_results = map(_load, ("make_pictures", "draw_curves", "make_results"))
 
 
 def test_every_picture_has_a_command_and_a_record() -> None:
