@@ -4,12 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .draw import Draw, ellipse, points, rectangle
-from .parts import Part, bar, box, ellipsoid, join, loft, revolve, tube, wing
+from .draw import Draw, Perhaps, ellipse, points, recipe, rectangle
+from .parts import Part, bar, box, ellipsoid, join, loft, revolve, strip, wing
 
 # Sections of a wing of each shape besides its middle and its tip, as shares of the half span.
-_STATIONS = {"straight": [], "kinked": [0.55, 0.95], "gull": [0.09, 0.18, 0.26, 0.35, 0.97]}
-_STATIONS["elliptic"] = np.sin(np.linspace(0, np.pi / 2, 8)).round(4).tolist()
+_STATIONS = {
+    "straight": [],
+    "kinked": [0.55, 0.95],
+    "gull": [0.09, 0.18, 0.26, 0.35, 0.97],
+    "elliptic": np.sin(np.linspace(0, np.pi / 2, 8)).round(4).tolist(),
+}
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,8 @@ class Planform:
         """x, y, z of the leading edge and chord at a share (0..1) of the half span."""
         x = share * self.half
         slope = np.tan(np.radians(self.sweep_deg))
-        y, z = self.y + x * np.tan(np.radians(self.dihedral_deg)), self.z - x * slope
+        y = self.y + x * np.tan(np.radians(self.dihedral_deg))
+        z = self.z - x * slope
         chord = self.root + share * (self.tip - self.root)
         if self.kink > 0.0:  # unswept trailing edge up to the kink, swept beyond it
             inner = self.root - self.kink * self.half * slope
@@ -43,8 +48,8 @@ class Planform:
         elif self.shape == "kinked":
             chord = np.interp(share, [0, 0.55, 1], [self.root, self.root, self.tip])
         elif self.shape == "gull":
-            bend, rise = np.sin(min(share, 0.35) / 0.35 * np.pi), max(share - 0.35, 0)
-            y = self.y + self.half * (-0.05 * bend + 0.12 * rise)
+            bend = np.sin(min(share, 0.35) / 0.35 * np.pi)
+            y = self.y + self.half * (-0.05 * bend + 0.12 * max(share - 0.35, 0))
         return x, y, z, chord
 
     def wing(self) -> Part:
@@ -97,30 +102,40 @@ def fin(height: float, root: float, tip: float, sweep_deg: float, z: float, thic
 
 def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     """Fin and stabiliser of a kind: "conventional", "cross" (stabiliser half-way up the fin), "T", "V" or "twin"."""
-    height, sweep = draw(0.14, 0.21), draw(28, 45) if swept else draw(5, 20)
-    root, tip = draw(0.13, 0.19), draw(0.06, 0.1)
-    half, chord, lean = draw(0.15, 0.22), draw(0.09, 0.13), draw(25, 38) if swept else draw(0, 15)
-    tip_chord, base, z = draw(0.4, 0.8) * chord, 0.25 * radius, -0.5 + root + draw(-0.01, 0.03)
+    height = draw(0.14, 0.21)
+    sweep = draw(28, 45) if swept else draw(5, 20)
+    root = draw(0.13, 0.19)
+    tip = draw(0.06, 0.1)
+    half = draw(0.15, 0.22)
+    chord = draw(0.09, 0.13)
+    lean = draw(25, 38) if swept else draw(0, 15)
+    tip_chord = draw(0.4, 0.8) * chord
+    base = 0.25 * radius
+    z = -0.5 + root + draw(-0.01, 0.03)
     if kind == "V":
         side = wing([(0, 0, z - 0.02, root, 0.1), (1.25 * half, 0, z - 0.02 - 0.5 * half * (1 + swept), tip, 0.1)])
         return side.rotated("z", draw(32, 45)).moved(y=base).both_sides()
     dihedral = draw(0, 7)
     if kind == "twin":
         plan = Planform(half, chord, 0.95 * chord, 3, dihedral, -0.5 + chord + 0.01, 0.4 * radius)
-        x, y, z1, c = plan.at(1.0)
-        upright = fin(0.8 * height, 1.2 * c, 0.8 * c, draw(5, 25), z=z1 + 0.02)
+        x, y, front, end = plan.at(1.0)
+        upright = fin(0.8 * height, 1.2 * end, 0.8 * end, draw(5, 25), z=front + 0.02)
         return plan.wing() + upright.moved(x, y - draw(0.1, 0.45) * height).both_sides()
     part = fin(height + base, root, tip, sweep, z).moved(y=0.4 * base)
     if swept and draw.maybe(0.4):  # a dorsal fillet
         part += fin(0.45 * height + base, 1.6 * root, 0.5 * root, 62, z + 0.75 * root, 0.04).moved(y=0.4 * base)
     share = {"T": 0.97, "cross": draw(0.35, 0.6), "conventional": 0.0}[kind]
-    if share == 0.0:
-        front, level = -0.5 + chord + draw(0.0, 0.04), draw(0.1, 0.45) * radius
+    if kind == "conventional":
+        front = -0.5 + chord + draw(0.0, 0.04)
+        level = draw(0.1, 0.45) * radius
     else:
-        rise, dihedral = share * (height + base), 0.0
-        front, level = z - rise * np.tan(np.radians(sweep)) + 0.01, 0.4 * base + rise
+        dihedral = 0.0
+        rise = share * (height + base)
+        front = z - rise * np.tan(np.radians(sweep)) + 0.01
+        level = 0.4 * base + rise
     if kind == "T":
-        chord, tip_chord = min(chord, 1.3 * tip), min(tip_chord, 0.9 * tip)
+        chord = min(chord, 1.3 * tip)
+        tip_chord = min(tip_chord, 0.9 * tip)
     return part + Planform(half, chord, tip_chord, lean, dihedral, front, level, thickness=0.1).wing()
 
 
@@ -138,19 +153,20 @@ def nacelle(radius: float, length: float) -> Part:
 
 def tail_engines(draw: Draw, radius: float, size: float, z: float) -> Part:
     """A pair of jet engines on short stubs at the rear fuselage."""
-    x, y = 0.8 * radius + 1.1 * size, draw(0.1, 0.6) * radius
+    x = 0.8 * radius + 1.1 * size
+    y = draw(0.1, 0.6) * radius
     stub = wing([(0.0, y, z + 0.02, 0.09, 0.12), (x, y, z + 0.01, 0.08, 0.12)])
     return (nacelle(size, draw(4.0, 5.5) * size).moved(x, y, z) + stub).both_sides()
 
 
-def propeller(draw: Draw, radius: float, blades: int, hub: float) -> Part:
+@recipe(width=(0.12, 0.2), turn_deg=(0, 360))
+def propeller(draw: Draw, radius: float, blades: int, hub: float, *, width, turn_deg) -> Part:
     """A spinner and `blades` blades in the plane z = 0, turned to a random angle."""
     part = along_z([(1.0, -1.0), (1.0, 0.0), (0.8, 0.8), (0.4, 1.5), (0.05, 1.8)], hub, hub, 10)
-    width = np.array([0.5, 0.8, 0.8, 0.4]) * (draw(0.12, 0.2) * radius)
+    scale = np.array([0.5, 0.8, 0.8, 0.4]) * (width * radius)
     path = [(0, share * radius, 0) for share in (0, 0.35, 0.75, 1)]
-    blade = tube(path, width, rectangle(2.0, 0.5, segments=1), side=(0.9, 0, 0.45))
-    turn = draw(0, 360)
-    return part + join(blade.rotated("z", turn + 360.0 * k / blades) for k in range(blades))
+    blade = strip(path, 2.0, 0.5, scale, side=(0.9, 0, 0.45))
+    return part + join(blade.rotated("z", turn_deg + 360.0 * k / blades) for k in range(blades))
 
 
 def pod(radius: float, length: float) -> Part:
@@ -176,7 +192,8 @@ def gear(belly: float, drop: float, main_x: float, main_z: float, other_z: float
 
     drop: depth of the wheels below the axis of the fuselage. belly: radius of the fuselage at the gear.
     """
-    main, top = _wheel(0.026), -0.5 * belly
+    main = _wheel(0.026)
+    top = -0.5 * belly
     part = bar((0.4 * main_x, top, main_z), (main_x, -drop, main_z), 0.016).both_sides()
     part += main.moved(main_x + 0.004, -drop, main_z).both_sides()
     if other_z < main_z:
@@ -190,16 +207,23 @@ def _wheel(radius: float) -> Part:
     return revolve([(0.7 * radius, -t), (radius, -0.6 * t), (radius, 0.6 * t), (0.7 * radius, t)], 12).rotated("z", 90)
 
 
-def airliner(draw: Draw) -> Part:
+@recipe(
+    radius=(0.042, 0.068),
+    freighter=0.25,
+    tall=(0.95, 1.15),
+    nose=(1.6, 3.0),
+    nose_power=(1.7, 2.2),
+    tail_start=(0.58, 0.72),
+)
+def airliner(draw: Draw, *, radius, freighter, tall, nose, nose_power, tail_start) -> Part:
     """A jet airliner, or a freighter with high wings, T-tail and upswept rear."""
-    radius, freighter = draw(0.042, 0.068), draw.maybe(0.25)
-    tall, nose, nose_power, tail_start = draw(0.95, 1.15), draw(1.6, 3.0) * radius, draw(1.7, 2.2), draw(0.58, 0.72)
     upsweep = draw(0.5, 0.9) if freighter else draw(0.25, 0.6)
-    plane = fuselage(radius, tall, nose, nose_power, tail_start, upsweep=upsweep, droop=draw(0.1, 0.35))
-    half, sweep, root, tip = draw(0.40, 0.56), draw(15, 38), draw(0.15, 0.21), draw(0.035, 0.07)
-    dihedral, z = draw(-4, 0) if freighter else draw(3, 8), draw(0.1, 0.17)
-    kink = draw(0.25, 0.42) if draw.maybe(0.7) else 0.0
-    plan = Planform(half, root, tip, sweep, dihedral, z, y=0.8 * radius if freighter else -0.6 * radius, kink=kink)
+    droop = draw(0.1, 0.35)
+    plane = fuselage(radius, tall, nose * radius, nose_power, tail_start, upsweep=upsweep, droop=droop)
+    size = draw.measures(half=(0.40, 0.56), sweep_deg=(15, 38), root=(0.15, 0.21), tip=(0.035, 0.07))
+    size["dihedral_deg"] = draw(-4, 0) if freighter else draw(3, 8)
+    size |= draw.measures(z=(0.1, 0.17), kink=Perhaps(0.7, (0.25, 0.42)))
+    plan = Planform(**size, y=0.8 * radius if freighter else -0.6 * radius)
     plane += plan.wing()
     if freighter:
         plane += ellipsoid((1.5 * radius, 0.7 * radius, 0.32), (0, 0.85 * radius, plan.z - 0.1))
@@ -207,16 +231,13 @@ def airliner(draw: Draw) -> Part:
     size = draw(0.35, 0.58) * radius
     if mount.startswith("tail"):
         plane += tail_engines(draw, radius, 0.9 * size, z=draw(-0.32, -0.24))
+    elif draw.maybe(0.35 if freighter else 0.7):
+        size *= 1.25
+        plane += _wing_engine(draw, plan, draw(0.28, 0.4), size).both_sides()
     else:
-        two = draw.maybe(0.35 if freighter else 0.7)
-        size *= 1.25 if two else 0.9
-        for share in (draw(0.28, 0.4),) if two else (0.3, draw(0.55, 0.65)):
-            x, y, z, chord = plan.at(share)
-            length, low = draw(3.0, 4.6) * size, y - draw(1.1, 1.5) * size
-            front = z + draw(0.0, 0.3) * length
-            lower = (low + 0.6 * size, x, front + 0.25 * length, 0.9 * length, 0.08)
-            pylon = wing([lower, (y, x, z - 0.05 * chord, 0.5 * chord, 0.1)], upright=True)
-            plane += (pylon + nacelle(size, length).moved(x, low, front)).both_sides()
+        size *= 0.9
+        outer = draw(0.55, 0.65)
+        plane += join(_wing_engine(draw, plan, share, size).both_sides() for share in (0.3, outer))
     if mount.endswith("3"):
         plane += nacelle(0.9 * size, 4.5 * size).moved(y=1.35 * radius, z=-0.36)
     plane += tail(draw, "T" if freighter or mount.startswith("tail") else "conventional", radius, swept=True)
@@ -229,12 +250,31 @@ def airliner(draw: Draw) -> Part:
     return plane
 
 
-def business_jet(draw: Draw) -> Part:
+@recipe(length=(3.0, 4.6), drop=(1.1, 1.5), forward=(0.0, 0.3))
+def _wing_engine(draw: Draw, plan: Planform, share: float, size: float, *, length, drop, forward) -> Part:
+    """A jet engine of radius `size` on a pylon under the right wing, at a share of its half span."""
+    x, y, z, chord = plan.at(share)
+    length *= size
+    low = y - drop * size
+    front = z + forward * length
+    lower = (low + 0.6 * size, x, front + 0.25 * length, 0.9 * length, 0.08)
+    pylon = wing([lower, (y, x, z - 0.05 * chord, 0.5 * chord, 0.1)], upright=True)
+    return pylon + nacelle(size, length).moved(x, low, front)
+
+
+@recipe(radius=(0.052, 0.075), nose=(0.14, 0.24))
+def business_jet(draw: Draw, *, radius, nose) -> Part:
     """A small jet with engines at the tail."""
-    radius = draw(0.052, 0.075)
-    plane = fuselage(radius, nose=draw(0.14, 0.24), nose_power=1.6, tail_start=0.6, upsweep=0.35, droop=0.3)
-    size = draw.measures(half=(0.4, 0.52), root=(0.15, 0.2), tip=(0.045, 0.07), sweep_deg=(2, 34), dihedral_deg=(2, 6))
-    plan = Planform(**size, z=draw(0.02, 0.08), y=-0.75 * radius)
+    plane = fuselage(radius, nose=nose, nose_power=1.6, tail_start=0.6, upsweep=0.35, droop=0.3)
+    size = draw.measures(
+        half=(0.4, 0.52),
+        root=(0.15, 0.2),
+        tip=(0.045, 0.07),
+        sweep_deg=(2, 34),
+        dihedral_deg=(2, 6),
+        z=(0.02, 0.08),
+    )
+    plan = Planform(**size, y=-0.75 * radius)
     plane += plan.wing() + tail_engines(draw, radius, draw(0.026, 0.036), z=-0.2)
     plane += tail(draw, draw.pick({"T": 3, "cross": 1, "V": 0.4}), radius, swept=True)
     if draw.maybe(0.5):
@@ -245,12 +285,18 @@ def business_jet(draw: Draw) -> Part:
     return plane
 
 
-def fighter(draw: Draw) -> Part:
+@recipe(
+    radius=(0.05, 0.068),
+    twin=0.45,
+    tall=(0.9, 1.15),
+    nose=(0.3, 0.42),
+    nose_power=(1.05, 1.4),
+    tail_radius=(0.65, 0.85),
+    exponent=(2.0, 3.2),
+    shape={"delta": 2.5, "swept": 2, "trapezoid": 2, "forward": 0.3},
+)
+def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
     """A jet fighter: delta, swept or trapezoid wings, one or two fins, canards, stores under the wings."""
-    radius, twin = draw(0.05, 0.068), draw.maybe(0.45)
-    form = draw.measures(tall=(0.9, 1.15), nose=(0.3, 0.42), nose_power=(1.05, 1.4))
-    form |= draw.measures(tail_radius=(0.65, 0.85), exponent=(2.0, 3.2))
-    shape = draw.pick({"delta": 2.5, "swept": 2, "trapezoid": 2, "forward": 0.3})
     root, tip, sweep, z = {
         "delta": (draw(0.42, 0.52), draw(0.02, 0.06), draw(46, 58), 0.1),
         "swept": (draw(0.2, 0.28), draw(0.08, 0.12), draw(35, 50), 0.12),
@@ -264,21 +310,16 @@ def fighter(draw: Draw) -> Part:
     plane = fuselage(radius, tail_start=0.75, **form) + plan.wing()
     plane += canopy(0.9 * radius, 1.1 * radius, draw(0.18, 0.28), 0.8 * radius, draw(0.15, 0.22))
     if twin:
-        wide, rings = draw(0.8, 1.25) * radius, []  # tunnels beside the fuselage, each with a slanted intake
-        for z0, w, h, y in (0.14, 0.9, 1.3, -0.3), (0.0, 1.0, 1.4, -0.2), (-0.3, 1.0, 1.3, 0), (-0.48, 0.8, 0.9, 0.1):
-            across, up = rectangle(w * wide, h * wide, 0.3 * wide).T
-            rings.append(points(wide + across, y * wide + up, z0 + 0.05 * (z0 > 0.1) * (up / wide)))
-        plane += (loft(rings) + nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)).both_sides()
+        plane += _intake_tunnel(radius, draw(0.8, 1.25) * radius).both_sides()
     else:
         side = box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02).both_sides()
         chin = box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02)
-        plane += draw.pick((side, chin, Part())) + nozzle(0.75 * radius, 0.08).moved(z=-0.52)
+        plane += draw.pick([side, chin, Part()]) + nozzle(0.75 * radius, 0.08).moved(z=-0.52)
     if draw.maybe(0.55 if twin else 0.1):
-        cant, x, height = draw(0, 25), draw(0.9, 1.4) * radius, draw(0.13, 0.19)
-        upright = fin(height, 0.19, 0.08, draw(30, 45), z=-0.27)
-        plane += upright.rotated("z", -cant).moved(x, 0.3 * radius).both_sides()
+        plane += _canted_fin(draw, radius).both_sides()
     else:
-        plane += fin(draw(0.17, 0.25) + 0.6 * radius, draw(0.2, 0.3), 0.09, draw(35, 52), z=-0.2).moved(y=0.3 * radius)
+        height = draw(0.17, 0.25) + 0.6 * radius
+        plane += fin(height, draw(0.2, 0.3), 0.09, draw(35, 52), z=-0.2).moved(y=0.3 * radius)
     if shape != "delta":
         plane += Planform(draw(0.17, 0.23), 0.15, 0.06, draw(30, 45), -3, -0.34, 0.0, thickness=0.06).wing()
         if draw.maybe(0.4):  # strakes from the wing root towards the nose
@@ -286,31 +327,68 @@ def fighter(draw: Draw) -> Part:
             plane += wing([(0.0, plan.y, z + 0.2, root + 0.1, 0.05), outer]).both_sides()
     elif draw.maybe(0.5):  # canards
         plane += Planform(draw(0.15, 0.2), 0.11, 0.04, 45, 4, 0.24, 0.35 * radius, thickness=0.06).wing()
-    for share in sorted({(0.4, 0.6, 0.8, 1.0)[draw.count(0, 3)] for _ in range(draw.count(0, 3))}):
-        x, y, z, chord = plan.at(share)  # a tank or missile, under the wing or at its tip
-        store = ellipsoid((0.022, 0.022, draw(0.14, 0.26)), (x, y - 0.026 * (share < 1), z - 0.4 * chord), 8, 6)
-        if share < 1:
-            store += box((0.01, 0.03, 0.06), (x, y - 0.012, z - 0.45 * chord))
-        plane += store.both_sides()
-    return plane
+    places = {(0.4, 0.6, 0.8, 1.0)[draw.count(0, 3)] for _ in range(draw.count(0, 3))}
+    return plane + join(_store(draw, plan, share).both_sides() for share in sorted(places))
 
 
-def turboprop(draw: Draw) -> Part:
+def _intake_tunnel(radius: float, wide: float) -> Part:
+    """A tunnel beside the fuselage with a slanted intake and a nozzle."""
+    rings = []
+    for z, width, height, y in (
+        (0.14, 0.9, 1.3, -0.3),
+        (0.0, 1.0, 1.4, -0.2),
+        (-0.3, 1.0, 1.3, 0),
+        (-0.48, 0.8, 0.9, 0.1),
+    ):
+        across, up = rectangle(width * wide, height * wide, 0.3 * wide).T
+        rings.append(points(wide + across, y * wide + up, z + 0.05 * (z > 0.1) * (up / wide)))
+    return loft(rings) + nozzle(0.42 * wide, 0.07).moved(wide, 0.08 * wide, -0.5)
+
+
+@recipe(cant_deg=(0, 25), x=(0.9, 1.4), height=(0.13, 0.19), sweep_deg=(30, 45))
+def _canted_fin(draw: Draw, radius: float, *, cant_deg, x, height, sweep_deg) -> Part:
+    upright = fin(height, 0.19, 0.08, sweep_deg, z=-0.27)
+    return upright.rotated("z", -cant_deg).moved(x * radius, 0.3 * radius)
+
+
+@recipe(length=(0.14, 0.26))
+def _store(draw: Draw, plan: Planform, share: float, *, length) -> Part:
+    """A tank or missile under the right wing, or at its tip."""
+    x, y, z, chord = plan.at(share)
+    store = ellipsoid((0.022, 0.022, length), (x, y - 0.026 * (share < 1), z - 0.4 * chord), 8, 6)
+    if share < 1:
+        store += box((0.01, 0.03, 0.06), (x, y - 0.012, z - 0.45 * chord))
+    return store
+
+
+@recipe(
+    radius=(0.05, 0.075),
+    high=0.55,
+    tall=(0.95, 1.2),
+    nose=(0.1, 0.2),
+    tail_start=(0.5, 0.66),
+    upsweep=(0.3, 0.8),
+    exponent=[2.0, 2.0, 2.6, 4.0],
+)
+def turboprop(draw: Draw, *, radius, high, **form) -> Part:
     """A twin or four-engined propeller plane."""
-    radius, high = draw(0.05, 0.075), draw.maybe(0.55)
-    form = draw.measures(tall=(0.95, 1.2), nose=(0.1, 0.2), tail_start=(0.5, 0.66), upsweep=(0.3, 0.8))
-    plane = fuselage(radius, **form, droop=0.2, exponent=draw.pick((2.0, 2.0, 2.6, 4.0)))
-    size = draw.measures(half=(0.48, 0.62), root=(0.11, 0.16), tip=(0.05, 0.1), sweep_deg=(0, 6), dihedral_deg=(0, 6))
-    plan = Planform(**size, z=draw(0.08, 0.18), y=0.85 * radius if high else -0.65 * radius)
+    plane = fuselage(radius, **form, droop=0.2)
+    size = draw.measures(
+        half=(0.48, 0.62),
+        root=(0.11, 0.16),
+        tip=(0.05, 0.1),
+        sweep_deg=(0, 6),
+        dihedral_deg=(0, 6),
+        z=(0.08, 0.18),
+    )
+    plan = Planform(**size, y=0.85 * radius if high else -0.65 * radius)
     plane += plan.wing()
     two = draw.maybe(0.65)
-    thick, blades, disc = draw(0.02, 0.03), draw.count(2, 6), draw(0.07, 0.1)
+    thick = draw(0.02, 0.03)
+    blades = draw.count(2, 6)
+    disc = draw(0.07, 0.1)
     for share in (draw(0.26, 0.34),) if two else (0.27, 0.56):
-        x, y, z, chord = plan.at(share)
-        long = chord + draw(0.08, 0.13)
-        y = y - 0.2 * thick
-        body = pod(thick, long).moved(x, y, z - 0.5 * long + 0.075)
-        plane += (body + propeller(draw, disc, blades, hub=0.55 * thick).moved(x, y, z + 0.075)).both_sides()
+        plane += _propeller_engine(draw, plan, share, thick, draw(0.08, 0.13), disc, blades).both_sides()
     kind = {"T": 2, "conventional": 2, "cross": 0.7} if high else {"conventional": 3, "twin": 1.2, "T": 0.6}
     plane += tail(draw, draw.pick(kind), radius, swept=draw.maybe(0.5))
     if draw.maybe(0.2):
@@ -318,61 +396,107 @@ def turboprop(draw: Draw) -> Part:
     return plane
 
 
-def light_plane(draw: Draw) -> Part:
+def _propeller_engine(
+    draw: Draw, plan: Planform, share: float, thick: float, longer: float, disc: float, blades: int
+) -> Part:
+    """A pod with a propeller on the right wing: `longer` than the chord, `thick` in radius."""
+    x, y, z, chord = plan.at(share)
+    long = chord + longer
+    y = y - 0.2 * thick
+    body = pod(thick, long).moved(x, y, z - 0.5 * long + 0.075)
+    return body + propeller(draw, disc, blades, hub=0.55 * thick).moved(x, y, z + 0.075)
+
+
+@recipe(
+    radius=(0.065, 0.085),
+    high=0.55,
+    pusher=0.1,
+    tall=(1.05, 1.35),
+    nose=(0.08, 0.22),
+    nose_power=(2.0, 3.2),
+    tail_start=(0.36, 0.48),
+    upsweep=(0.0, 0.4),
+    tail_radius=(0.15, 0.3),
+    exponent=(2.0, 4.5),
+)
+def light_plane(draw: Draw, *, radius, high, pusher, **form) -> Part:
     """A single-engined light plane; sometimes on floats."""
-    radius, high, pusher = draw(0.065, 0.085), draw.maybe(0.55), draw.maybe(0.1)
-    form = draw.measures(tall=(1.05, 1.35), nose=(0.08, 0.22), nose_power=(2.0, 3.2), tail_start=(0.36, 0.48))
-    form |= draw.measures(upsweep=(0.0, 0.4), tail_radius=(0.15, 0.3), exponent=(2.0, 4.5))
     tall = 1.2 * radius
     size = draw.measures(half=(0.5, 0.72), root=(0.14, 0.2), tip=(0.09, 0.14), sweep_deg=(0, 4))
-    dihedral, z = draw(0, 3) if high else draw(3, 8), draw(0.16, 0.24)
-    y = tall * draw(1.05, 1.2) if high else -0.7 * tall
-    shape = draw.pick(("straight", "straight", "elliptic", "kinked"))
-    plan = Planform(**size, dihedral_deg=dihedral, z=z, y=y, shape=shape)
+    size["dihedral_deg"] = draw(0, 3) if high else draw(3, 8)
+    size["z"] = draw(0.16, 0.24)
+    size["y"] = tall * draw(1.05, 1.2) if high else -0.7 * tall
+    plan = Planform(**size, shape=draw.pick(["straight", "straight", "elliptic", "kinked"]))
     plane = fuselage(radius, **form) + plan.wing()
-    cabin = box((1.5 * radius, 1.1 * tall, 0.2), (0, 0.62 * tall, 0.14), 0.03)
-    plane += cabin if high else canopy(1.5 * radius, 1.3 * tall, draw(0.24, 0.36), 0.72 * tall, 0.1)
+    if high:
+        plane += box((1.5 * radius, 1.1 * tall, 0.2), (0, 0.62 * tall, 0.14), 0.03)
+    else:
+        plane += canopy(1.5 * radius, 1.3 * tall, draw(0.24, 0.36), 0.72 * tall, 0.1)
     plane += propeller(draw, draw(0.11, 0.16), draw.count(2, 3), hub=0.025).moved(z=-0.515 if pusher else 0.497)
-    swept, kind = draw.maybe(0.5), draw.pick({"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5})
-    plane += tail(draw, kind, radius, swept)
+    swept = draw.maybe(0.5)
+    plane += tail(draw, draw.pick({"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5}), radius, swept)
     if high and draw.maybe(0.6):
         x, y, z, chord = plan.at(draw(0.4, 0.6))
-        plane += bar((0.6 * radius, -0.6 * tall, z - 0.4 * chord), (x, y, z - 0.4 * chord), 0.018, 0.01).both_sides()
-    if draw.maybe(0.12):  # floats
-        x, y = 2.2 * radius, -tall - draw(0.08, 0.11)
-        hull = fuselage(0.035, nose=0.25, nose_power=1.8, tail_start=0.5, upsweep=0.9, length=draw(0.65, 0.8))
-        plane += hull.moved(x, y, 0.12).both_sides()
-        for z in (0.24, 0.02):
-            end = (x, y + 0.02, z)
-            plane += (bar((0.5 * radius, -0.6 * tall, z), end, 0.016) + bar((0.0, *end[1:]), end, 0.012)).both_sides()
-        return plane
+        z = z - 0.4 * chord
+        plane += bar((0.6 * radius, -0.6 * tall, z), (x, y, z), 0.018, 0.01).both_sides()
+    if draw.maybe(0.12):
+        return plane + _floats(draw, radius, tall)
     if draw.maybe(0.75):
         main_z, other_z = (0.03, 0.4) if draw.maybe(0.6) else (0.25, -0.46)
         plane += gear(tall, tall + draw(0.05, 0.09), 2.0 * radius, main_z, other_z)
     return plane
 
 
-def glider(draw: Draw) -> Part:
+@recipe(drop=(0.08, 0.11), length=(0.65, 0.8))
+def _floats(draw: Draw, radius: float, tall: float, *, drop, length) -> Part:
+    x = 2.2 * radius
+    y = -tall - drop
+    hull = fuselage(0.035, nose=0.25, nose_power=1.8, tail_start=0.5, upsweep=0.9, length=length)
+    part = hull.moved(x, y, 0.12).both_sides()
+    for z in (0.24, 0.02):
+        end = (x, y + 0.02, z)
+        part += (bar((0.5 * radius, -0.6 * tall, z), end, 0.016) + bar((0.0, *end[1:]), end, 0.012)).both_sides()
+    return part
+
+
+@recipe(radius=(0.042, 0.055))
+def glider(draw: Draw, *, radius) -> Part:
     """A sailplane: a slender pod and boom under very long wings."""
-    radius = draw(0.042, 0.055)
     plane = fuselage(radius, 1.25, 0.26, 1.8, tail_start=0.33, tail_power=0.75, tail_radius=0.22, upsweep=0.1)
-    size = draw.measures(half=(0.9, 1.35), root=(0.085, 0.12), tip=(0.03, 0.055), sweep_deg=(0, 3), dihedral_deg=(2, 6))
-    y = draw(0.3, 0.9) * radius
-    plan = Planform(**size, z=0.16, y=y, shape=draw.pick(("straight", "elliptic", "kinked")))
+    size = draw.measures(
+        half=(0.9, 1.35),
+        root=(0.085, 0.12),
+        tip=(0.03, 0.055),
+        sweep_deg=(0, 3),
+        dihedral_deg=(2, 6),
+        y=(0.3, 0.9),
+        shape=["straight", "elliptic", "kinked"],
+    )
+    size["y"] *= radius
+    plan = Planform(**size, z=0.16)
     plane += plan.wing() + canopy(1.5 * radius, 1.6 * radius, 0.26, 0.75 * radius, 0.27)
     plane += tail(draw, draw.pick({"T": 3, "conventional": 1, "V": 0.5}), 0.9 * radius)
     return plane + (plan.winglets(draw) if draw.maybe(0.4) else Part())
 
 
-def warbird(draw: Draw) -> Part:
+@recipe(radius=(0.058, 0.08), twin=0.35, radial=0.4, tall=(1.1, 1.3))
+def warbird(draw: Draw, *, radius, twin, radial, tall) -> Part:
     """A propeller fighter or a twin-engined bomber of the 1940s."""
-    radius, twin, radial = draw(0.058, 0.08), draw.maybe(0.35), draw.maybe(0.4)
-    tall, nose = draw(1.1, 1.3), 0.07 if radial and not twin else draw(0.12, 0.25)
-    nose_power, tail_start = 3.0 if radial else 2.0, draw(0.4, 0.5)
-    plane = fuselage(radius, tall, nose, nose_power, tail_start, tail_radius=0.15, upsweep=0.35)
-    size = draw.measures(half=(0.5, 0.66), root=(0.19, 0.25), tip=(0.07, 0.12), sweep_deg=(2, 9), dihedral_deg=(3, 7))
-    z, y = draw(0.14, 0.2), draw(-0.8, 0.2) * radius
-    plan = Planform(**size, z=z, y=y, shape=draw.pick(("elliptic", "straight", "gull")))
+    nose = 0.07 if radial and not twin else draw(0.12, 0.25)
+    nose_power = 3.0 if radial else 2.0
+    plane = fuselage(radius, tall, nose, nose_power, draw(0.4, 0.5), tail_radius=0.15, upsweep=0.35)
+    size = draw.measures(
+        half=(0.5, 0.66),
+        root=(0.19, 0.25),
+        tip=(0.07, 0.12),
+        sweep_deg=(2, 9),
+        dihedral_deg=(3, 7),
+        z=(0.14, 0.2),
+        y=(-0.8, 0.2),
+        shape=["elliptic", "straight", "gull"],
+    )
+    size["y"] *= radius
+    plan = Planform(**size)
     plane += plan.wing()
     plane += canopy(0.95 * radius, 1.2 * radius, draw(0.16, 0.34), 1.05 * radius, draw(-0.02, 0.1))
     disc = draw(0.12, 0.16)
@@ -388,20 +512,21 @@ def warbird(draw: Draw) -> Part:
     return plane
 
 
-def biplane(draw: Draw) -> Part:
+@recipe(radius=(0.06, 0.075), exponent=(2, 5), gap=(0.16, 0.22), stagger=(-0.03, 0.1), triplane=0.2)
+def biplane(draw: Draw, *, radius, exponent, gap, stagger, triplane) -> Part:
     """A biplane, or rarely a triplane, with struts and fixed gear."""
-    radius = draw(0.06, 0.075)
-    plane = fuselage(radius, 1.2, 0.06, 3.0, tail_start=0.35, tail_radius=0.2, exponent=draw(2, 5))
-    gap, stagger = draw(0.16, 0.22), draw(-0.03, 0.1)
-    decks = 3 if draw.maybe(0.2) else 2
-    chord, half = draw(0.13, 0.18) * (0.8 if decks == 3 else 1), draw(0.42, 0.58)
-    z, low, shape = draw(0.24, 0.3), -0.9 * radius, draw.pick(("straight", "elliptic"))
+    plane = fuselage(radius, 1.2, 0.06, 3.0, tail_start=0.35, tail_radius=0.2, exponent=exponent)
+    chord = draw(0.13, 0.18) * (0.8 if triplane else 1)
+    half = draw(0.42, 0.58)
+    z = draw(0.24, 0.3)
+    shape = draw.pick(["straight", "elliptic"])
     plans = []
-    for t in np.linspace(0, 1, decks):
-        reach, y = half * (1 if t == 1 else draw(0.85, 1.0)), low + t * (gap + radius)
+    for t in np.linspace(0, 1, 3 if triplane else 2):
+        reach = half * (1 if t == 1 else draw(0.85, 1.0))
+        y = -0.9 * radius + t * (gap + radius)
         plans.append(Planform(reach, chord, 0.9 * chord, 0, 1.5, z + t * stagger, y, shape=shape))
         plane += plans[-1].wing()
-    bottom, top = plans[0], plans[-1]
+    bottom, *_, top = plans
     for share in (0.75,) if draw.maybe(0.5) else (0.45, 0.85):
         x = share * bottom.half
         (_, y0, z0, c0), (_, y1, z1, c1) = (plan.at(x / plan.half) for plan in (bottom, top))
@@ -413,5 +538,13 @@ def biplane(draw: Draw) -> Part:
     return plane + gear(radius, 2.6 * radius, main_x=0.11, main_z=0.27, other_z=-0.46)
 
 
-KINDS = {airliner: 4.0, business_jet: 1.5, turboprop: 2.0, light_plane: 3.0, glider: 1.0, fighter: 3.0, warbird: 1.5}
-KINDS |= {biplane: 0.8}
+KINDS = {
+    airliner: 4.0,
+    business_jet: 1.5,
+    turboprop: 2.0,
+    light_plane: 3.0,
+    glider: 1.0,
+    fighter: 3.0,
+    warbird: 1.5,
+    biplane: 0.8,
+}

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from .draw import Draw, points, rectangle, rounded_path
+from .draw import Draw, points, recipe, rectangle, rounded_path
 from .parts import Part, bar, box, crossbar, join, loft, revolve, slab, wing
 
 TYRE = 0.22  # width of the wheels
@@ -35,43 +35,65 @@ _KINDS = {
 
 def car(draw: Draw, kind: str) -> Part:
     """A car of one of the kinds of `_KINDS`."""
-    limits = zip(_FIELDS, *_KINDS[kind][1:], strict=True)
-    body = SimpleNamespace(**{name: draw(*both) for name, *both in limits}, has_bed=kind == "pickup")
+    _, least, greatest = _KINDS[kind]
+    limits = dict(zip(_FIELDS, zip(least, greatest, strict=True), strict=True))
+    body = SimpleNamespace(**draw.measures(**limits), has_bed=kind == "pickup")
     body.shoulder = max(body.belt * body.height, 2 * body.wheel + 0.15)  # height of the shoulder line, above the wheels
     body.axles = body.wheel + 0.48, body.length - body.wheel - 0.44  # their distances from the front bumper
     part = _hull(body)
 
-    x, y, dish = (body.width - TYRE) / 2 - 0.02, body.wheel, draw(0.1, 0.6)
+    x = (body.width - TYRE) / 2 - 0.02
+    y = body.wheel
+    dish = draw(0.1, 0.6)
     rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])  # of a wheel with a dished hub
     profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
     pair = revolve(profile).rotated("z", 90).moved(x, y).both_sides() + crossbar((-x, y, 0), 0.1)
     part += join(pair.moved(z=body.length / 2 - s) for s in body.axles)
 
-    half, y, z = body.width / 2, body.shoulder + 0.07, (0.5 - body.bonnet) * body.length - 0.2
+    half = body.width / 2
+    y = body.shoulder + 0.07
+    z = (0.5 - body.bonnet) * body.length - 0.2
     mirror = box((draw(0.14, 0.22), draw(0.09, 0.16), 0.08), (half + 0.07, y, z), 0.03)
     part += (mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)).both_sides()
-    if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):  # a roof box on two bars
-        start, end, half = body.bonnet + body.screen, body.roof, 0.35 * body.width
-        half -= 0.5 * body.lean * (body.height - body.shoulder)
-        z, long = (0.5 - (start + end) / 2) * body.length, 0.8 * (end - start) * body.length
-        part += join(box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1))
-        outline = rectangle(draw(1.0, 1.8) * half, long, 0.2, 3)
-        part += slab(outline, draw(0.18, 0.35), 0.1).moved(y=body.height + 0.05, z=z)
-    if kind == "coupe" and draw.maybe(0.5):  # a spoiler on two stays
-        half, z, high = 0.42 * body.width, draw(0.15, 0.4) - body.length / 2, draw(0.1, 0.3)
-        y = body.shoulder + high
-        stay = box((0.05, high + 0.3, 0.14), (0.7 * half, y - high / 2 - 0.13, z - 0.13))
-        part += wing([(-half, y, z, 0.3, 0.12), (half, y, z, 0.3, 0.12)]) + stay.both_sides()
+    if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):
+        part += _roof_box(draw, body)
+    if kind == "coupe" and draw.maybe(0.5):
+        part += _spoiler(draw, body)
     return part
+
+
+@recipe(width=(1.0, 1.8), tall=(0.18, 0.35))
+def _roof_box(draw: Draw, body: SimpleNamespace, *, width, tall) -> Part:
+    """A box on two bars across the roof."""
+    start = body.bonnet + body.screen
+    half = 0.35 * body.width - 0.5 * body.lean * (body.height - body.shoulder)
+    z = (0.5 - (start + body.roof) / 2) * body.length
+    long = 0.8 * (body.roof - start) * body.length
+    bars = (box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1))
+    top = slab(rectangle(width * half, long, 0.2, 3), tall, 0.1).moved(y=body.height + 0.05, z=z)
+    return join(bars) + top
+
+
+@recipe(inset=(0.15, 0.4), high=(0.1, 0.3))
+def _spoiler(draw: Draw, body: SimpleNamespace, *, inset, high) -> Part:
+    """A small wing on two stays over the boot."""
+    half = 0.42 * body.width
+    z = inset - body.length / 2
+    y = body.shoulder + high
+    stay = box((0.05, high + 0.3, 0.14), (0.7 * half, y - high / 2 - 0.13, z - 0.13))
+    return wing([(-half, y, z, 0.3, 0.12), (half, y, z, 0.3, 0.12)]) + stay.both_sides()
 
 
 def _hull(body: SimpleNamespace) -> Part:
     """The body: cross-sections from front to rear, with the wheel arches cut into their lower corners."""
-    length, belt, boot = body.length, body.shoulder, min(body.window * body.length, body.length - 0.12)
+    length = body.length
+    belt = body.shoulder
+    boot = min(body.window * length, length - 0.12)
     bed = (boot + 0.06, length - 0.08) if body.has_bed else (length, length)  # start and end of the open box
 
     # The upper edge of the body seen from the side: distance from the front bumper, and height.
-    cowl, roof_rear = body.bonnet * length, body.roof * length
+    cowl = body.bonnet * length
+    roof_rear = body.roof * length
     roof_front = cowl + body.screen * length
     side_view = [(0, 0.75 * belt), (0.06, 0.9 * belt), (0.22, belt), (cowl, belt + 0.08), (roof_front, body.height)]
     side_view += [((roof_front + roof_rear) / 2, body.height + 0.015), (roof_rear, body.height - 0.02)]
@@ -88,7 +110,8 @@ def _hull(body: SimpleNamespace) -> Part:
     s = s[np.append(True, np.diff(s) > 0.004)]
 
     # Heights and half widths of each cross-section, all [S].
-    to_front, to_rear = s / length, 1 - s / length
+    to_front = s / length
+    to_rear = 1 - s / length
     top = np.interp(s, *line.T)
     width = body.width / 2 * (1 - 0.15 * np.clip(1 - to_front / 0.18, 0, 1) ** 2)
     width = width * (1 - 0.06 * np.clip(1 - to_rear / 0.15, 0, 1) ** 2)
@@ -102,7 +125,8 @@ def _hull(body: SimpleNamespace) -> Part:
     middle = np.maximum(0.55 * floor + 0.45 * shoulder, 0.5 * (cut + shoulder))
     edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)  # rim of the roof
     roof = np.maximum(0.96 * width - 0.03 - body.lean * (edge - shoulder), 0.45 * width)
-    rim, bottom = shoulder + 0.02, np.full_like(s, belt - 0.38)  # heights of the bed
+    rim = shoulder + 0.02  # of the bed
+    bottom = np.full_like(s, belt - 0.38)  # of the bed
     hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))  # the wheel arch seen from the bed
 
     # The right half of each cross-section: points (x, y) from the middle of the floor outwards and up to the middle.
@@ -115,7 +139,9 @@ def _hull(body: SimpleNamespace) -> Part:
     bed_y = [rim, rim - 0.01, hump, hump - 0.001, bottom, bottom]
     upper = np.where((bed[0] < s) & (s < bed[1]), [bed_x, bed_y], [cabin_x, cabin_y])
     x, y = np.concatenate([[lower_x, lower_y], upper], 1).transpose(0, 2, 1)  # [S, 12]
-    x, y = np.c_[x, -x[:, -2:0:-1]], np.c_[y, y[:, -2:0:-1]]
+    left = slice(-2, 0, -1)  # the mirrored points, without those in the plane of symmetry
+    x = np.c_[x, -x[:, left]]
+    y = np.c_[y, y[:, left]]
     return loft(points(x, y, (length / 2 - s)[:, None]))
 
 

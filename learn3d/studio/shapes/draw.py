@@ -3,8 +3,11 @@
 Outlines are closed curves [N, 2], counter-clockwise, star-shaped about their mean.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,15 +15,31 @@ Point = Sequence[float] | np.ndarray  # (x, y, z); in a profile (radius, y)
 
 
 class Draw(np.random.Generator):
-    """Random numbers and choices: `width = draw(0.4, 0.5)`, `if draw.maybe(0.3)`."""
+    """Random numbers and choices: `width = draw(0.4, 0.5)`, `if draw.maybe(0.3)`.
+
+    A *space* says what can be drawn: a pair (least, greatest) a number between them; a range a whole number of it; a
+    list one of its items; a dict one of its keys, in proportion to the values; a probability True or False.
+    """
 
     def __call__(self, least: float, greatest: float) -> float:
         """A random number in [least, greatest)."""
         return self.uniform(least, greatest)
 
-    def measures(self, **ranges: tuple[float, float]) -> dict[str, float]:
-        """A random number for each named range (least, greatest)."""
-        return {name: self(*limits) for name, limits in ranges.items()}
+    def of(self, space: Any) -> Any:
+        """A random value of a space."""
+        if isinstance(space, Perhaps):
+            return self.of(space.space) if self.maybe(space.probability) else space.otherwise
+        if isinstance(space, tuple):
+            return self(*space)
+        if isinstance(space, range):
+            return self.count(space[0], space[-1])
+        if isinstance(space, float):
+            return self.maybe(space)
+        return self.pick(space)
+
+    def measures(self, **spaces: Any) -> dict[str, Any]:
+        """A random value of each named space, in this order."""
+        return {name: self.of(space) for name, space in spaces.items()}
 
     def count(self, least: int, greatest: int) -> int:
         """A random whole number from `least` to `greatest`, both included."""
@@ -30,11 +49,49 @@ class Draw(np.random.Generator):
         """True with the given probability."""
         return self.random() < probability
 
-    def pick(self, options: dict[Any, float] | Sequence, weights: Sequence[float] = ()) -> Any:
-        """One of the options, in proportion to the weights or to a dict's values, else with equal probability."""
-        weights = weights or (list(options.values()) if isinstance(options, dict) else np.ones(len(options)))
+    def pick(self, options: dict[Any, float] | list) -> Any:
+        """One of the options: of a list with equal probability, of a dict's keys in proportion to the values."""
+        weights = list(options.values()) if isinstance(options, dict) else np.ones(len(options))
         ends = np.cumsum(weights)
-        return tuple(options)[np.searchsorted(ends, self.random() * ends[-1], side="right")]
+        return list(options)[np.searchsorted(ends, self.random() * ends[-1], side="right")]
+
+
+class Perhaps(NamedTuple):
+    """The space of a measure that is drawn from `space` with a probability, and else is `otherwise`."""
+
+    probability: float
+    space: Any
+    otherwise: float | None = 0.0
+
+
+def recipe(**spaces: Any) -> Callable[[Callable], Callable]:
+    """A decorator of `make(draw, ..., *, <names>)`, whose keyword arguments are the named random measures.
+
+    They are drawn in this order, before the body draws others. A measure that the caller gives is not drawn.
+
+    >>> @recipe(width=(0.3, 0.45), arms=0.5)
+    ... def seat(draw: Draw, *, width: float, arms: bool): ...
+    """
+
+    def decorate(make: Callable) -> Callable:
+        @functools.wraps(make)
+        def with_measures(draw: Draw, *args: Any, **given: Any) -> Any:
+            missing = {name: space for name, space in spaces.items() if name not in given}
+            return make(draw, *args, **given, **draw.measures(**missing))
+
+        return with_measures
+
+    return decorate
+
+
+def shares(count: int) -> np.ndarray:
+    """`count` numbers from 0 to 1, equally spaced."""
+    return np.linspace(0, 1, count)
+
+
+def spread(half: float, count: int) -> np.ndarray:
+    """`count` places that divide the distance from -half to half into equal parts."""
+    return np.linspace(-half, half, count + 2)[1:-1]
 
 
 def points(x: float | np.ndarray, y: float | np.ndarray, z: float | np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from .draw import Point, ellipse, inset, points, rectangle
 
 CIRCLE = ellipse(2.0, 2.0, 8)
-Z = (0.0, 0.0, 1.0)
+X, Y, Z = np.eye(3)
 
 # Thin bars get extra rings: a voxelizer that casts rays on a 32^3 grid misses bars between two grid lines, but it also
 # marks the cell of every vertex. Both lengths are in units of the longest side of the shape.
@@ -162,8 +162,15 @@ def tube(
 def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = Z) -> Part:
     """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
     if height is None:
-        return tube([start, end], 1.0, ellipse(width, width, 6), side=side)
-    return tube([start, end], 1.0, rectangle(width, height, segments=int(max(width, height) > 0.04)), side=side)
+        section = ellipse(width, width, 6)
+    else:
+        section = rectangle(width, height, segments=int(max(width, height) > 0.04))
+    return tube([start, end], 1.0, section, side=side)
+
+
+def strip(path: ArrayLike, width: float, height: float, scale: ArrayLike = 1.0, side: Point = Z) -> Part:
+    """A flat bar along a path: its section is `width` (along `side`) by `height`, times `scale` (a number or [P])."""
+    return tube(path, scale, rectangle(width, height, segments=1), side=side)
 
 
 def crossbar(start: Point, width: float, height: float | None = None) -> Part:

@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from .draw import Draw, ellipse, points
-from .parts import Part, bar, between, crossbar, join, sheet, slab
+from .draw import Draw, ellipse, points, recipe, shares
+from .parts import Part, X, bar, between, crossbar, join, sheet, slab
 from .supports import feet, legs, loops, panels
 
 
@@ -15,26 +15,33 @@ def _cushions(lower: tuple[float, float, float], upper: tuple[float, float, floa
     return join(between((left + 0.008, *lower[1:]), (right - 0.008, *upper[1:]), 0.05) for left, right in edges)
 
 
-def upholstered(draw: Draw, seats: int = 0) -> Part:
-    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaning back, perhaps arms.
-
-    seats 0: a random number from two to four.
-    """
-    seats = seats or draw.pick({2: 3, 3: 4, 4: 1})
-    half, depth = seats * draw(0.27, 0.36), draw(0.75, 1.0)
-    foot, seat, high = draw(0.05, 0.16), draw(0.36, 0.46), draw(0.66, 0.95 if seats > 1 else 1.1)
-    back, lean, soft = draw(0.14, 0.24), draw(0, 12), draw(0.02, 0.06)
-    front, rear, low = depth / 2, -depth / 2, seat - draw(0.1, 0.17)
+@recipe(
+    seats={2: 3, 3: 4, 4: 1},
+    half=(0.27, 0.36),
+    depth=(0.75, 1.0),
+    foot=(0.05, 0.16),
+    seat=(0.36, 0.46),
+)
+def upholstered(draw: Draw, *, seats, half, depth, foot, seat) -> Part:
+    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaning back, perhaps arms."""
+    half *= seats
+    high = draw(0.66, 0.95 if seats > 1 else 1.1)
+    back = draw(0.14, 0.24)
+    lean = draw(0, 12)
+    soft = draw(0.02, 0.06)
+    low = seat - draw(0.1, 0.17)
+    front = depth / 2
+    rear = -depth / 2
     part = between((-half, foot, rear), (half, low + 0.005, front - 0.03), 0.02)
-    part += _cushions((-half, low, rear + 0.7 * back), (half, seat, front), draw.pick((1, seats, seats)))
+    part += _cushions((-half, low, rear + 0.7 * back), (half, seat, front), draw.pick([1, seats, seats]))
     upright = between((-half, low - 0.1, rear), (half, high, rear + back), soft)
     if draw.maybe(0.5):
         top = high + draw(-0.08, 0.08)
         upright += _cushions((-half, seat - 0.05, rear + 0.4 * back), (half, top, rear + 1.6 * back), seats)
     if seats == 1 and high > 0.8 and draw.maybe(0.35):  # wings
-        t = np.linspace(0, 1, 6)[:, None]
+        t = shares(6)[:, None]
         reach = draw(0.18, 0.3) * np.sin(np.pi * (0.12 + 0.8 * t)) ** 0.7
-        z = rear + back - 0.06 + np.linspace(0, 1, 4)[None] * (reach + 0.06)
+        z = rear + back - 0.06 + shares(4)[None] * (reach + 0.06)
         y = seat + 0.1 + t * (high - seat - 0.1)
         upright += sheet(points(half - 0.03, y, z), draw(0.04, 0.08)).both_sides()
     part += upright.rotated("x", -lean, (0, low, rear + back))
@@ -46,26 +53,40 @@ def upholstered(draw: Draw, seats: int = 0) -> Part:
     level = seat + 0.06 if kind == "low" else min(draw(0.52, 0.68), high - 0.03)
     arm = between((half - 0.01, foot, rear), (half + wide, level, front - 0.01), soft)
     if kind == "rolled":
-        x, y = half + 0.5 * wide, level - 0.05
-        arm += bar((x, y, rear + 0.02), (x, y, front), 1.3 * wide, 1.3 * wide)
+        x = half + 0.5 * wide
+        arm += bar((x, level - 0.05, rear + 0.02), (x, level - 0.05, front), 1.3 * wide, 1.3 * wide)
     return part + arm.both_sides()
 
 
-def corner_sofa(draw: Draw) -> Part:
+@recipe(
+    half=(1.05, 1.5),
+    depth=(0.8, 0.98),
+    reach=(1.4, 2.3),
+    foot=(0.04, 0.12),
+    seat=(0.38, 0.44),
+    high=(0.7, 0.9),
+    back=(0.16, 0.24),
+    arm=(0.1, 0.2),
+    wing=(0.75, 0.95),
+    level=(0.52, 0.66),
+    count=[2, 3],
+    chaise=0.5,
+    side=[1.0, -1.0],
+)
+def corner_sofa(
+    draw: Draw, *, half, depth, reach, foot, seat, high, back, arm, wing, level, count, chaise, side
+) -> Part:
     """An L-shaped sofa: a long side along x, and a chaise or a second side towards +z, left or right."""
-    half, depth, reach = draw(1.05, 1.5), draw(0.8, 0.98), draw(1.4, 2.3)
-    foot, seat, high = draw(0.04, 0.12), draw(0.38, 0.44), draw(0.7, 0.9)
-    back, arm, wing = draw(0.16, 0.24), draw(0.1, 0.2), draw(0.75, 0.95)
-    low, level, inner = seat - 0.14, draw(0.52, 0.66), half - wing
+    low = seat - 0.14
+    inner = half - wing
     sofa = between((-half, foot, 0), (half, low + 0.005, depth), 0.02)
     sofa += between((inner, foot, 0.3), (half, low + 0.005, reach), 0.02)
     sofa += between((-half, low - 0.08, 0), (half, high, back), 0.04)
     sofa += between((inner + 0.01, low, back - 0.05), (half - 0.005, seat, reach), 0.04)
     sofa += between((-half - arm, foot, 0), (-half + 0.01, level, depth), 0.04)
-    count = draw.pick((2, 3))
     sofa += _cushions((-half, low, back - 0.05), (inner, seat, depth), count)
     sofa += _cushions((-half, seat - 0.02, back - 0.06), (inner, high + 0.03, back + 0.14), count)
-    if draw.maybe(0.5):  # a chaise, open towards its end
+    if chaise:  # open towards its end
         sofa += between((half - 0.01, foot, 0), (half + arm, level, depth), 0.04)
     else:  # a second side, with the back around the corner
         sofa += between((half - back, low - 0.08, 0), (half, high, reach), 0.04)
@@ -73,19 +94,31 @@ def corner_sofa(draw: Draw) -> Part:
     leg = slab(ellipse(0.08, 0.08, 10), foot + 0.02)
     for x, z in ((-half, 0), (-half, depth), (half, 0), (half, reach), (inner, reach)):
         sofa += leg.moved(x=x + (0.08 if x < half else -0.08), z=z + (0.08 if z == 0 else -0.08))
-    return sofa.scaled(x=draw.pick((1.0, -1.0)))
+    return sofa.scaled(x=side)
 
 
-def settee(draw: Draw) -> Part:
+@recipe(
+    seats={2: 3, 3: 2},
+    half=(0.26, 0.34),
+    depth=(0.62, 0.82),
+    size=(0.03, 0.06),
+    seat=(0.38, 0.46),
+    high=(0.72, 0.95),
+    rest=(0.56, 0.66),
+    sink=(0.08, 0.15),
+    support={legs: 3, loops: 2, panels: 1},
+)
+def settee(draw: Draw, *, seats, half, depth, size, seat, high, rest, sink, support) -> Part:
     """Cushions on an open frame of wood or metal."""
-    seats = draw.pick({2: 3, 3: 2})
-    half, depth, size = seats * draw(0.26, 0.34), draw(0.62, 0.82), draw(0.03, 0.06)
-    seat, high, rest = draw(0.38, 0.46), draw(0.72, 0.95), draw(0.56, 0.66)
-    low, front, rear = seat - draw(0.08, 0.15), depth / 2, -depth / 2
-    sofa = draw.pick({legs: 3, loops: 2, panels: 1})(draw, half - 0.02, 0.85 * front, low)
+    half *= seats
+    low = seat - sink
+    front = depth / 2
+    rear = -depth / 2
+    sofa = support(draw, half - 0.02, 0.85 * front, low)
     sofa += between((-half, low - 0.05, rear + 0.03), (half, low + 0.01, front - 0.03), 0.01)
     sofa += _cushions((-half, low, rear + 0.04), (half, seat, front), seats)
-    lean, hinge, z = draw(5, 16), (0, low, rear + 0.06), rear + 0.04
+    lean = draw(5, 16)
+    z = rear + 0.04
     frame = bar((half - 0.03, low - 0.04, z), (half - 0.03, high, z), size, size).both_sides()
     frame += crossbar((-half, high - 0.02, z), size, 1.3 * size)
     if draw.maybe(0.55):
@@ -93,28 +126,39 @@ def settee(draw: Draw) -> Part:
     else:
         for x in np.linspace(-half + 0.03, half - 0.03, draw.count(7, 13))[1:-1]:
             frame += bar((x, low - 0.02, z), (x, high, z), 0.4 * size, 0.8 * size)
-    sofa += frame.rotated("x", -lean, hinge)
+    sofa += frame.rotated("x", -lean, (0, low, rear + 0.06))
     if draw.maybe(0.75):
-        x, start = half - 0.02, z - np.tan(np.radians(lean)) * (rest - low)
-        arm = bar((x, rest, start), (x, rest, front - 0.03), 1.6 * size, 0.8 * size, side=(1, 0, 0))
+        x = half - 0.02
+        start = z - np.tan(np.radians(lean)) * (rest - low)
+        arm = bar((x, rest, start), (x, rest, front - 0.03), 1.6 * size, 0.8 * size, side=X)
         sofa += (arm + bar((x, low - 0.03, front - 0.08), (x, rest, front - 0.08), size, size)).both_sides()
     return sofa
 
 
-def curved_sofa(draw: Draw) -> Part:
+@recipe(
+    half=(0.7, 1.25),
+    depth=(0.75, 0.95),
+    seat=(0.36, 0.44),
+    foot=(0.04, 0.14),
+    high=(0.66, 0.85),
+    thick=(0.1, 0.2),
+    turn_deg=(75, 92),
+    power=(0.5, 0.8),
+    fall=(0, 0.25),
+    bulge=(-0.1, 0.1),
+)
+def curved_sofa(draw: Draw, *, half, depth, seat, foot, high, thick, turn_deg, power, fall, bulge) -> Part:
     """A sofa on an arc, or a tub sofa: the back continues into the arms."""
-    half, depth, seat = draw(0.7, 1.25), draw(0.75, 0.95), draw(0.36, 0.44)
-    foot, high, thick = draw(0.04, 0.14), draw(0.66, 0.85), draw(0.1, 0.2)
-    turn = np.radians(draw(75, 92))
+    turn = np.radians(turn_deg)
     angle = np.linspace(-turn, turn, 31)
     forward = (1 - np.cos(angle)) / (1 - np.cos(turn))  # 0 in the middle of the back, 1 at the ends of the arms
     sine = np.sin(angle) / np.sin(turn)
-    x = (half - thick / 2) * np.sign(sine) * np.abs(sine) ** draw(0.5, 0.8)  # flatter than a circle's arc
+    x = (half - thick / 2) * np.sign(sine) * np.abs(sine) ** power  # flatter than a circle's arc
     z = -depth / 2 + thick / 2 + (depth - thick) * forward
-    y = foot + np.linspace(0, 1, 4)[:, None] * (high - draw(0, 0.25) * forward - foot)
+    y = foot + shares(4)[:, None] * (high - fall * forward - foot)
     wrap = sheet(points(x, y, z), thick)
     edge = np.linspace(x[0], x[-1], 9)[1:-1]
-    front = np.c_[edge, z[0] + draw(-0.1, 0.1) * (1 - (edge / x[0]) ** 2)]
+    front = np.c_[edge, z[0] + bulge * (1 - (edge / x[0]) ** 2)]
     outline = np.r_[front, np.c_[x, z][::-1]][::-1]
     cushion = slab(outline, seat - foot, 0.04).moved(y=foot)
     return wrap + cushion + feet(draw, 0.6 * half, 0.22 * depth, foot + 0.02)
