@@ -35,6 +35,8 @@ def _read(path: Path) -> RawMesh:
     with open_file(path, limits.MESH_FILE_BYTES, "a mesh file") as file, faults_of(path, "a mesh file", advice=""):
         size = os.fstat(file.fileno()).st_size
         sandbox.allow(30 * size, size / 1e6)
+        if not size:
+            raise EOFError("it is empty")
         vertices, faces = _triangles(path, file)
         if not len(faces):
             raise DamagedFile(path, "no faces")

@@ -25,6 +25,8 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
     and ValueError if it needs an extension that is not supported.
     """
     text, binary = _chunks(content) if content[:4] == b"glTF" else (content, None)
+    if not text.rstrip().endswith(b"}"):
+        raise EOFError("its JSON does not end")
     tree = parse_json(text)
     if not str(tree["asset"]["version"]).startswith("2"):
         raise ValueError(f"it is glTF {tree['asset']['version']}; version 2 is read")
@@ -42,16 +44,19 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
             indices = np.arange(len(points))
             if "indices" in primitive:
                 indices = accessors.read(primitive["indices"])[:, 0].astype(np.int64)
-            faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
             if len(indices) and indices.max() >= len(points):
                 raise ValueError(f"a face refers to vertex {indices.max()}, but its mesh has {len(points)}")
-            vertices.append(points @ matrix[:3, :3].T + matrix[:3, 3])
-            total += len(points)
+            used, indices = np.unique(indices, return_inverse=True)  # primitives may share one large array
+            faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
+            vertices.append(points[used] @ matrix[:3, :3].T + matrix[:3, 3])
+            total += len(used)
     return np.concatenate(vertices), np.concatenate(faces)
 
 
 def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
     """The JSON text and the binary chunk of a GLB file."""
+    if len(content) < 12:
+        raise EOFError("its header does not end")
     _, version, length = struct.unpack_from("<4sII", content)
     if version != 2:
         raise ValueError(f"it is glTF {version}; version 2 is read")
@@ -161,16 +166,12 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     """The matrix [4, 4] of a node."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    length = np.sqrt(x * x + y * y + z * z + w * w) or 1.0
-    x, y, z, w = x / length, y / length, z / length, w / length
+    quaternion = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    x, y, z, w = quaternion / (np.linalg.norm(quaternion) or 1.0)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])  # cross @ v is the cross product of (x, y, z) with v
+    turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = node.get("translation", (0, 0, 0))
     return matrix
 

@@ -29,9 +29,10 @@ def read_stl(content: bytes) -> Triangles:
         rows = np.frombuffer(content, "u1", 50 * count, 84).reshape(count, 50)
         corners = rows[:, 12:48].copy().view("<f4").reshape(-1, 3)
     else:
-        lines = re.findall(rb"(?im)^\s*vertex[ \t]+([^\r\n]*)", content.replace(b"\r", b"\n"))
-        facets = len(re.findall(rb"(?im)^\s*facet\b", content.replace(b"\r", b"\n")))
-        if content.lower().rfind(b"endsolid") < content.lower().rfind(b"vertex"):
+        text = content.lower().replace(b"\r", b"\n")
+        lines = re.findall(rb"(?m)^\s*vertex\s+(.*)", text)
+        facets = len(re.findall(rb"(?m)^\s*facet\b", text))
+        if text.rfind(b"endsolid") < text.rfind(b"vertex"):
             raise EOFError("its last solid does not end")
         corners = np.fromstring(b" ".join(lines), sep=" ").reshape(-1, 3)
         if len(corners) != 3 * facets or len(lines) != len(corners):
@@ -80,7 +81,11 @@ def read_ply(content: bytes) -> Triangles:
             elements[-1][2].append((words[-1], ["f8"] * len(types) if kind == "ascii" else types))
     body = content[header.end() :]
     if kind == "ascii":  # as a binary file of doubles
-        body = np.fromstring(body, sep=" ").tobytes()
+        try:
+            numbers = np.fromstring(body, sep=" ")
+        except ValueError:  # the last number may be cut in two
+            numbers = np.fromstring(b" ".join(body.rsplit(None, 1)[:-1]), sep=" ")
+        body = numbers.tobytes()
     vertices, corners, sizes, at = np.empty((0, 3)), np.empty(0, np.int64), np.empty(0, np.int64), 0
     for name, count, properties in elements:
         if name == "tristrips" and count:
@@ -181,7 +186,8 @@ def read_dae(file: BinaryIO) -> Triangles:
             if isinstance(part, collada.lineset.BoundLineSet):
                 continue
             corners = np.asarray(part.vertex_index, np.int64).reshape(-1)
-            sizes = part.polyends - part.polystarts if hasattr(part, "polyends") else np.full(len(part), 3)
+            is_polygons = hasattr(part, "polyindex")  # [P, 2]: first corner, end
+            sizes = np.diff(part.polyindex)[:, 0] if is_polygons else np.full(len(part), 3)
             vertices.append(np.asarray(part.vertex, np.float64))
             faces.append(_cut(vertices[-1], corners, sizes)[1] + total)
             total += len(vertices[-1])
