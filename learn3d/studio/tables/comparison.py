@@ -11,17 +11,18 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from learn3d.config import command_line
+from learn3d.config import TrainConfig, command_line
 from learn3d.data.categories import SYNSETS
 from learn3d.files import limits
 from learn3d.files.reading import read_json
 from learn3d.runs.measurement import HEADERS, Result, figures
-from learn3d.studio.tables.plan import PlannedRun, Request, select_rows
-from learn3d.studio.tables.tables import MEAN, TABLES
+from learn3d.studio.tables.plan import Request, name_run, select_rows, variant_of
+from learn3d.studio.tables.tables import MEAN, TABLES, Row, Table
 
 RESAMPLES = 2000
 Cells = list[list[str]]
 Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
+Runs = Sequence[tuple[TrainConfig, Result]]  # measured runs
 
 NOTES = (
     "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
@@ -64,7 +65,7 @@ def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
 
 
 def make_report(
-    request: Request, runs: Sequence[PlannedRun], results: Mapping[Path, Result]
+    request: Request, runs: Sequence[TrainConfig], results: Mapping[Path, Result]
 ) -> tuple[dict[str, Cells], str]:
     """The tables "main", "differences", "runs", "curves" and, if poses were estimated, "poses"; the report as Markdown.
 
@@ -72,48 +73,86 @@ def make_report(
     results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has no path of a machine.
     """
     table = TABLES[request.table]
-    done = [run for run in runs if run.folder in results]
-    measured: dict[tuple[str | None, str], dict[int, Result]] = {}
-    trained = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
-    curves, commands = [["run", "split", "step", HEADERS[0], "MMD"]], {}
-    for run in done:
-        result, config = results[run.folder], run.config
-        measured.setdefault((run.variant, config.category), {})[config.seed] = result
-        counts = [f"step {result.step}", str(result.iterations), str(config.batch_size), str(result.images)]
-        minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
-        trained.append([run.name, *counts, *figures(vars(result)), minutes, result.commit])
-        for split, step, *values in result.curve:
-            curves.append([run.name, split, str(step), *("-" if v is None else f"{v:.4f}" for v in values)])
-        words = {"data": "DATA", "category": "CATEGORY", "seed": "SEED", "poses": "OUTPUT/poses/CATEGORY-seedSEED.npz"}
-        words["output"] = f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED"
-        commands[command_line(config, **words)] = None
-    categories = list(dict.fromkeys(run.config.category for run in runs))
-    columns = {name: [name] for name in categories} | {MEAN: categories}
-    measures = {"mmd": "mmd"} if table.measure == "mmd" else {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19"}
-    baseline = table.rows[table.baseline].variant
-    main, differences = [["method", "", *columns]], [["method", *columns]]
-    for label, row in select_rows(request).items():
-        ours, theirs = (
-            [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
-            for variant in (row.variant, baseline)
-        )
-        if row.printed:
-            printed = [_format_printed(row.printed, column, categories) for column in columns]
-            main.append([label, f"paper ({row.about})", *printed])
-        if row.variant:
-            main += [[label, f"here ({name})", *(_compare(m, side) for side in ours)] for m, name in measures.items()]
-        if row.variant and row.variant != baseline:
-            pairs = zip(ours, theirs, strict=True)
-            differences.append([label, *(_compare(table.measure, *pair) for pair in pairs)])
-    tables = {"main": main, "differences": differences, "runs": trained, "curves": curves}
-    missing = [run.name for run in runs if run not in done]
-    parts = [f"## {table.title}", _markdown(main), NOTES, *([f"Missing: {', '.join(missing)}."] if missing else [])]
+    done = [(run, results[run.output]) for run in runs if run.output in results]
+    main, differences = _compare_methods(table, select_rows(request), runs, done)
+    trained = _run_rows(done)
+    tables = {"main": main, "differences": differences, "runs": trained, "curves": _curve_rows(done)}
+    parts = [f"## {table.title}", _markdown(main), NOTES]
+    if missing := [name_run(run) for run in runs if run.output not in results]:
+        parts.append(f"Missing: {', '.join(missing)}.")
     parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
     if len(poses := _pose_rows(runs, results)) > 1:
         tables["poses"] = poses
         parts += ["Estimated azimuths of all images, and voxel IoU (kato18) of the trainings:", _markdown(poses)]
+    commands = dict.fromkeys(_general_command(run) for run, _ in done)
     parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *commands, "```"])]
     return tables, "\n\n".join(parts) + "\n"
+
+
+def _compare_methods(
+    table: Table, rows: Mapping[str, Row], runs: Sequence[TrainConfig], done: Runs
+) -> tuple[Cells, Cells]:
+    """Printed and measured values of each row by category, and the differences to the table's baseline."""
+    measured: dict[tuple[str, str], dict[int, Result]] = {}
+    for run, result in done:
+        measured.setdefault((variant_of(run), run.category), {})[run.seed] = result
+    categories = list(dict.fromkeys(run.category for run in runs))
+    columns = {name: [name] for name in categories} | {MEAN: categories}
+
+    def results_of(variant: str) -> list[Side]:
+        """The results of a variant for each column."""
+        return [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
+
+    measures = {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19"}
+    if table.measure == "mmd":
+        measures = {"mmd": "mmd"}
+    baseline = table.rows[table.baseline].variant
+    main = [["method", "", *columns]]
+    differences = [["method", *columns]]
+    for label, row in rows.items():
+        if row.printed:
+            printed = [_format_printed(row.printed, column, categories) for column in columns]
+            main.append([label, f"paper ({row.about})", *printed])
+        if not row.variant:
+            continue
+        ours = results_of(row.variant)
+        for measure, name in measures.items():
+            main.append([label, f"here ({name})", *(_compare(measure, side) for side in ours)])
+        if row.variant != baseline:
+            pairs = zip(ours, results_of(baseline), strict=True)
+            differences.append([label, *(_compare(table.measure, *pair) for pair in pairs)])
+    return main, differences
+
+
+def _run_rows(done: Runs) -> Cells:
+    """A header, and the measures of each run."""
+    rows = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
+    for run, result in done:
+        counts = [f"step {result.step}", str(result.iterations), str(run.batch_size), str(result.images)]
+        minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
+        rows.append([name_run(run), *counts, *figures(vars(result)), minutes, result.commit])
+    return rows
+
+
+def _curve_rows(done: Runs) -> Cells:
+    """A header, and the validations of each run."""
+    rows = [["run", "split", "step", HEADERS[0], "MMD"]]
+    for run, result in done:
+        for split, step, *values in result.curve:
+            rows.append([name_run(run), split, str(step), *("-" if v is None else f"{v:.4f}" for v in values)])
+    return rows
+
+
+def _general_command(run: TrainConfig) -> str:
+    """The command of a run, with words in place of folders, category and seed."""
+    return command_line(
+        run,
+        data="DATA",
+        category="CATEGORY",
+        seed="SEED",
+        poses="OUTPUT/poses/CATEGORY-seedSEED.npz",
+        output=f"OUTPUT/runs/CATEGORY/{variant_of(run)}-seedSEED",
+    )
 
 
 def _format_printed(printed: Mapping[str, float], column: str, categories: Sequence[str]) -> str:
@@ -164,16 +203,17 @@ def read_pose_errors(poses: Path) -> dict[str, float]:
     return read_json(poses.with_suffix(".json"), limits.JSON_BYTES, "the errors of a table of poses")
 
 
-def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[Path, Result]) -> Cells:
+def _pose_rows(runs: Sequence[TrainConfig], results: Mapping[Path, Result]) -> Cells:
     """A header; errors of the estimated poses of each run, and its IoU beside that of the run on known poses."""
-    known = {(r.config.category, r.config.seed): results.get(r.folder) for r in runs if r.config.poses is None}
+    known = {(run.category, run.seed): results.get(run.output) for run in runs if run.poses is None}
     by_category: dict[str, dict[str, Sequence[float]]] = {}
     for run in runs:
-        config, both = run.config, (known.get((run.config.category, run.config.seed)), results.get(run.folder))
-        if config.poses is not None and None not in both:
-            errors, ious = read_pose_errors(config.poses), [result.voxel_iou for result in both]
+        both = known.get((run.category, run.seed)), results.get(run.output)
+        if run.poses is not None and None not in both:
+            errors = read_pose_errors(run.poses)
+            ious = [result.voxel_iou for result in both]
             values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
-            by_category.setdefault(config.category, {})[str(config.seed)] = values
+            by_category.setdefault(run.category, {})[str(run.seed)] = values
     rows = [["category", "seed", *_POSE_ERRORS.values(), "IoU, known poses", "IoU, estimated poses", "ratio"]]
     for category, by_seed in by_category.items():
         if len(by_seed) > 1:

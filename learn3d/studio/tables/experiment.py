@@ -20,7 +20,7 @@ from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import NEAR_DEG, PoseOptions
 from learn3d.studio.poses.views import CameraOptions, estimate_views, load_views
 from learn3d.studio.tables.comparison import make_report, read_pose_errors
-from learn3d.studio.tables.plan import PlannedRun, Request, plan_runs
+from learn3d.studio.tables.plan import Request, name_run, plan_runs, variant_of
 from learn3d.studio.tables.tables import TABLES, VARIANTS
 from learn3d.tasks import Task, run_tasks
 from learn3d.terminal import INTERRUPTED, align, note, say
@@ -53,7 +53,8 @@ def _measure_updated_poses(config: TrainConfig) -> None:
     """Add the share of azimuths that were right to 30 degrees at the end of the training to the JSON file of errors."""
     weights = checkpoint.load(checkpoint.find(config.output, "last"))[0]["poses.weights"]
     load = functools.partial(load_dataset, config.layout, config.data, config.category, "train")
-    known, estimated = (load(views_per_object=config.views_per_object, poses=poses) for poses in (None, config.poses))
+    known = load(views_per_object=config.views_per_object)
+    estimated = load(views_per_object=config.views_per_object, poses=config.poses)
     azimuths = estimated.candidates.poses.azimuth_deg.view(weights.shape)
     best = azimuths.gather(1, weights.argmax(1, keepdim=True))[:, 0]
     right = wrap_deg(best - torch.as_tensor(known.poses.azimuth_deg)).abs() <= NEAR_DEG
@@ -61,29 +62,28 @@ def _measure_updated_poses(config: TrainConfig) -> None:
     writing.write_json(config.poses.with_suffix(".json"), errors)
 
 
-def train_and_test(run: PlannedRun) -> bool:
+def train_and_test(config: TrainConfig) -> bool:
     """Estimate poses if the run needs them, train, measure and write test.json; False if a signal stopped the training.
 
     An existing run continues; `train` checks that it has the same options and data. Raises as `train` and
     `evaluate_runs` do.
     """
-    config = run.config
     if config.poses is not None:
         estimate_poses(config)
-    resume = run_folder.is_run(run.folder)
+    resume = run_folder.is_run(config.output)
     if not train(config, resume=resume, overwrite=not resume).finished:  # the folder exists: log.txt is in it
         return False
     if config.poses is not None:
         _measure_updated_poses(config)
-    which = VARIANTS[run.variant].checkpoint
-    (result,) = evaluate_runs([run.folder], which=which, data=config.data, device=config.device)
-    result.curve = read_curve(run.folder)
-    writing.write_json(run.folder / RESULT_FILE, result.model_dump())
+    which = VARIANTS[variant_of(config)].checkpoint
+    (result,) = evaluate_runs([config.output], which=which, data=config.data, device=config.device)
+    result.curve = read_curve(config.output)
+    writing.write_json(config.output / RESULT_FILE, result.model_dump())
     print(f"tested: voxel IoU {result.voxel_iou:.4f} (kato18)", flush=True)
     return True
 
 
-def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = train_and_test) -> int:
+def run_experiment(request: Request, *, work: Callable[[TrainConfig], bool] = train_and_test) -> int:
     """Train and test the missing runs of a table and write its report.
 
     Returns the exit status: 0, 1 if a run failed, 130 if a signal stopped it. The report of the results so far is
@@ -91,16 +91,17 @@ def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = tra
     an unknown method or option, for runs with other options in the output folder, and for damaged files.
     """
     threads = request.threads or request.workers.threads
-    runs, failed = plan_runs(dataclasses.replace(request, threads=threads)), []
+    runs = plan_runs(dataclasses.replace(request, threads=threads))
     if conflicts := [text for run in runs if (text := find_conflict(run))]:
         advice = "ask for the same options, choose another --output, or remove these folders"
         raise ValueError("\n  ".join([*conflicts, advice]))
     results = read_results(runs)
+    failed = []
     if not request.report_only:
         logs = request.output / "runs/*/*" / LOG_FILE
         note(f"{request.table}: {len(runs)} runs, {len(results)} of them done; logs: {logs}")
-        missing = [run for run in runs if run.folder not in results]
-        tasks = [Task(run.name, work, (run,), run.folder / LOG_FILE) for run in missing]
+        missing = [run for run in runs if run.output not in results]
+        tasks = [Task(name_run(run), work, (run,), run.output / LOG_FILE) for run in missing]
         failed = run_tasks(tasks, request.workers)
         results = read_results(runs)
     tables, text = make_report(request, runs, results)
@@ -128,27 +129,27 @@ def read_result(path: Path) -> Result:
         raise ValueError(f"{path} is no measurement of a run ({reason}); remove it, and it is made again") from None
 
 
-def read_results(runs: Sequence[PlannedRun]) -> dict[Path, Result]:
+def read_results(runs: Sequence[TrainConfig]) -> dict[Path, Result]:
     """The stored results of these runs, by folder. Those of other data or another number of iterations are left out."""
     results = {}
     for run in runs:
-        if (path := run.folder / RESULT_FILE).is_file():
+        if (path := run.output / RESULT_FILE).is_file():
             result = read_result(path)
-            if (result.iterations, result.data) == (run.config.iterations, str(run.config.data.resolve())):
-                results[run.folder] = result
+            if (result.iterations, result.data) == (run.iterations, str(run.data.resolve())):
+                results[run.output] = result
     return results
 
 
-def find_conflict(run: PlannedRun) -> str:
+def find_conflict(run: TrainConfig) -> str:
     """A sentence with the options in which the run in the folder differs from the planned one; "" if there are none."""
-    if not (run.folder / run_folder.CONFIG).is_file():
+    if not (run.output / run_folder.CONFIG).is_file():
         return ""
     asked, saved = (  # a run saves the precision that "auto" stands for
         dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
-        for config in (run.config, load_config(run.folder / run_folder.CONFIG))
+        for config in (run, load_config(run.output / run_folder.CONFIG))
     )
     changed = differences(asked, saved)
-    return f"{run.folder} has a run with other options: " + "; ".join(changed) if changed else ""
+    return f"{run.output} has a run with other options: " + "; ".join(changed) if changed else ""
 
 
 def describe_tables() -> str:

@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from learn3d.config import USUAL_OPTIONS, TrainConfig, all_options
 from learn3d.data.layouts import LAYOUTS, Layout
@@ -59,19 +59,14 @@ class Request:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
 
 
-class PlannedRun(NamedTuple):
-    """A training run and its test. Tables that need the same run share its folder."""
+def variant_of(run: TrainConfig) -> str:
+    """The name of the variant that a planned run trains; its folder is OUTPUT/runs/<category>/<variant>-seed<k>."""
+    return run.output.name.removesuffix(f"-seed{run.seed}")
 
-    variant: str
-    config: TrainConfig
 
-    @property
-    def folder(self) -> Path:  # OUTPUT/runs/<category>/<variant>-seed<k>
-        return self.config.output
-
-    @property
-    def name(self) -> str:
-        return f"{self.config.category}/{self.folder.name}"
+def name_run(run: TrainConfig) -> str:
+    """The name of a planned run, <category>/<variant>-seed<k>."""
+    return f"{run.category}/{run.output.name}"
 
 
 def select_rows(request: Request) -> dict[str, Row]:
@@ -88,8 +83,8 @@ def select_rows(request: Request) -> dict[str, Row]:
     return {label: row for label, row in rows.items() if row.variant is None or row.variant in chosen}
 
 
-def plan_runs(request: Request) -> list[PlannedRun]:
-    """The runs of a request, by category, then row, then seed.
+def plan_runs(request: Request) -> list[TrainConfig]:
+    """The training runs of a request, by category, then row, then seed. Tables that need the same run share its folder.
 
     Raises ValueError for an unknown method, for a layout without true voxels, and for options that do not fit (see
     `TrainConfig`).
@@ -101,7 +96,7 @@ def plan_runs(request: Request) -> list[PlannedRun]:
     variants = [row.variant for row in select_rows(request).values() if row.variant]
     changes = _parse_changes(variants, request.set)
     return [
-        PlannedRun(name, _configure(request, name, changes[name], layout, category, seed))
+        _configure(request, name, changes[name], layout, category, seed)
         for category in dict.fromkeys(split_names(request.category) or table.categories)
         for name in variants
         for seed in range(request.seeds or table.seeds)
@@ -112,8 +107,10 @@ def _configure(
     request: Request, name: str, given: dict[str, Any], layout: Layout, category: str, seed: int
 ) -> TrainConfig:
     variant = VARIANTS[name]
-    preset, length_of = PRESETS[variant.preset], PRESETS[variant.small_batches_of or variant.preset]
-    changes, divisor = dict(variant.changes) | given, BATCH_DIVISOR if variant.small_batches_of else 1
+    preset = PRESETS[variant.preset]
+    length_of = PRESETS[variant.small_batches_of or variant.preset]
+    changes = dict(variant.changes) | given
+    divisor = BATCH_DIVISOR if variant.small_batches_of else 1
     iterations = (request.iterations or length_of.iterations) * divisor
     batch_size = request.batch_size or length_of.batch_size
     if batch_size % divisor:
