@@ -81,7 +81,7 @@ def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
         target = Path(app.srcdir) / f"{link['reftarget']}.md"  # outside of docs, the target is absolute
         if target.is_file():
             relative = os.path.relpath(target, Path(app.env.doc2path(link["refdoc"])).parent)
-            link.replace_self(addnodes.download_reference("", *link.children, reftarget=relative))
+            link.replace_self(addnodes.download_reference("", "", *link.children, reftarget=relative))
 
 
 def parameter_texts(function: Any) -> dict[str, Parameter]:

@@ -82,6 +82,11 @@ def test_pages_load_nothing_from_elsewhere(site, pages):
         assert not re.findall(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//", sheet.read_text()), sheet.name
 
 
+def test_links_show_words_and_no_markup(site):
+    for path in site.glob("*.html"):
+        assert "&lt;inline" not in path.read_text(), path.name
+
+
 def test_every_public_name_is_described(pages):
     described = set().union(*(page.places for page in pages.values()))
     public = {f"nmr.{name}" for name in nmr.__all__} - {"nmr.cameras", "nmr.losses", "nmr.metrics"}
