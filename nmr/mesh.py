@@ -120,32 +120,28 @@ def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) ->
     >>> image = nmr.render_silhouette(mesh.vertices, mesh.faces, nmr.LookAt.from_angles(2.732, 30.0, 45.0))
     """
     filename = os.fspath(filename)
-    obj = load(filename)
+    vertices, colors, uv, faces, uv_faces, face_material, names, libraries = load(filename)
     materials, folder = {}, os.path.dirname(filename)
-    for library in find_libraries(folder, obj.libraries):
+    for library in find_libraries(folder, libraries):
         if not os.path.isfile(library):
             warnings.warn(f"{filename} names the materials {library}, which is missing", stacklevel=2)
             continue
-        colors, images = read_mtl(library)
-        for name in {**colors, **images}:
-            image = find_image(folder, images[name]) if name in images else None
-            materials[name] = Material(name, tuple(colors[name].tolist()) if name in colors else None, image)
+        kd, map_kd = read_mtl(library)
+        for name in {**kd, **map_kd}:
+            image = find_image(folder, map_kd[name]) if name in map_kd else None
+            materials[name] = Material(name, tuple(kd[name].tolist()) if name in kd else None, image)
     numbers = {name: number for number, name in enumerate(materials)}
-    matched = match_materials(obj, materials, filename) if obj.libraries else [""] * len(obj.materials)
-    face_material = np.array([numbers.get(name, -1) for name in matched])[obj.face_material]
-    colors = obj.colors
+    matched = match_materials(names, face_material, materials, filename) if libraries else [""] * len(names)
+    face_material = torch.tensor([numbers.get(name, -1) for name in matched])[torch.from_numpy(face_material)]
     if colors is not None:
         colors = np.where(np.isfinite(colors).all(axis=1, keepdims=True), colors, np.nan)
         colors = np.nan_to_num(colors / (255 if np.nanmax(colors, initial=0) > 1 else 1), nan=0.5).clip(0, 1)
-    return ObjMesh(
-        torch.tensor(obj.vertices, dtype=dtype),
-        torch.tensor(obj.faces, dtype=torch.int64),
-        torch.tensor(obj.uv, dtype=dtype),
-        torch.tensor(obj.uv_faces, dtype=torch.int64),
-        torch.tensor(face_material, dtype=torch.int64),
-        tuple(materials.values()),
-        None if colors is None else torch.tensor(colors, dtype=dtype),
-    )
+        colors = torch.tensor(colors, dtype=dtype)
+    # Each array is freed as soon as its tensor exists.
+    vertices, uv = torch.tensor(vertices, dtype=dtype), torch.tensor(uv, dtype=dtype)
+    faces = torch.tensor(faces, dtype=torch.int64)
+    uv_faces = torch.tensor(uv_faces, dtype=torch.int64)
+    return ObjMesh(vertices, faces, uv, uv_faces, face_material, tuple(materials.values()), colors)
 
 
 def unique_edges(faces: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-_CHUNK = 2**19  # bytes that are parsed at a time
+_CHUNK = 2**18  # bytes that are parsed at a time
 _MOST_BYTES = 2**30  # limit of an .obj or .mtl file
 _MOST_EARS = 4096  # corners of a polygon that is no fan; the time grows with their square
 _LARGEST = float(np.finfo(np.float32).max)
@@ -182,11 +182,12 @@ class _Lines:
         colors = [part if part.shape[1] else np.full((len(part), 3), np.nan) for part in self.colors if has_colors]
         vertices, uv = _joined(self.vertices, 3), _joined(self.uv, 2)
         corners, uv_corners, sizes = (_joined(parts, 1)[:, 0] for parts in (self.corners, self.uv_corners, self.sizes))
-        triangles = triangulate(vertices, corners, sizes)
-        faces, uv_faces = corners[triangles], uv_corners[triangles]
-        if not self.num_uv:
-            uv_faces[:] = -1
-        uv_faces[(uv_faces < 0).any(axis=1)] = -1
+        if (sizes == 3).all():
+            faces, uv_faces = corners.reshape(-1, 3), uv_corners.reshape(-1, 3)
+        else:
+            triangles = triangulate(vertices, corners, sizes)
+            faces, uv_faces = corners[triangles], uv_corners[triangles]
+        uv_faces[(uv_faces < 0).any(axis=1) | (self.num_uv == 0)] = -1
         runs = np.diff(self.first_polygons, append=self.num_polygons)
         of_polygon = np.repeat(np.arange(len(runs), dtype=np.int32), runs)
         of_face = np.repeat(of_polygon, np.maximum(sizes - 2, 0))
@@ -460,17 +461,17 @@ def _find(folder: str, name: str) -> str | None:
     return None
 
 
-def match_materials(obj: Obj, known: Collection[str], filename: str) -> list[str]:
-    """The material of each name in ``obj.materials``: itself, or its first word (as published); "" if neither is known.
+def match_materials(names: list[str], face_material: np.ndarray, known: Collection[str], filename: str) -> list[str]:
+    """The material of each name of a line `usemtl`: itself, or its first word (as published); "" if neither is known.
 
     Warns of faces without a known material.
     """
-    firsts = [(name.split() or [""])[0] for name in obj.materials]
-    matched = [next((one for one in pair if one in known), "") for pair in zip(obj.materials, firsts, strict=True)]
-    unknown = np.array([name == "" for name in matched])[obj.face_material]
+    firsts = [(name.split() or [""])[0] for name in names]
+    matched = [next((one for one in pair if one in known), "") for pair in zip(names, firsts, strict=True)]
+    unknown = np.array([name == "" for name in matched])[face_material]
     if unknown.any():
-        names = {obj.materials[i] for i in np.unique(obj.face_material[unknown])}
-        named = ", ".join(repr(name[:60]) for name in sorted(names - {""})[:3])
+        missing = {names[i] for i in np.unique(face_material[unknown])}
+        named = ", ".join(repr(name[:60]) for name in sorted(missing - {""})[:3])
         why = f"their materials ({named}) are in no library" if named else "no line `usemtl` gives them a material"
         warnings.warn(
             f"{filename}: {int(unknown.sum())} of {len(unknown)} faces stay grey, for {why}; "

@@ -28,7 +28,8 @@ def read_mesh(path: Path) -> RawMesh:
     Raises MissingFile, and DamagedFile if it cannot be read as a whole, has no triangle or over 256 MiB, or if a corner
     is not finite, or if all are at one place.
     """
-    return sandbox.read(_read, path, wanted="a mesh file")
+    mesh = sandbox.read(_read, path, wanted="a mesh file")
+    return RawMesh(mesh.vertices, mesh.faces.astype(np.int64))
 
 
 def _read(path: Path) -> RawMesh:
@@ -42,12 +43,14 @@ def _read(path: Path) -> RawMesh:
             raise DamagedFile(path, "no faces")
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}; there are {len(vertices)}")
-        used = vertices[np.unique(faces)]
+        is_used = np.zeros(len(vertices), bool)
+        is_used[faces] = True
+        used = vertices[is_used]
         if not np.isfinite(used).all():
             raise ValueError(f"{np.count_nonzero(~np.isfinite(used).all(axis=1))} of its corners are not finite")
         if (used == used[0]).all():
             raise ValueError("all its corners are at one place: its longest side is 0")
-    return RawMesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int64))
+    return RawMesh(np.asarray(vertices, np.float64), faces)
 
 
 def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:

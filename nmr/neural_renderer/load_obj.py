@@ -123,7 +123,7 @@ def _textures(
         more_colors, more_images = load_mtl(library)
         colors.update(more_colors)
         images.update(more_images)
-    names = match_materials(obj, {**colors, **images}, filename_obj)
+    names = match_materials(obj.materials, obj.face_material, {**colors, **images}, filename_obj)
     textures = np.full((len(obj.faces), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32)
     has_uv = obj.uv_faces[:, 0] >= 0
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
