@@ -170,14 +170,14 @@ def format_table(results: Sequence[Result]) -> str:
     rows = [("class", "method", "seed", "iterations", "images", *HEADERS)]
     for r in results:
         about = (r.category, f"{r.method} ({r.preset})", str(r.seed), str(r.step), str(r.images))
-        rows.append((*about, *figures(vars(r))))
+        rows.append((*about, *format_measures(vars(r))))
     for m in class_means(results):
         classes = f"{m['classes']} classes" if m["classes"] > 1 else "1 class"
-        rows.append(("mean", f"{m['method']} ({m['preset']})", "", "", classes, *figures(m)))
+        rows.append(("mean", f"{m['method']} ({m['preset']})", "", "", classes, *format_measures(m)))
     return align(rows)
 
 
-def figures(values: dict[str, Any]) -> list[str]:
+def format_measures(values: dict[str, Any]) -> list[str]:
     """All measures with four digits, as cells below `HEADERS`."""
     return ["-" if values[name] is None else f"{values[name]:.4f}" for name in MEASURES]
 

@@ -22,7 +22,7 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
 )
 from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import PoseOptions
-from learn3d.studio.poses.sheet import draw_sheet
+from learn3d.studio.poses.sheet import draw_pose_sheet
 from learn3d.studio.poses.views import MIN_CONFIDENCE, CameraOptions, estimate_views, load_views
 from learn3d.studio.tables.experiment import describe_tables, run_experiment
 from learn3d.studio.tables.plan import Request
@@ -107,7 +107,7 @@ class EstimatePoses(Command):
             note(f"warning: {warning}")
         table.write(self.output)
         sheet = self.output.with_suffix(".png")
-        save_png(sheet, draw_sheet(views, offset_deg))
+        save_png(sheet, draw_pose_sheet(views, offset_deg))
         rows = "first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
         say(f"written to {self.output}; sheet {sheet}: columns: azimuths; {rows}")
 
@@ -245,7 +245,7 @@ class Figures(OnDataset):
 
     def run(self) -> None:
         from learn3d.studio.tables import grids, tsne
-        from learn3d.studio.tables.figure_runs import open_runs
+        from learn3d.studio.tables.trained_models import open_runs
 
         check_target(self.output.parent, "--output", folder=True)
         refused = {"grid": (), "interpolation": ("truth",), "tsne": ("images", "indices", "truth")}[self.figure]

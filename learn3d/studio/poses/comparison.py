@@ -53,12 +53,21 @@ def compare(views: EstimatedViews) -> Comparison:
     flips = (errors >= 150).double()
     _, which = number_objects(views.datasets)[views.shown].unique(return_inverse=True)
     by_object = torch.bincount(which, flips) / torch.bincount(which)
-    right, confidence = (errors <= NEAR_DEG).double(), views.result.confidence.double()
+    right = (errors <= NEAR_DEG).double()
+    confidence = views.result.confidence.double()
     bins = [torch.nonzero((10 * confidence).floor().clamp(max=9) == k)[:, 0] for k in range(10)]
     calibration = tuple((float(confidence[b].mean()), float(right[b].mean()), len(b)) for b in bins if len(b))
     up_to_half_turn = (_up_to_half_turn(errors) <= NEAR_DEG).double()
-    numbers = (right.mean(), up_to_half_turn.mean(), errors.median(), errors.mean(), flips.mean())
-    return Comparison(offset, *map(float, (*numbers, (by_object > 0.5).double().mean())), calibration)
+    return Comparison(
+        offset_deg=offset,
+        accuracy=float(right.mean()),
+        half_turn_accuracy=float(up_to_half_turn.mean()),
+        median_deg=float(errors.median()),
+        mean_deg=float(errors.mean()),
+        flips=float(flips.mean()),
+        objects_flipped=float((by_object > 0.5).double().mean()),
+        calibration=calibration,
+    )
 
 
 def _up_to_half_turn(errors: Tensor) -> Tensor:

@@ -124,10 +124,9 @@ def estimate(data: Masks, fitted: Tensor, candidates: Candidates, options: PoseO
         parts = [_estimate_once(options, create, data, *neighbours) for _ in range(options.repeats)]
     posteriors, agreements, shapes, weights, front_votes = zip(*parts, strict=True)
     shifts = _common_frame([posterior.sum(2) for posterior in posteriors], rng)
-    posteriors, agreements = (
-        [values.roll(shift, 1) for values, shift in zip(each, shifts, strict=True)] for each in (posteriors, agreements)
-    )
-    posterior, agreement = sum(posteriors) / len(parts), sum(agreements)
+    posteriors = [values.roll(shift, 1) for values, shift in zip(posteriors, shifts, strict=True)]
+    posterior = sum(posteriors) / len(parts)
+    agreement = sum(values.roll(shift, 1) for values, shift in zip(agreements, shifts, strict=True))
     best = posterior.sum(2).argmax(1)
     confidence = MAX_CONFIDENCE * (_near(agreement, best) / agreement.sum(1).clamp_min(1e-9))
     _, which = data.objects.unique(return_inverse=True)
@@ -139,8 +138,8 @@ def estimate(data: Masks, fitted: Tensor, candidates: Candidates, options: PoseO
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
     k = max(range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum()))  # the most typical one
     shapes[k].turns = (shapes[k].turns + shifts[k] * TURNS // options.azimuths) % TURNS
-    faces, votes = shapes[k].network.faces, sum(front_votes) / len(parts)
-    return Estimate(posterior, confidence, shapes[k].align(), faces, weights[k], votes)
+    votes = sum(front_votes) / len(parts)
+    return Estimate(posterior, confidence, shapes[k].align(), shapes[k].network.faces, weights[k], votes)
 
 
 def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
@@ -198,7 +197,11 @@ class Shapes:
     def __init__(
         self, data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, bar: tqdm
     ) -> None:
-        self.data, self.candidates, self.options, self.rng, self.bar = data, candidates, options, rng, bar
+        self.data = data
+        self.candidates = candidates
+        self.options = options
+        self.rng = rng
+        self.bar = bar
         self.network = GENERATORS["sphere-small"](symmetry="x")
         scale = torch.exp(torch.empty(3).uniform_(np.log(0.3), 0.0, generator=rng))
         self.base = 0.5 * self.network.place(self.network.sphere) * (scale - 1)
@@ -215,7 +218,8 @@ class Shapes:
         Views from azimuths above 180 degrees are mirror images.
         """
         azimuth_deg, elevation_deg, distance, half_fov_deg = self.candidates
-        count, half = len(vertices), len(azimuth_deg) // 2 + 1
+        count = len(vertices)
+        half = len(azimuth_deg) // 2 + 1
         azimuth, elevation = torch.meshgrid(azimuth_deg[:half], elevation_deg[elevations], indexing="ij")
         angles = (elevation.flatten().repeat(count), azimuth.flatten().repeat(count))
         cameras = nmr.LookAt.from_angles(distance, *angles, half_fov_deg=half_fov_deg)
@@ -243,12 +247,16 @@ class Shapes:
         if len(self.codes) > 1:
             groups.append({"params": [self.codes], "lr": 1e-2})
         optimizer = torch.optim.Adam(groups, 4e-4)
-        (masks, allowed, _), steps = self.data, self.options.steps
-        rows, elevations, known = torch.arange(len(masks)), slice(None), bool((allowed.sum(1) == 1).all())
+        masks, allowed, _ = self.data
+        steps = self.options.steps
+        rows = torch.arange(len(masks))
+        elevations = slice(None)
+        known = bool((allowed.sum(1) == 1).all())
         for step in range(steps):
             if known:  # a batch has a single elevation
                 e = int(torch.multinomial(allowed.sum(0).double(), 1, generator=self.rng))
-                rows, elevations = torch.nonzero(allowed[:, e])[:, 0], slice(e, e + 1)
+                rows = torch.nonzero(allowed[:, e])[:, 0]
+                elevations = slice(e, e + 1)
             batch = rows[torch.randint(len(rows), (_BATCH,), generator=self.rng)]
             vertices = self.vertices()
             values = self.distances(masks[batch], vertices, elevations)
@@ -273,7 +281,8 @@ class Shapes:
     def align(self) -> Tensor:
         """Vertices [M, V, 3] in the common frame, each shape turned by its `turns`."""
         angle = self.turns * (2 * math.pi / TURNS)
-        cos, sin = angle.cos().round()[:, None], angle.sin().round()[:, None]
+        cos = angle.cos().round()[:, None]
+        sin = angle.sin().round()[:, None]
         x, y, z = self.vertices().unbind(2)
         return torch.stack([cos * x - sin * z, y, sin * x + cos * z], 2)
 
@@ -359,10 +368,10 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, f
     azimuth = posterior[torch.arange(len(values)), prototype].sum(2).argmax(1)
     of_masks = _mask_votes(data, prototype, azimuth, count, azimuths)
     votes = of_masks + _PEAK_WEIGHT * _peak_votes(data, prototype, azimuth, count, azimuths)
-    best, every = _solve_turns(votes, rng), np.arange(count)
-    same, opposite = (
-        float(of_masks[best[:, None], turned, every[:, None], every].sum()) for turned in (best, (best + 2) % TURNS)
-    )
+    best = _solve_turns(votes, rng)
+    every = np.arange(count)
+    same = float(of_masks[best[:, None], best, every[:, None], every].sum())
+    opposite = float(of_masks[best[:, None], (best + 2) % TURNS, every[:, None], every].sum())
     best = (best + 2 * (best[0] >= 2)) % TURNS  # half a turn of all prototypes changes no vote
     return torch.from_numpy(best), 1 - opposite / max(same + opposite, 1e-9)
 
@@ -372,7 +381,9 @@ def _solve_turns(couplings: Tensor, rng: torch.Generator) -> np.ndarray:
     count = couplings.shape[-1]
     coupling = ((couplings + couplings.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
-    best, best_score, every = np.zeros(count, np.int64), -np.inf, np.arange(count)
+    best = np.zeros(count, np.int64)
+    best_score = -np.inf
+    every = np.arange(count)
     for _ in range(200):  # coordinate ascent from random turns
         turns = draw.integers(TURNS, size=count)
         for _ in range(50):
@@ -381,8 +392,10 @@ def _solve_turns(couplings: Tensor, rng: torch.Generator) -> np.ndarray:
                 turns[i] = coupling[:, turns, i, every].sum(1).argmax()
             if (turns == before).all():
                 break
-        if (score := coupling[turns[:, None], turns, every[:, None], every].sum()) > best_score:
-            best, best_score = turns, score
+        score = coupling[turns[:, None], turns, every[:, None], every].sum()
+        if score > best_score:
+            best = turns
+            best_score = score
     return best
 
 
@@ -393,7 +406,8 @@ def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
     prototype, azimuth: int64 [N].
     """
     votes = torch.zeros(TURNS, TURNS, count, count, dtype=torch.float64)
-    neighbours, quarter = Neighbours.of(data, data, prototype, _VOTERS), azimuths // TURNS
+    neighbours = Neighbours.of(data, data, prototype, _VOTERS)
+    quarter = azimuths // TURNS
     for mirrored, (rows, weights) in enumerate(zip(neighbours.rows, neighbours.weights, strict=True)):
         pairs = (prototype[:, None].expand_as(rows), prototype[rows])
         for own, other in itertools.product(range(TURNS), repeat=2):
@@ -410,10 +424,11 @@ def _peak_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
     The vote of two turned prototypes is the inner product of their mean peaks at all azimuths, each azimuth weighted by
     the roots of its numbers of masks. prototype, azimuth: int64 [N].
     """
-    cells, peaks = prototype * azimuths + azimuth, _peaks(data.masks)
-    total = torch.zeros(count * azimuths, SIZE).index_add_(0, cells, peaks).view(count, azimuths, SIZE)
+    cells = prototype * azimuths + azimuth
+    total = torch.zeros(count * azimuths, SIZE).index_add_(0, cells, _peaks(data.masks)).view(count, azimuths, SIZE)
     number = torch.bincount(cells, minlength=count * azimuths).view(count, azimuths)
-    turned, places = [], torch.arange(azimuths)
+    turned = []
+    places = torch.arange(azimuths)
     for turn in range(TURNS):
         plain, mirrored = ((p - turn * (azimuths // TURNS)) % azimuths for p in (places, -places))
         masks = (number[:, plain] + number[:, mirrored])[..., None]

@@ -13,12 +13,13 @@ PROTOTYPES, ROWS = 6, 8  # rows of prototypes, and of images, at most
 TILE = 64  # side of a picture in pixels
 
 
-def draw_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarray:
+def draw_pose_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarray:
     """Uint8 [H, W, 3]: the most frequent prototypes, and below each azimuth images with about that estimate.
 
     offset_deg: added to the azimuths of images and prototypes, as by `PoseTable.turned`.
     """
-    (directions, heights, distance, half_fov), result = views.candidates, views.result
+    directions, heights, distance, half_fov = views.candidates
+    result = views.result
     count = min(COLUMNS, len(directions))
     azimuths = directions[torch.linspace(0, len(directions), count + 1)[:-1].long()]
     middle = heights[len(heights) // 2 :][:1]

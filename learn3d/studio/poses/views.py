@@ -126,8 +126,8 @@ def estimate_views(datasets: Sequence[ViewDataset], cameras: CameraOptions, opti
         posterior = posterior.sum(2, keepdim=True)
     weights, chosen = posterior.flatten(1).topk(min(MAX_CANDIDATES, posterior[0].numel()), 1)
     weights[:, options.candidates :] = 0
-    azimuth, height = chosen // posterior.shape[2], chosen % posterior.shape[2]
-    heights = elevation[:, None].expand_as(weights) if own_elevation else grid[height]
+    azimuth = chosen // posterior.shape[2]
+    heights = elevation[:, None].expand_as(weights) if own_elevation else grid[chosen % posterior.shape[2]]
     confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
     columns = (wrap_deg(azimuths[azimuth]), heights, weights / weights.sum(1, keepdim=True))
     columns = (part.numpy().astype(np.float32) for part in (*columns, distance, half_fov, confidence))
@@ -141,7 +141,8 @@ def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[T
     half_fov = torch.full((sum(map(len, datasets)),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
     largest = max(float(dataset.object_sizes().max()) for dataset in datasets)
     guess = 0.5 / (max(largest, 0.01) * np.tan(np.radians(float(half_fov[0]))))
-    distance, elevation = torch.full_like(half_fov, guess), torch.full_like(half_fov, sum(given) / 2)
+    distance = torch.full_like(half_fov, guess)
+    elevation = torch.full_like(half_fov, sum(given) / 2)
     if any(dataset.poses is not None for dataset in datasets):
         if not all(isinstance(dataset.poses, LookAtPoses) for dataset in datasets):
             raise ValueError("poses can only be estimated for look-at cameras; the poses of this layout are rotations")
@@ -169,7 +170,8 @@ def _masks(datasets: Sequence[ViewDataset], factor: Tensor) -> Tensor:
     reduced = []
     for dataset, of_dataset in zip(datasets, factor.split([len(d) for d in datasets]), strict=True):
         for rows in torch.arange(len(dataset)).split(1024):
-            masks, factors = torch.from_numpy(dataset.read_masks(rows.numpy()))[:, None].float() / 255, of_dataset[rows]
+            masks = torch.from_numpy(dataset.read_masks(rows.numpy()))[:, None].float() / 255
+            factors = of_dataset[rows]
             if bool((factors - 1).abs().max() >= 1e-3):
                 grid = F.affine_grid(torch.eye(2, 3) / factors[:, None, None], masks.shape, align_corners=False)
                 masks = F.grid_sample(masks, grid, align_corners=False)

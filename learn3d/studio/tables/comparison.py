@@ -15,7 +15,7 @@ from learn3d.config import TrainConfig, command_line
 from learn3d.data.categories import SYNSETS
 from learn3d.files import limits
 from learn3d.files.reading import read_json
-from learn3d.runs.measurement import HEADERS, Result, figures
+from learn3d.runs.measurement import HEADERS, Result, format_measures
 from learn3d.studio.tables.plan import Request, name_run, select_rows, variant_of
 from learn3d.studio.tables.tables import MEAN, TABLES, Row, Table
 
@@ -130,7 +130,7 @@ def _run_rows(done: Runs) -> Cells:
     for run, result in done:
         counts = [f"step {result.step}", str(result.iterations), str(run.batch_size), str(result.images)]
         minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
-        rows.append([name_run(run), *counts, *figures(vars(result)), minutes, result.commit])
+        rows.append([name_run(run), *counts, *format_measures(vars(result)), minutes, result.commit])
     return rows
 
 

@@ -12,7 +12,7 @@ from learn3d.evaluation import spread_samples
 from learn3d.pictures.grid import AROUND, TURNS_DEG
 from learn3d.pictures.sheets import TILE, magnify, natural_colors, save_png, tile
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, grid_surface, orbit
-from learn3d.studio.tables.figure_runs import Run
+from learn3d.studio.tables.trained_models import TrainedModel
 
 TILE_SIZE = 128  # pixels of a picture in a comparison
 AZIMUTHS_DEG = (-135.0, -45.0)  # views of an interpolation: oblique, along whichever axis the objects face
@@ -20,7 +20,9 @@ STEPS = 4  # steps of an interpolation from one image to the next
 
 
 @torch.no_grad()
-def comparison_grid(runs: Sequence[Run], samples: Tensor, *, truth: bool = False, title: str = "input") -> np.ndarray:
+def comparison_grid(
+    runs: Sequence[TrainedModel], samples: Tensor, *, truth: bool = False, title: str = "input"
+) -> np.ndarray:
     """Reconstructions of the same images by runs on one data set: uint8 [H,W,3].
 
     A group of rows per image: the input, and a row per run with its shape from the input's view and from five more
@@ -50,7 +52,7 @@ def comparison_grid(runs: Sequence[Run], samples: Tensor, *, truth: bool = False
 
 
 @torch.no_grad()
-def interpolate(run: Run, samples: Tensor, *, title: str = "input") -> np.ndarray:
+def interpolate(run: TrainedModel, samples: Tensor, *, title: str = "input") -> np.ndarray:
     """Shapes between a run's reconstructions of images, samples int64 [n]: uint8 [H,W,3].
 
     The first row has the images, each above its reconstruction, and `title` before them. Below it are a row per view of
@@ -58,8 +60,10 @@ def interpolate(run: Run, samples: Tensor, *, title: str = "input") -> np.ndarra
     """
     if len(samples) < 2:
         raise ValueError(f"an interpolation takes at least two images, got {len(samples)}")
-    dataset, method = run.dataset, run.method
-    batch, pose = dataset.batch(samples), dataset.poses[samples[:1]]
+    dataset = run.dataset
+    method = run.method
+    batch = dataset.batch(samples)
+    pose = dataset.poses[samples[:1]]
     codes = method.encode(batch.images)
     weights = torch.arange(STEPS, dtype=codes.dtype, device=codes.device)[:, None] / STEPS
     between = torch.lerp(codes[:-1, None], codes[1:, None], weights).flatten(0, 1)
@@ -76,22 +80,24 @@ def interpolate(run: Run, samples: Tensor, *, title: str = "input") -> np.ndarra
 
 
 def save_grid(
-    runs: Sequence[Run], output: Path, *, images: int = 6, indices: Sequence[int] = (), truth: bool = False
+    runs: Sequence[TrainedModel], output: Path, *, images: int = 6, indices: Sequence[int] = (), truth: bool = False
 ) -> list[Path]:
     """Save a `comparison_grid` for each data set, below each other, as a PNG.
 
     images, indices: the samples of each data set, see `choose_samples`.
     """
-    blocks, datasets = [], {id(run.dataset): run.dataset for run in runs}.values()
+    blocks = []
+    datasets = {id(run.dataset): run.dataset for run in runs}.values()
     for dataset in datasets:
-        group, samples = [run for run in runs if run.dataset is dataset], choose_samples(dataset, images, indices)
+        group = [run for run in runs if run.dataset is dataset]
+        samples = choose_samples(dataset, images, indices)
         title = dataset.category if len(datasets) > 1 else "input"
         blocks.append(comparison_grid(group, samples, truth=truth, title=title))
     return _save(blocks, output)
 
 
 def save_interpolation(
-    runs: Sequence[Run], output: Path, *, images: int = 3, indices: Sequence[int] = ()
+    runs: Sequence[TrainedModel], output: Path, *, images: int = 3, indices: Sequence[int] = ()
 ) -> list[Path]:
     """Save the interpolation of each run, below each other, as a PNG. images, indices: see `choose_samples`."""
     samples = [choose_samples(run.dataset, images, indices) for run in runs]

@@ -28,7 +28,7 @@ from learn3d.runs.measurement import MEASURES
 from learn3d.settings import MOST
 from learn3d.studio.picture_to_mesh.smoothing import smooth
 from learn3d.studio.tables.comparison import percentile_interval, resampled_means
-from learn3d.studio.tables.figure_runs import Run, open_runs
+from learn3d.studio.tables.trained_models import TrainedModel, open_runs
 from learn3d.terminal import note, plain
 
 UNIT = 1e-4  # length of 1 in the stored int16 coordinates, which reach 3.3; objects reach 1
@@ -99,7 +99,7 @@ def write_report(
     return len(content)
 
 
-def _check_same_images(runs: Sequence[Run], data: Path | None) -> None:
+def _check_same_images(runs: Sequence[TrainedModel], data: Path | None) -> None:
     classes = dict.fromkeys(run.dataset.category for run in runs)
     if len(classes) > 1 or "," in next(iter(classes)):
         raise ValueError(f"a report is about one class, and these runs are of {', '.join(classes)}; give --category")
@@ -114,24 +114,25 @@ def _check_same_images(runs: Sequence[Run], data: Path | None) -> None:
 
 
 def _measure(
-    runs: Sequence[Run], results: Sequence[Evaluation], objects: int, indices: Sequence[int]
+    runs: Sequence[TrainedModel], results: Sequence[Evaluation], objects: int, indices: Sequence[int]
 ) -> dict[str, Any]:
     """The values of the template; "browser" is for the script of the page."""
     dataset = runs[0].dataset
-    ids, names, truth = dataset.object_ids, [plain(name) for name in dataset.object_names], dataset.voxels is not None
-    metric, kind = ("voxel_iou", "voxel IoU") if truth else ("silhouette_iou", "silhouette IoU")
+    names = [plain(name) for name in dataset.object_names]
+    metric, kind = "silhouette_iou", "silhouette IoU"
+    if dataset.voxels is not None:
+        metric, kind = "voxel_iou", "voxel IoU"
     ious = np.stack([result.values[metric].numpy() for result in results])  # run by image
+    ids = dataset.object_ids
     sums = np.stack([np.bincount(ids, np.nan_to_num(row), len(names)) for row in ious])
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
     means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)  # run by object
-    of_images, of_objects = _mean(ious, axis=0), _mean(means, axis=0)
+
+    of_objects = _mean(means, axis=0)
     numbers = np.unique(ids)
     ranked = numbers[np.argsort(-np.nan_to_num(of_objects[numbers], nan=-1.0), kind="stable")]  # the best object first
-    if not indices:  # of each object the image with the most typical IoU
-        order = np.nan_to_num(np.abs(of_images - of_objects[ids]), nan=9.0).argsort(kind="stable")
-        typical = dict(zip(ids[order[::-1]], order[::-1], strict=True))
-        places = np.unique(np.linspace(0, len(ranked) - 1, min(objects, len(ranked))).round().astype(int))
-        indices = [typical[number] for number in ranked[places]]
+    if not indices:
+        indices = _typical_images(_mean(ious, axis=0), of_objects, ids, ranked, objects)
     rank = ranked.tolist().index
     shown = sorted(map(int, dict.fromkeys(indices)), key=lambda sample: rank(ids[sample]))
     items = pack_shapes(runs, shown)
@@ -144,16 +145,11 @@ def _measure(
         views = [{"azimuths": azimuths.tolist(), "ious": _numbers(values)} for azimuths, values in by_view]
     legend = [{"name": plain(run.label), "color": COLORS[k % len(COLORS)]} for k, run in enumerate(runs)]
     resampled = [resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)]
-    rows = []
-    for run, result, entry, samples in zip(runs, results, legend, resampled, strict=True):
-        config, iou, mmd = run.metadata.config, result.means.get(metric), result.means.get("mmd")
-        row = entry | {"about": run.metadata, "method": PRESETS[config.preset].label, "mmd": mmd, "iou": iou}
-        row["interval"] = percentile_interval(samples)
-        row["command"] = command_line(config, data="DATA", output="OUTPUT", pretrained="WEIGHTS")
-        if rows and None not in (iou, rows[0]["iou"]):
-            row["difference"] = iou - rows[0]["iou"]
+    rows = [entry | _describe(*each, metric) for entry, *each in zip(legend, runs, results, resampled, strict=True)]
+    for row, samples in zip(rows[1:], resampled[1:], strict=True):
+        if None not in (row["iou"], rows[0]["iou"]):
+            row["difference"] = row["iou"] - rows[0]["iou"]
             row["difference_interval"] = percentile_interval(samples - resampled[0])
-        rows.append(row)
     return {
         "runs": rows,
         "category": plain(dataset.category),
@@ -162,9 +158,32 @@ def _measure(
         "kind": kind,
         "meaning": MEASURES[metric][1],
         "mmd": MEASURES["mmd"][1],
-        "truth": truth,
+        "truth": dataset.voxels is not None,
         "browser": {"runs": legend, "items": items, "kind": kind, "views": views, "unit": UNIT},
     }
+
+
+def _describe(run: TrainedModel, result: Evaluation, resampled: np.ndarray, metric: str) -> dict[str, Any]:
+    """A run's row of the first table, but for its difference to the first run."""
+    config = run.metadata.config
+    return {
+        "about": run.metadata,
+        "method": PRESETS[config.preset].label,
+        "mmd": result.means.get("mmd"),
+        "iou": result.means.get(metric),
+        "interval": percentile_interval(resampled),
+        "command": command_line(config, data="DATA", output="OUTPUT", pretrained="WEIGHTS"),
+    }
+
+
+def _typical_images(
+    of_images: np.ndarray, of_objects: np.ndarray, ids: np.ndarray, ranked: np.ndarray, count: int
+) -> list[int]:
+    """Of `count` objects, spread from the best to the worst, the image whose IoU is nearest to the object's mean."""
+    order = np.nan_to_num(np.abs(of_images - of_objects[ids]), nan=9.0).argsort(kind="stable")
+    typical = dict(zip(ids[order[::-1]], order[::-1], strict=True))
+    places = np.unique(np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int))
+    return [typical[number] for number in ranked[places]]
 
 
 def mean_by_azimuth(azimuths_deg: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -182,7 +201,7 @@ def _mean(values: np.ndarray, axis: int | None = None) -> np.ndarray:
 
 
 @torch.no_grad()
-def pack_shapes(runs: Sequence[Run], samples: Sequence[int]) -> list[dict[str, Any]]:
+def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[dict[str, Any]]:
     """For each image the picture and its meshes: one of each run, then the true shape if it is known.
 
     "reach" is the largest radius of the meshes, "eye" the direction of the camera (an oblique one if it is unknown).

@@ -18,7 +18,7 @@ from sklearn.neighbors import KNeighborsClassifier
 from learn3d.evaluation import spread_samples
 from learn3d.files import writing
 from learn3d.pictures.surfaces import azimuths_deg
-from learn3d.studio.tables.figure_runs import Run
+from learn3d.studio.tables.trained_models import TrainedModel
 
 MOST_CODES, FEWEST_CODES = 2000, 10  # images in a map; one of fewer means nothing
 _styled = mpl.rc_context(  # a decorator: matplotlib's settings change in the decorated functions alone
@@ -34,7 +34,7 @@ _styled = mpl.rc_context(  # a decorator: matplotlib's settings change in the de
 
 @_styled
 @torch.no_grad()
-def draw_tsne(runs: Sequence[Run]) -> Figure:
+def draw_tsne(runs: Sequence[TrainedModel]) -> Figure:
     """The shape codes of up to 2,000 images by t-SNE: a map for each run, coloured by the azimuths of the cameras.
 
     Above each map is how often the view is predicted from a code; a colour wheel is the legend. Raises ValueError for
@@ -50,7 +50,8 @@ def draw_tsne(runs: Sequence[Run]) -> Figure:
         samples = spread_samples(dataset.object_ids, dataset.view_ids, MOST_CODES)
         batches = [run.method.encode(dataset.batch(part).images).float().cpu() for part in samples.split(256)]
         codes = torch.cat(batches).numpy()
-        points, color = embed(codes), wheel(azimuths_deg(dataset.poses)[samples].numpy() / 360 % 1.0)
+        points = embed(codes)
+        color = wheel(azimuths_deg(dataset.poses)[samples].numpy() / 360 % 1.0)
         order = np.random.default_rng(0).permutation(len(points))  # so that no view covers all others
         size = float(np.clip(7000 / len(points), 4, 16))
         axes = figure.add_subplot(grid[index // columns, index % columns])
@@ -112,7 +113,7 @@ def cyclic_colors(count: int = 256) -> np.ndarray:
 
 
 @_styled
-def save_tsne(runs: Sequence[Run], output: Path) -> list[Path]:
+def save_tsne(runs: Sequence[TrainedModel], output: Path) -> list[Path]:
     """Save `draw_tsne` as .png and as .svg, whichever ending `output` has; returns both paths."""
     figure = draw_tsne(runs)
     output.parent.mkdir(parents=True, exist_ok=True)

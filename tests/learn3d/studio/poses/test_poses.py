@@ -25,7 +25,7 @@ from learn3d.studio.poses.estimate import (
     _peak_votes,
     _turns,
 )
-from learn3d.studio.poses.sheet import COLUMNS, TILE, draw_sheet
+from learn3d.studio.poses.sheet import COLUMNS, TILE, draw_pose_sheet
 from learn3d.studio.poses.views import (
     CameraOptions,
     EstimatedViews,
@@ -48,7 +48,7 @@ def test_azimuths_of_distinct_shapes_are_found(found: EstimatedViews) -> None:
     result = compare(found)
     assert result.accuracy > 0.9 and result.flips < 0.1 and not found.warnings
     assert found.table.weights.shape == (192, 24) and (found.table.weights[:, 2:] == 0).all()
-    assert draw_sheet(found).ndim == 3
+    assert draw_pose_sheet(found).ndim == 3
     alike = dataclasses.replace(found, result=dataclasses.replace(found.result, front_votes=0.5))
     assert "the same from front and back" in alike.warnings[0]
 
@@ -148,6 +148,6 @@ def test_the_sheet_turns_images_and_prototypes_alike(tiny_set: ViewDataset) -> N
     estimate = Estimate(torch.ones(count, 24, 1), torch.ones(count), shape[None], faces, torch.ones(1), 1.0)
     candidates = Candidates(torch.arange(24) * 15.0, torch.tensor([30.0]), 2.7, 15.0)
     views = EstimatedViews((tiny_set,), torch.arange(count), candidates, estimate, table)
-    before, after = (draw_sheet(views, offset)[HEADER:, -COLUMNS * step :] for offset in (0.0, 90.0))
+    before, after = (draw_pose_sheet(views, offset)[HEADER:, -COLUMNS * step :] for offset in (0.0, 90.0))
     assert np.array_equal(after, np.roll(before, 3 * step, axis=1))
     assert not np.array_equal(after[:TILE], before[:TILE])

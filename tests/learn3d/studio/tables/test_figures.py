@@ -22,8 +22,8 @@ from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_color
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
 from learn3d.runs import checkpoint
 from learn3d.studio.tables import grids
-from learn3d.studio.tables.figure_runs import Run, name_runs, open_runs
 from learn3d.studio.tables.grids import comparison_grid, interpolate
+from learn3d.studio.tables.trained_models import TrainedModel, name_runs, open_runs
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("sklearn")
@@ -94,7 +94,7 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set, poses) -> No
 @pytest.mark.parametrize("truth", [False, True])
 def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth) -> None:
     samples, methods = torch.tensor([3, 40]), {"large": Ellipsoids(), "small": GridEllipsoids(0.5)}
-    runs, batch = [Run(name, method, tiny_set) for name, method in methods.items()], tiny_set.batch(samples)
+    runs, batch = [TrainedModel(name, method, tiny_set) for name, method in methods.items()], tiny_set.batch(samples)
     grid = comparison_grid(runs, samples, truth=truth)
     shown = [method.decode(method.encode(batch.images)).surfaces() for method in methods.values()]
     if truth:
@@ -116,13 +116,13 @@ def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth)
 def test_the_truth_must_be_known(tiny_set) -> None:
     blind = dataclasses.replace(tiny_set, voxels=None)
     with pytest.raises(ValueError, match="airplane, test has no true voxels to show"):
-        comparison_grid([Run("a", Ellipsoids(), blind)], torch.tensor([3]), truth=True)
+        comparison_grid([TrainedModel("a", Ellipsoids(), blind)], torch.tensor([3]), truth=True)
 
 
 @pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
 def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_set, method) -> None:
     samples = torch.tensor([3, 30, 60])
-    strip, batch = interpolate(Run("a", method, tiny_set), samples), tiny_set.batch(samples)
+    strip, batch = interpolate(TrainedModel("a", method, tiny_set), samples), tiny_set.batch(samples)
     assert strip.shape[0] == 3 * STEP + MARGIN
     codes = method.encode(batch.images)
     way = torch.stack([torch.lerp(codes[k // 4], codes[min(2, k // 4 + 1)], k % 4 / 4) for k in range(9)])
@@ -136,7 +136,7 @@ def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_s
             assert np.abs(shown.astype(int) - views[row]).mean() < 0.1
         assert (cell(strip, 0, column, top=0, columns=9) < 250).any() == (column % 4 == 0)
     with pytest.raises(ValueError, match="at least two images, got 1"):
-        interpolate(Run("a", method, tiny_set), samples[:1])
+        interpolate(TrainedModel("a", method, tiny_set), samples[:1])
 
 
 def write_metrics(folder: Path, records: list[object], tail: str = "") -> Path:
@@ -233,7 +233,10 @@ def test_an_embedding_keeps_neighbours_and_is_always_the_same() -> None:
 def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set, tmp_path, monkeypatch) -> None:
     points = np.random.default_rng(0).normal(size=(72, 2)).astype(np.float32)
     monkeypatch.setattr(tsne, "embed", lambda codes: points)
-    runs, wheel = [Run("$\\bad$", Ellipsoids(), tiny_set), Run("b", Ellipsoids(), tiny_set)], tsne.cyclic_colors()
+    runs, wheel = (
+        [TrainedModel("$\\bad$", Ellipsoids(), tiny_set), TrainedModel("b", Ellipsoids(), tiny_set)],
+        tsne.cyclic_colors(),
+    )
     scatter = tsne.draw_tsne(runs).axes[0].collections[0]
     azimuths = azimuths_deg(tiny_set.poses).numpy() % 360
     for position, color in zip(scatter.get_offsets(), scatter.get_facecolors(), strict=True):
@@ -259,7 +262,7 @@ def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
 
 def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:
     chairs = dataclasses.replace(tiny_set, category="chair")
-    runs = [Run(label, Ellipsoids(), data) for data in (tiny_set, chairs) for label in ("a", "b")]
+    runs = [TrainedModel(label, Ellipsoids(), data) for data in (tiny_set, chairs) for label in ("a", "b")]
     (one,) = grids.save_grid(runs[:2], tmp_path / "one", images=1)
     (two,) = grids.save_grid(runs, tmp_path / "2", images=1)
     assert Image.open(two).height == 2 * Image.open(one).height + 10

@@ -16,7 +16,7 @@ from learn3d.terminal import note
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class TrainedModel:
     """A trained method and the data on which figures show it. Runs on the same data share one `dataset`."""
 
     label: str
@@ -33,7 +33,7 @@ def open_runs(
     category: str | None = None,
     split: str = "test",
     which: Literal["last", "best"] = "last",
-) -> list[Run]:
+) -> list[TrainedModel]:
     """Open run folders (their checkpoint `which`) or checkpoint files, each with a split of its data.
 
     `data` and `category` default to those of the training, `labels` to `name_runs`. Raises ValueError without runs, for
@@ -41,7 +41,9 @@ def open_runs(
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to draw")
-    configs, runs, datasets = [], [], {}
+    configs = []
+    runs = []
+    datasets = {}
     for path in paths:
         note(f"opening {path}")
         method, config, metadata = checkpoint.load_method(path, which)
@@ -51,7 +53,7 @@ def open_runs(
         if key not in datasets:
             datasets[key] = checkpoint.load_data(config, split, data=data, category=category)
         runs.append((method, datasets[key], metadata))
-    return [Run(name, *run) for name, run in zip(name_runs(configs, paths, labels), runs, strict=True)]
+    return [TrainedModel(name, *run) for name, run in zip(name_runs(configs, paths, labels), runs, strict=True)]
 
 
 def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()) -> list[str]:
