@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ._chunks import draw_chunks, make_chunks
 from ._packing import is_list
-from ._scene import LARGEST_IMAGE, Meshes, Scene, average, background_rows, make_scene, shade
-from ._validate import GRADIENTS, as_positive, check_choice, check_flag, check_image_size, check_number, check_size
+from ._scene import Meshes, Scene, average, background_rows, make_scene, shade
+from ._validate import GRADIENTS, as_positive, check_choice, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -105,9 +104,6 @@ def render(
     or colours alone. The images are the same (depth and normals up to rounding).
     ``docs/examples/draw_gradients.py`` draws the three.
 
-    Batches in colour of 33 million raster pixels or more are shaded a few images at a time, and once more for the
-    gradients, to save memory. This needs nmr's own colours and cameras; not in ``torch.compile`` and ``torch.func``.
-
     Raises
     ------
     TypeError, ValueError
@@ -123,20 +119,9 @@ def render(
     outputs = _check_outputs(outputs)
     check_choice(gradient, "gradient", GRADIENTS)
 
-    def scene_of(vertices, faces, camera, *shading):
-        return make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
-
-    def draw(vertices, faces, camera, background, colors, lights, face_index=None):
-        how = interpolation_gradient, gradient, smooth, space
-        return _draw(scene_of(vertices, faces, camera), face_index, outputs, background, colors, lights, *how)
-
-    arguments, chunks = (vertices, faces, camera, background, colors, lights), None
-    if "rgb" in outputs and "fragments" not in outputs and not (colors is None and lights is None):
-        size = check_image_size(image_size, LARGEST_IMAGE)
-        chunks = make_chunks(arguments, size, check_flag(anti_aliasing, "anti_aliasing"))
-    if chunks is None:
-        return Images(draw(*arguments))
-    return Images(draw_chunks(chunks, lambda *some: scene_of(*some).rasterize(), draw))
+    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
+    how = interpolation_gradient, gradient, smooth, space
+    return Images(_draw(scene, outputs, background, colors, lights, *how))
 
 
 def _check_outputs(outputs: object) -> tuple[str, ...]:
@@ -150,7 +135,6 @@ def _check_outputs(outputs: object) -> tuple[str, ...]:
 
 def _draw(
     scene: Scene,
-    face_index: Tensor | None,
     outputs: Sequence[str],
     background: float | Sequence[float] | Tensor,
     colors: Colors | None,
@@ -160,7 +144,7 @@ def _draw(
     smooth: bool,
     space: str,
 ) -> dict[str, Tensor | Fragments]:
-    """The outputs of :func:`render`. If the face index map is known, it is not drawn again."""
+    """The outputs of :func:`render`."""
     images: dict[str, Tensor | Fragments] = dict.fromkeys(outputs)  # in the requested order
     anti_aliasing = scene.settings.anti_aliasing
     white = "rgb" in images and colors is None and lights is None
@@ -174,7 +158,7 @@ def _draw(
         if white:
             covered = alpha.unsqueeze(-1)
             images["rgb"] = covered + (1 - covered) * behind[:, None, None]
-    elif face_index is None:
+    else:
         face_index = scene.rasterize()
     local = gradient == "local" and ("depth" in images or "normals" in images)
     if "depth" in images and not local:
