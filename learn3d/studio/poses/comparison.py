@@ -37,9 +37,10 @@ class Comparison:
 def compare(views: EstimatedViews) -> Comparison:
     """Compare the most probable azimuths with the true ones.
 
-    The frame is turned by the whole number of degrees with the smallest sum of two mean errors, over all images but
-    those of the test split: that of the azimuths, and that up to half a turn, which alone decides for objects that look
-    the same from front and back. Raises ValueError if the data set has no poses.
+    The frame is turned by the whole number of degrees with the smallest sum of two mean errors,
+    over all images but those of the test split: that of the azimuths, and that up to half a turn,
+    which alone decides for objects that look the same from front and back. Raises ValueError if
+    the data set has no poses.
     """
     if any(dataset.poses is None for dataset in views.datasets):
         raise ValueError("--compare needs true poses, but this data set has none")

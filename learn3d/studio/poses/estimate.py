@@ -5,15 +5,17 @@
 2. Prototypes, shapes for the different kinds of objects, start as the mean shape and are fitted in the same way: EM
    over prototype and pose.
 3. Silhouettes hardly tell front from back, nor the long side of a table from its short side. So a prototype may be
-   turned by 90 or 180 degrees against the others. Nearly equal masks of different prototypes vote for turns. So do
-   peaks of the upper outline: an airplane's fin or a chair's back is at one end of the object. The votes are the
-   couplings of a Potts model whose states are the four turns of each prototype.
+   turned by 90 or 180 degrees against the others. Nearly equal masks of different prototypes vote
+   for turns. So do peaks of the upper outline: an airplane's fin or a chair's back is at one end
+   of the object. The votes are the couplings of a Potts model whose states are the four turns of
+   each prototype.
 4. The posteriors over poses are smoothed over the nearest masks and the nearest mirrored masks. Then steps 2 to 4 are
    repeated with the smoothed posteriors as a prior.
 5. Steps 1 to 4 are repeated from other random shapes, and the posteriors are averaged: a kind of object that is turned
    in one estimate is outvoted by the others.
 
-Objects are assumed to be symmetric about x = 0: the view from azimuth -a is the mirror image of the view from a.
+Objects are assumed to be symmetric about x = 0: the view from azimuth -a is the mirror image of
+the view from a.
 """
 
 from __future__ import annotations
@@ -110,7 +112,8 @@ class Estimate:
 def estimate(data: Masks, fitted: Tensor, candidates: Candidates, options: PoseOptions) -> Estimate:
     """Estimate the poses of N masks, none of them empty. The same arguments and number of threads give the same bits.
 
-    fitted: int64, rows of the masks that shapes are fitted to; of more than MAX_FITTED rows, a random part is used.
+    fitted: int64, rows of the masks that shapes are fitted to; of more than MAX_FITTED rows, a
+    random part is used.
     """
     rng = torch.Generator().manual_seed(options.seed)
     fitted = fitted[torch.randperm(len(fitted), generator=rng)[:MAX_FITTED].sort().values]
@@ -157,13 +160,18 @@ def _near(mass: Tensor, azimuth: Tensor) -> Tensor:
 
 
 def _estimate_once(
-    options: PoseOptions, create: Callable[[], Shapes], data: Masks, of_fitted: Neighbours, of_all: Neighbours
+    options: PoseOptions,
+    create: Callable[[], Shapes],
+    data: Masks,
+    of_fitted: Neighbours,
+    of_all: Neighbours,
 ) -> tuple[Tensor, Tensor, Shapes, Tensor, float]:
     """Steps 1 to 4 on the masks of the shapes that `create` makes, then the posteriors of all masks `data`.
 
-    of_fitted, of_all: the neighbours of the shapes' masks and of `data` among the shapes' masks. Returns, in a frame of
-    its own, the posteriors [N, A, E] of `data` and the added probabilities [N, A] of their nearest masks; the shapes
-    and their mean posteriors [M]; and `Estimate.front_votes`.
+    of_fitted, of_all: the neighbours of the shapes' masks and of `data` among the shapes' masks.
+    Returns, in a frame of its own, the posteriors [N, A, E] of `data` and the added probabilities
+    [N, A] of their nearest masks; the shapes and their mean posteriors [M]; and
+    `Estimate.front_votes`.
     """
     starts = []
     for _ in range(options.restarts):
@@ -195,7 +203,12 @@ class Shapes:
     """
 
     def __init__(
-        self, data: Masks, candidates: Candidates, options: PoseOptions, rng: torch.Generator, bar: tqdm
+        self,
+        data: Masks,
+        candidates: Candidates,
+        options: PoseOptions,
+        rng: torch.Generator,
+        bar: tqdm,
     ) -> None:
         self.data = data
         self.candidates = candidates
@@ -421,8 +434,8 @@ def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
 def _peak_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
     """Votes float64 [TURNS, TURNS, M, M] of the peaks of upper outlines: an airplane's fin, a chair's back.
 
-    The vote of two turned prototypes is the inner product of their mean peaks at all azimuths, each azimuth weighted by
-    the roots of its numbers of masks. prototype, azimuth: int64 [N].
+    The vote of two turned prototypes is the inner product of their mean peaks at all azimuths,
+    each azimuth weighted by the roots of its numbers of masks. prototype, azimuth: int64 [N].
     """
     cells = prototype * azimuths + azimuth
     total = torch.zeros(count * azimuths, SIZE).index_add_(0, cells, _peaks(data.masks)).view(count, azimuths, SIZE)
@@ -442,7 +455,8 @@ def _peak_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
 def _peaks(masks: Tensor) -> Tensor:
     """White top-hat of each mask's upper outline, its parts narrower than _PEAK_WIDTH pixels: float32 [N, SIZE].
 
-    The outline is the height of the topmost pixel of each column above the centre of mass, 0 in empty columns.
+    The outline is the height of the topmost pixel of each column above the centre of mass, 0 in
+    empty columns.
     """
     shown = masks.reshape(-1, SIZE, SIZE) > 0.5
     rows = torch.arange(SIZE, dtype=torch.float32)[:, None]

@@ -37,8 +37,15 @@ def draw_pose_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarra
             dataset, index = places[row]
             pictures.append(natural_colors(dataset.images[np.array([index])], inverted=dataset.inverted)[0])
         columns.append(pictures + [None] * (ROWS - len(pictures)))
-    names = [f"prototype, {float(result.weights[m]):.0%}" for m in order] + ["images", *[""] * (ROWS - 1)]
+    names = [f"prototype, {float(result.weights[m]):.0%}" for m in order] + [
+        "images",
+        *[""] * (ROWS - 1),
+    ]
     titles = [f"{azimuth:g}°" for azimuth in azimuths.tolist()]
     return tile(
-        [*rows, *map(list, zip(*columns, strict=True))], titles, tile_size=TILE, row_titles=names, rules=(len(rows),)
+        [*rows, *map(list, zip(*columns, strict=True))],
+        titles,
+        tile_size=TILE,
+        row_titles=names,
+        rules=(len(rows),),
     )

@@ -99,8 +99,8 @@ def load_views(layout: Layout, data: Path, category: str, views_per_object: int 
 def estimate_views(datasets: Sequence[ViewDataset], cameras: CameraOptions, options: PoseOptions) -> EstimatedViews:
     """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
-    The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight. Raises ValueError if all
-    training masks are empty, or if the data set's poses are rotations.
+    The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight.
+    Raises ValueError if all training masks are empty, or if the data set's poses are rotations.
     """
     elevation, distance, half_fov = _cameras(datasets, cameras)
     size = distance * torch.tan(half_fov.deg2rad())
@@ -165,7 +165,8 @@ def number_objects(datasets: Sequence[ViewDataset]) -> Tensor:
 def _masks(datasets: Sequence[ViewDataset], factor: Tensor) -> Tensor:
     """Masks float32 [N, SIZE^2] in 0 .. 1, read in parts, as images may exceed memory.
 
-    Each is magnified about its centre by its factor: an approximate change of the distance or of the field of view.
+    Each is magnified about its centre by its factor: an approximate change of the distance or of
+    the field of view.
     """
     reduced = []
     for dataset, of_dataset in zip(datasets, factor.split([len(d) for d in datasets]), strict=True):

@@ -1,7 +1,8 @@
 """Procedural shapes: any number of small watertight meshes, without a download.
 
-Frame of all categories: y up, the front (nose of an airplane or car, open side of a chair or sofa) towards +z. Shapes
-are symmetric about x = 0, except L-shaped sofas, desks with one drawer unit, and the like.
+Frame of all categories: y up, the front (nose of an airplane or car, open side of a chair or
+sofa) towards +z. Shapes are symmetric about x = 0, except L-shaped sofas, desks with one drawer
+unit, and the like.
 """
 
 import numpy as np
@@ -19,9 +20,9 @@ CATEGORIES: tuple[str, ...] = tuple(_RECIPES)
 def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
     """A random shape of the category (one of `CATEGORIES`). It depends on the state of `rng` alone, which advances.
 
-    The components are watertight, oriented outwards, and overlap at the joints of the object. It has 150 to 8000 faces,
-    mostly 1000 to 5000. The bounding box is centred at the origin, its longest side is 1. Raises ValueError for an
-    unknown category.
+    The components are watertight, oriented outwards, and overlap at the joints of the object. It
+    has 150 to 8000 faces, mostly 1000 to 5000. The bounding box is centred at the origin, its
+    longest side is 1. Raises ValueError for an unknown category.
 
     >>> make_shape("chair", np.random.default_rng(7)).is_watertight
     True
@@ -35,7 +36,7 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
 def numbered_shape(category: str, seed: int, number: int) -> trimesh.Trimesh:
     """Shape `number` of a data set of generated shapes with this seed; see `make_shape`.
 
-    Exported models know shapes by their numbers (`picture_to_mesh.templates`): after a change of recipes, train and
-    export the package's model again.
+    Exported models know shapes by their numbers (`picture_to_mesh.templates`): after a change of
+    recipes, train and export the package's model again.
     """
     return make_shape(category, np.random.default_rng([seed, 0, number]))

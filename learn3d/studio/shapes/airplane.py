@@ -80,9 +80,10 @@ def fuselage(
 ) -> Part:
     """A fuselage along z from +length/2 (nose) to -length/2, `tall` times as high as wide.
 
-    The nose ends at the share `nose` of the length, and the tail begins at the share `tail_start`. nose_power is the
-    bluntness of the nose: 1 for a cone, 2 for an ellipse. upsweep lifts the end of the tail and droop lowers the tip of
-    the nose, both in radii. tail_radius is the radius at the end, in radii. exponent is that of `ellipse`.
+    The nose ends at the share `nose` of the length, and the tail begins at the share
+    `tail_start`. nose_power is the bluntness of the nose: 1 for a cone, 2 for an ellipse. upsweep
+    lifts the end of the tail and droop lowers the tip of the nose, both in radii. tail_radius is
+    the radius at the end, in radii. exponent is that of `ellipse`.
     """
     ahead = np.array([0.0, 0.02, 0.07, 0.16, 0.3, 0.5, 0.75, 1.0])
     behind = np.array([0.15, 0.35, 0.6, 0.85, 1.0])
@@ -113,7 +114,12 @@ def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     base = 0.25 * radius
     z = -0.5 + root + draw(-0.01, 0.03)
     if kind == "V":
-        side = wing([(0, 0, z - 0.02, root, 0.1), (1.25 * half, 0, z - 0.02 - 0.5 * half * (1 + swept), tip, 0.1)])
+        side = wing(
+            [
+                (0, 0, z - 0.02, root, 0.1),
+                (1.25 * half, 0, z - 0.02 - 0.5 * half * (1 + swept), tip, 0.1),
+            ]
+        )
         return side.rotated("z", draw(32, 45)).moved(y=base).both_sides()
     dihedral = draw(0, 7)
     if kind == "twin":
@@ -139,15 +145,39 @@ def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     return part + Planform(half, chord, tip_chord, lean, dihedral, front, level, thickness=0.1).wing()
 
 
-def along_z(profile: list[tuple[float, float]], radius: float, length: float, sides: int, hollow: bool = False) -> Part:
+def along_z(
+    profile: list[tuple[float, float]],
+    radius: float,
+    length: float,
+    sides: int,
+    hollow: bool = False,
+) -> Part:
     """The solid of revolution about the z axis of a profile [(share of the radius, share of the length)]."""
     return revolve(np.array(profile) * [radius, length], sides, hollow).rotated("x", 90)
 
 
 def nacelle(radius: float, length: float) -> Part:
     """A jet engine along z, centred: an open cowl around a core with a spinner in front and a cone behind."""
-    cowl = [(0.78, -0.5), (0.97, -0.1), (1.0, 0.25), (0.95, 0.45), (0.88, 0.5), (0.8, 0.44), (0.8, 0.0), (0.72, -0.48)]
-    core = [(0.03, 0.42), (0.2, 0.35), (0.22, 0.3), (0.86, 0.28), (0.86, 0.2), (0.55, 0.1), (0.5, -0.5), (0.1, -0.72)]
+    cowl = [
+        (0.78, -0.5),
+        (0.97, -0.1),
+        (1.0, 0.25),
+        (0.95, 0.45),
+        (0.88, 0.5),
+        (0.8, 0.44),
+        (0.8, 0.0),
+        (0.72, -0.48),
+    ]
+    core = [
+        (0.03, 0.42),
+        (0.2, 0.35),
+        (0.22, 0.3),
+        (0.86, 0.28),
+        (0.86, 0.2),
+        (0.55, 0.1),
+        (0.5, -0.5),
+        (0.1, -0.72),
+    ]
     return along_z(cowl, radius, length, 14, hollow=True) + along_z(core, radius, length, 14)
 
 
@@ -190,7 +220,8 @@ def canopy(width: float, height: float, length: float, y: float, z: float) -> Pa
 def gear(belly: float, drop: float, main_x: float, main_z: float, other_z: float) -> Part:
     """A main gear at x = +-main_x, and a nose wheel or, if other_z < main_z, a tail wheel.
 
-    drop: depth of the wheels below the axis of the fuselage. belly: radius of the fuselage at the gear.
+    drop: depth of the wheels below the axis of the fuselage. belly: radius of the fuselage at the
+    gear.
     """
     main = _wheel(0.026)
     top = -0.5 * belly

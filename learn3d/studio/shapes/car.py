@@ -39,7 +39,8 @@ def car(draw: Draw, kind: str) -> Part:
     limits = dict(zip(_FIELDS, zip(least, greatest, strict=True), strict=True))
     body = SimpleNamespace(**draw.measures(**limits), has_bed=kind == "pickup")
     body.shoulder = max(body.belt * body.height, 2 * body.wheel + 0.15)  # height of the shoulder line, above the wheels
-    body.axles = body.wheel + 0.48, body.length - body.wheel - 0.44  # their distances from the front bumper
+    # Distances of the axles from the front bumper.
+    body.axles = body.wheel + 0.48, body.length - body.wheel - 0.44
     part = _hull(body)
 
     x = (body.width - TYRE) / 2 - 0.02
@@ -95,8 +96,17 @@ def _hull(body: SimpleNamespace) -> Part:
     cowl = body.bonnet * length
     roof_rear = body.roof * length
     roof_front = cowl + body.screen * length
-    side_view = [(0, 0.75 * belt), (0.06, 0.9 * belt), (0.22, belt), (cowl, belt + 0.08), (roof_front, body.height)]
-    side_view += [((roof_front + roof_rear) / 2, body.height + 0.015), (roof_rear, body.height - 0.02)]
+    side_view = [
+        (0, 0.75 * belt),
+        (0.06, 0.9 * belt),
+        (0.22, belt),
+        (cowl, belt + 0.08),
+        (roof_front, body.height),
+    ]
+    side_view += [
+        ((roof_front + roof_rear) / 2, body.height + 0.015),
+        (roof_rear, body.height - 0.02),
+    ]
     side_view += [(boot, belt + 0.07), (length - 0.08, belt + 0.04), (length, 0.85 * belt)]
     line = rounded_path(side_view, 0.12, 2)
     line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
@@ -135,7 +145,14 @@ def _hull(body: SimpleNamespace) -> Part:
     lower_y = [floor, floor, cut, cut, middle, shoulder]
     cabin_x = [0.97 * width - 0.03, roof, 0.88 * roof, 0.6 * roof, 0.3 * roof, zero]
     cabin_y = [shoulder + 0.006, edge, 0.5 * (edge + top), top - 0.008, top - 0.002, top]
-    bed_x = [0.95 * width - 0.02, 0.92 * width - 0.05, 0.9 * width - 0.06, inner - 0.03, inner - 0.032, zero]
+    bed_x = [
+        0.95 * width - 0.02,
+        0.92 * width - 0.05,
+        0.9 * width - 0.06,
+        inner - 0.03,
+        inner - 0.032,
+        zero,
+    ]
     bed_y = [rim, rim - 0.01, hump, hump - 0.001, bottom, bottom]
     upper = np.where((bed[0] < s) & (s < bed[1]), [bed_x, bed_y], [cabin_x, cabin_y])
     x, y = np.concatenate([[lower_x, lower_y], upper], 1).transpose(0, 2, 1)  # [S, 12]

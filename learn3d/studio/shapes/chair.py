@@ -5,7 +5,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .draw import Draw, Perhaps, Point, ellipse, points, recipe, rectangle, rounded_path, shares, spread
+from .draw import (
+    Draw,
+    Perhaps,
+    Point,
+    ellipse,
+    points,
+    recipe,
+    rectangle,
+    rounded_path,
+    shares,
+    spread,
+)
 from .parts import Part, X, bar, between, crossbar, join, post, sheet, slab, strip, tube
 from .sofa import upholstered
 from .supports import cantilever, cross, disc, legs, loops, panels, rocker, star
@@ -38,10 +49,32 @@ _LOUNGE = {
     "cushioned": 0.6,
 }
 _OFFICE = {"width": (0.46, 0.56), "depth": (0.44, 0.52), "back_height": (0.4, 0.75)}
-_BAR = {"width": (0.36, 0.44), "depth": (0.34, 0.42), "height": (0.62, 0.78), "back_height": (0.14, 0.4)}
+_BAR = {
+    "width": (0.36, 0.44),
+    "depth": (0.34, 0.42),
+    "height": (0.62, 0.78),
+    "back_height": (0.14, 0.4),
+}
 _STOOLS = {legs: 3, disc: 1.5, loops: 1, panels: 0.3}
-_DINING_SUPPORTS = {legs: 6, loops: 1, cantilever: 1, cross: 0.8, panels: 0.6, disc: 0.7, star: 0.4, rocker: 0.5}
-_LOUNGE_SUPPORTS = {legs: 2.5, loops: 2, cantilever: 1, rocker: 1, star: 0.6, panels: 0.7, cross: 0.7}
+_DINING_SUPPORTS = {
+    legs: 6,
+    loops: 1,
+    cantilever: 1,
+    cross: 0.8,
+    panels: 0.6,
+    disc: 0.7,
+    star: 0.4,
+    rocker: 0.5,
+}
+_LOUNGE_SUPPORTS = {
+    legs: 2.5,
+    loops: 2,
+    cantilever: 1,
+    rocker: 1,
+    star: 0.6,
+    panels: 0.7,
+    cross: 0.7,
+}
 DINING = Family({"throne": Perhaps(0.15, (0.65, 0.85))}, _DINING_SUPPORTS, 0.12, 0.3)
 LOUNGE = Family(_LOUNGE, _LOUNGE_SUPPORTS, 0.5, 0.6)
 OFFICE = Family(_OFFICE, {}, 0.8, 0.6)
@@ -117,7 +150,17 @@ def _join_chair(
     width=(1.0, 2.0),
 )
 def _arm(
-    draw: Draw, back: Point, rise: float, edge: float, base: float, depth: float, *, front, kind, size, width
+    draw: Draw,
+    back: Point,
+    rise: float,
+    edge: float,
+    base: float,
+    depth: float,
+    *,
+    front,
+    kind,
+    size,
+    width,
 ) -> Part:
     """The arm at x > 0, from a point of the back to the front, `rise` above a seat with its edge at x = edge."""
     x, y, rear = back
@@ -127,10 +170,20 @@ def _arm(
     if kind == "panel":
         return between((edge - 0.02, base - 0.02, rear), (edge + 0.03, y, front + 0.02), 0.012)
     if kind == "loop":
-        path = [start, (edge + 0.02, y, front), (edge + 0.02, base, foot_z), (edge - 0.06, base, foot_z)]
+        path = [
+            start,
+            (edge + 0.02, y, front),
+            (edge + 0.02, base, foot_z),
+            (edge - 0.06, base, foot_z),
+        ]
         return tube(rounded_path(path, 0.09), 0.011 + 0.2 * size)
     if kind == "swoop":
-        path = [start, (edge, y + 0.02, 0.2 * front), (edge, y - 0.4 * rise, front), (edge - 0.01, base, foot_z)]
+        path = [
+            start,
+            (edge, y + 0.02, 0.2 * front),
+            (edge, y - 0.4 * rise, front),
+            (edge - 0.01, base, foot_z),
+        ]
         return strip(rounded_path(path, 0.12, 5), size * width, 0.7 * size, side=X)
     path = rounded_path([start, (edge, y, 0.0), (edge, y, front)], 0.1)
     arm = strip(path, size * width, 0.7 * size, side=X)
@@ -268,12 +321,30 @@ def _hoop(draw: Draw, half: float, top: float, curve: float, *, straight, thick,
     support={legs: 2, star: 1, disc: 1, loops: 1, rocker: 0.5},
 )
 def shell_chair(
-    draw: Draw, *, width, depth, height, back, lean, curl, wings, bend, waist, top, thickness, support
+    draw: Draw,
+    *,
+    width,
+    depth,
+    height,
+    back,
+    lean,
+    curl,
+    wings,
+    bend,
+    waist,
+    top,
+    thickness,
+    support,
 ) -> Part:
     """A moulded bucket: one curved sheet for seat and back, on any support."""
     front = depth / 2
     rear = -depth / 2
-    path = [(0, -0.03, front), (0, 0, front - 0.08), (0, -0.02, rear + 0.05), (0, back, rear - lean)]
+    path = [
+        (0, -0.03, front),
+        (0, 0, front - 0.08),
+        (0, -0.02, rear + 0.05),
+        (0, back, rear - lean),
+    ]
     path = rounded_path(path, bend, 5)
     length = np.r_[0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
     t = shares(18)[:, None]  # from the front edge to the top of the back
@@ -308,7 +379,19 @@ def shell_chair(
     exponent=[2.0, 2.0, 3.0],
 )
 def barrel_chair(
-    draw: Draw, *, radius, height, rise, fall, reach_deg, thickness, thicker, gap, slant, cushion, exponent
+    draw: Draw,
+    *,
+    radius,
+    height,
+    rise,
+    fall,
+    reach_deg,
+    thickness,
+    thicker,
+    gap,
+    slant,
+    cushion,
+    exponent,
 ) -> Part:
     """A round seat with a back that wraps around it and falls towards the arms, perhaps with a gap over the seat."""
     reach = np.radians(reach_deg)

@@ -17,8 +17,9 @@ Point = Sequence[float] | np.ndarray  # (x, y, z); in a profile (radius, y)
 class Draw(np.random.Generator):
     """Random numbers and choices: `width = draw(0.4, 0.5)`, `if draw.maybe(0.3)`.
 
-    A *space* says what can be drawn: a pair (least, greatest) a number between them; a range a whole number of it; a
-    list one of its items; a dict one of its keys, in proportion to the values; a probability True or False.
+    A *space* says what can be drawn: a pair (least, greatest) a number between them; a range a
+    whole number of it; a list one of its items; a dict one of its keys, in proportion to the
+    values; a probability True or False.
     """
 
     def __call__(self, least: float, greatest: float) -> float:
@@ -67,7 +68,8 @@ class Perhaps(NamedTuple):
 def recipe(**spaces: Any) -> Callable[[Callable], Callable]:
     """A decorator of `make(draw, ..., *, <names>)`, whose keyword arguments are the named random measures.
 
-    They are drawn in this order, before the body draws others. A measure that the caller gives is not drawn.
+    They are drawn in this order, before the body draws others. A measure that the caller gives is
+    not drawn.
 
     >>> @recipe(width=(0.3, 0.45), arms=0.5)
     ... def seat(draw: Draw, *, width: float, arms: bool): ...

@@ -165,4 +165,11 @@ def chandelier(draw: Draw, *, count, reach, drop, swing, rise, globes, waves) ->
     return column + arm.around(90 + 360 / count * np.arange(count))
 
 
-KINDS = {table_lamp: 3.5, floor_lamp: 2.5, arc_lamp: 1, desk_lamp: 1.5, pendant: 1.8, chandelier: 1.2}
+KINDS = {
+    table_lamp: 3.5,
+    floor_lamp: 2.5,
+    arc_lamp: 1,
+    desk_lamp: 1.5,
+    pendant: 1.8,
+    chandelier: 1.2,
+}

@@ -1,7 +1,7 @@
 """Closed parts of procedural shapes: boxes, slabs, posts, tubes, revolved profiles, sheets, wings.
 
-All parts are lofts, which are watertight for any rings: a shape is a union of closed components. Axes: x right, y up, z
-forward.
+All parts are lofts, which are watertight for any rings: a shape is a union of closed components.
+Axes: x right, y up, z forward.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ X, Y, Z = np.eye(3)
 
 # Thin bars get extra rings: a voxelizer that casts rays on a 32^3 grid misses bars between two grid lines, but it also
 # marks the cell of every vertex. Both lengths are in units of the longest side of the shape.
-THIN, STEP = 0.06, 0.031  # diameter below which a bar is thin, and the largest distance of its rings
+THIN = 0.06  # diameter below which a bar is thin
+STEP = 0.031  # largest distance of its rings
 
 
 class Part(tuple):
@@ -69,7 +70,8 @@ def join(parts: Iterable[Part]) -> Part:
 def loft(rings: np.ndarray | Sequence[np.ndarray], ends: str = "fan") -> Part:
     """The part with one surface: rings [R, N, 3], joined in order.
 
-    ends: "fan" closes each end about its mean, "strip" from point i to N-1-i, "ring" joins the last ring to the first.
+    ends: "fan" closes each end about its mean, "strip" from point i to N-1-i, "ring" joins the
+    last ring to the first.
     """
     return Part([(np.ascontiguousarray(rings), ends)])
 
@@ -111,12 +113,16 @@ def post(foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[
 def revolve(profile: Sequence[Point], sides: int = 16, hollow: bool = False) -> Part:
     """The solid of revolution about the y axis of the profile [(radius > 0, y)].
 
-    With `hollow` the profile is a closed loop that stays off the axis (a lamp shade, an engine nacelle).
+    With `hollow` the profile is a closed loop that stays off the axis (a lamp shade, an engine
+    nacelle).
     """
     profile = np.asarray(profile, dtype=float)
     angle = np.arange(sides) * (2.0 * np.pi / sides)
     radius = np.maximum(profile[:, :1], 1e-4)
-    return loft(points(radius * np.cos(angle), profile[:, 1:], radius * np.sin(angle)), "ring" if hollow else "fan")
+    return loft(
+        points(radius * np.cos(angle), profile[:, 1:], radius * np.sin(angle)),
+        "ring" if hollow else "fan",
+    )
 
 
 def ellipsoid(size: Point, center: Point = (0.0, 0.0, 0.0), sides: int = 14, stacks: int = 8) -> Part:
@@ -127,7 +133,11 @@ def ellipsoid(size: Point, center: Point = (0.0, 0.0, 0.0), sides: int = 14, sta
 
 
 def tube(
-    path: ArrayLike, radius: ArrayLike = 1.0, section: np.ndarray = CIRCLE, closed: bool = False, side: Point = Z
+    path: ArrayLike,
+    radius: ArrayLike = 1.0,
+    section: np.ndarray = CIRCLE,
+    closed: bool = False,
+    side: Point = Z,
 ) -> Part:
     """A tube along a path [P, 3], with mitred bends. section: outline [N, 2]; radius scales it, a number or [P].
 
@@ -189,13 +199,16 @@ def sheet(surface: np.ndarray, thickness: float) -> Part:
 def wing(sections: Sequence[Sequence[float]], upright: bool = False) -> Part:
     """A wing through airfoil sections (span, rise, leading edge z, chord, thickness / chord), nose towards +z.
 
-    The span is along x and the rise along y; `upright` swaps them, for a fin. The airfoil is a symmetric four-digit
-    NACA profile with a blunt trailing edge.
+    The span is along x and the rise along y; `upright` swaps them, for a fin. The airfoil is a
+    symmetric four-digit NACA profile with a blunt trailing edge.
     """
     c = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, 7)))  # dense at the leading edge (0) and the trailing edge (1)
     half = 5.0 * (0.2969 * np.sqrt(c) - 0.1260 * c - 0.3516 * c**2 + 0.2843 * c**3 - 0.1015 * c**4) + 0.02
     span, rise, front, chord, ratio = np.array(sections, dtype=float).T[:, :, None]
-    y, z = rise + np.append(half, -half[::-1]) * chord * ratio, front - np.append(c, c[::-1]) * chord
+    y, z = (
+        rise + np.append(half, -half[::-1]) * chord * ratio,
+        front - np.append(c, c[::-1]) * chord,
+    )
     return loft(points(*((y, span, z) if upright else (span, y, z))), "strip")
 
 

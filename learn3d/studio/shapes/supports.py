@@ -6,16 +6,41 @@ A support reaches from the floor (y = 0) to `height`, and to about x = +-half_x 
 import numpy as np
 
 from .draw import Draw, Perhaps, ellipse, points, recipe, rectangle, rounded_path, shares
-from .parts import Part, X, Y, bar, between, crossbar, ellipsoid, join, post, revolve, slab, strip, tube
+from .parts import (
+    Part,
+    X,
+    Y,
+    bar,
+    between,
+    crossbar,
+    ellipsoid,
+    join,
+    post,
+    revolve,
+    slab,
+    strip,
+    tube,
+)
 
 TAPERED = [(0, 0.6), (1, 1)]  # the profile of a tapered leg
 
 
 @recipe(size=(0.028, 0.055), splay=Perhaps(0.55, (0.02, 0.16)), hairpin=0.1)
-def legs(draw: Draw, half_x: float, half_z: float, height: float, plain: bool = False, *, size, splay, hairpin) -> Part:
+def legs(
+    draw: Draw,
+    half_x: float,
+    half_z: float,
+    height: float,
+    plain: bool = False,
+    *,
+    size,
+    splay,
+    hairpin,
+) -> Part:
     """Four legs, straight or splayed, perhaps with stretchers and an apron; or bent-wire (hairpin) legs.
 
-    size: width of a leg. splay: how far the feet stand out, as a share of the height. plain: tapered legs, no apron.
+    size: width of a leg. splay: how far the feet stand out, as a share of the height. plain:
+    tapered legs, no apron.
     """
     splay *= height
     if hairpin:
@@ -64,7 +89,16 @@ def _leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
         return [(0, 1), (0.1, 1), (0.13, waist), (0.68, waist), (0.72, 1), (1, 1)], False
     if kind == "baluster":
         swell = (draw(0.25, 0.5), 1.25)
-        return [(0, 0.55), (0.06, 0.75), (0.1, 0.5), swell, (0.75, 0.7), (0.82, 1.1), (0.88, 0.8), (1, 1)], True
+        return [
+            (0, 0.55),
+            (0.06, 0.75),
+            (0.1, 0.5),
+            swell,
+            (0.75, 0.7),
+            (0.82, 1.1),
+            (0.88, 0.8),
+            (1, 1),
+        ], True
     a = draw(0.2, 0.35)
     b = draw(0.55, 0.75)
     lower = [(0, 0.5), (a - 0.08, 0.7), (a, 1.05), (a + 0.08, 0.65)]
@@ -91,7 +125,13 @@ def feet(draw: Draw, half_x: float, half_z: float, height: float, *, size, kind)
     return post(foot, (half_x, height, half_z), outline, TAPERED).four_corners()
 
 
-@recipe(reach=(1.05, 1.3), arms={5: 3, 4: 2, 3: 0.6, 6: 0.5}, castors=0.6, hub=(0.02, 0.12), thick=(0.018, 0.032))
+@recipe(
+    reach=(1.05, 1.3),
+    arms={5: 3, 4: 2, 3: 0.6, 6: 0.5},
+    castors=0.6,
+    hub=(0.02, 0.12),
+    thick=(0.018, 0.032),
+)
 def star(draw: Draw, half_x: float, half_z: float, height: float, *, reach, arms, castors, hub, thick) -> Part:
     """A column on a star of 3 to 6 arms, perhaps on castors, with a plate under the seat."""
     reach *= max(half_x, half_z)
@@ -121,7 +161,13 @@ def disc(draw: Draw, half_x: float, half_z: float, height: float, *, reach, thic
     reach *= min(half_x, half_z)
     thick *= 1 + height
     if kind == "disc":
-        profile = [(reach, 0), (reach, 0.02), (reach - 0.015, 0.03), (thick, 0.035), (thick, height + 0.01)]
+        profile = [
+            (reach, 0),
+            (reach, 0.02),
+            (reach - 0.015, 0.03),
+            (thick, 0.035),
+            (thick, height + 0.01),
+        ]
     elif kind == "cone":
         profile = [(reach, 0), (reach, 0.012), (draw(0.6, 1) * thick, height + 0.01)]
     else:
@@ -155,7 +201,12 @@ def loops(draw: Draw, half_x: float, half_z: float, height: float, *, lean, flat
     low = size / 2
     high = height - 0.3 * size
     rear = half_z + rear_lean * lean
-    path = [(foot_x, low, half_z + lean / 2), (half_x, high, half_z), (half_x, high, -half_z), (foot_x, low, -rear)]
+    path = [
+        (foot_x, low, half_z + lean / 2),
+        (half_x, high, half_z),
+        (half_x, high, -half_z),
+        (foot_x, low, -rear),
+    ]
     section = rectangle(1.5 * size, size, segments=1) if flat else ellipse(size, size, 8)
     path = rounded_path(path, 0.012 if flat else draw(0.02, 0.09), 3, closed=True)
     part = tube(path, 1.0, section, closed=True, side=X).both_sides()

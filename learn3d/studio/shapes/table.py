@@ -96,7 +96,12 @@ def _pedestal(draw: Draw, reach: float, under: float) -> Part:
     radius = thick * (1 + 0.4 * np.sin(draw(2, 4) * np.pi * t))
     column = revolve(np.c_[radius, 0.5 * low + t * (top - 0.5 * low)], 14)
     plate = slab(ellipse(reach, reach, 16), 0.03).moved(y=under - 0.025)
-    path = [(0, 1.2 * low, 0), (0.45 * reach, 1.1 * low, 0), (0.75 * reach, 0.1 * low, 0), (reach, 0.025, 0)]
+    path = [
+        (0, 1.2 * low, 0),
+        (0.45 * reach, 1.1 * low, 0),
+        (0.75 * reach, 0.1 * low, 0),
+        (reach, 0.025, 0),
+    ]
     path = rounded_path(path, 0.2, 4)
     foot = strip(path, 1.1 * thick, 1.3 * thick, np.linspace(1.2, 0.7, len(path)))
     count = draw.pick([3, 4])
@@ -139,7 +144,10 @@ def desk(draw: Draw, *, half_x, half_z, height) -> Part:
     drawers = between((left, low, -front), (right, high, front))
     count = draw.count(2, 5) if high - low > 0.4 else 2
     for lower, upper in pairwise(np.linspace(low + 0.01, high - 0.01, count)):
-        drawers += between((left + 0.015, lower + 0.008, front - 0.01), (right - 0.015, upper - 0.008, front + 0.015))
+        drawers += between(
+            (left + 0.015, lower + 0.008, front - 0.01),
+            (right - 0.015, upper - 0.008, front + 0.015),
+        )
         handle = ((left + right) / 2, 0.4 * lower + 0.6 * upper, front + 0.022)
         drawers += bar(handle - 0.05 * X, handle + 0.05 * X, 0.02)
     if low > 0.03:

@@ -1,7 +1,7 @@
 """The report of a table from stored results: the paper's figures beside ours, with confidence intervals.
 
-Our values are not subtracted from the paper's, which are for other meshes. Intervals over test objects are by
-bootstrap, intervals over seeds by Student's t.
+Our values are not subtracted from the paper's, which are for other meshes. Intervals over test
+objects are by bootstrap, intervals over seeds by Student's t.
 """
 
 import html
@@ -43,11 +43,12 @@ _POSE_ERRORS = {  # fields of the JSON file beside a table of poses, and the col
 def resampled_means(sums: Sequence[np.ndarray], counts: Sequence[np.ndarray]) -> np.ndarray:
     """Means of 2,000 resampled test sets, float64 [2000]; NaN if no image of a set has a value.
 
-    sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c, and their number.
-    Objects are drawn with replacement within each category, because the images of an object depend on each other. The
-    result is the mean over the images of a category, then over categories. The draws depend only on the numbers of
-    objects. So results on the same objects can be subtracted: the bootstrap of their difference is paired.
-    (scipy.stats.bootstrap has neither strata nor weights.)
+    sums[c], counts[c] float [N_c]: sum of a measure over the images of each object of category c,
+    and their number. Objects are drawn with replacement within each category, because the images
+    of an object depend on each other. The result is the mean over the images of a category, then
+    over categories. The draws depend only on the numbers of objects. So results on the same
+    objects can be subtracted: the bootstrap of their difference is paired. (scipy.stats.bootstrap
+    has neither strata nor weights.)
     """
     rng = np.random.default_rng(0)
     means = []
@@ -70,20 +71,32 @@ def make_report(
     """The tables "main", "differences", "runs", "curves" and, if poses were estimated, "poses"; the report as Markdown.
 
     "curves" has the validations of each run. The Markdown leaves them out.
-    results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has no path of a machine.
+    results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has
+    no path of a machine.
     """
     table = TABLES[request.table]
     done = [(run, results[run.output]) for run in runs if run.output in results]
     main, differences = _compare_methods(table, select_rows(request), runs, done)
     trained = _run_rows(done)
-    tables = {"main": main, "differences": differences, "runs": trained, "curves": _curve_rows(done)}
+    tables = {
+        "main": main,
+        "differences": differences,
+        "runs": trained,
+        "curves": _curve_rows(done),
+    }
     parts = [f"## {table.title}", _markdown(main), NOTES]
     if missing := [name_run(run) for run in runs if run.output not in results]:
         parts.append(f"Missing: {', '.join(missing)}.")
-    parts += [f"Differences to {table.baseline}, paired by seed and by object:", _markdown(differences)]
+    parts += [
+        f"Differences to {table.baseline}, paired by seed and by object:",
+        _markdown(differences),
+    ]
     if len(poses := _pose_rows(runs, results)) > 1:
         tables["poses"] = poses
-        parts += ["Estimated azimuths of all images, and voxel IoU (kato18) of the trainings:", _markdown(poses)]
+        parts += [
+            "Estimated azimuths of all images, and voxel IoU (kato18) of the trainings:",
+            _markdown(poses),
+        ]
     commands = dict.fromkeys(_general_command(run) for run, _ in done)
     parts += ["What was run:", _markdown(trained), "\n".join(["```sh", *commands, "```"])]
     return tables, "\n\n".join(parts) + "\n"
@@ -128,7 +141,12 @@ def _run_rows(done: Runs) -> Cells:
     """A header, and the measures of each run."""
     rows = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
     for run, result in done:
-        counts = [f"step {result.step}", str(result.iterations), str(run.batch_size), str(result.images)]
+        counts = [
+            f"step {result.step}",
+            str(result.iterations),
+            str(run.batch_size),
+            str(result.images),
+        ]
         minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
         rows.append([name_run(run), *counts, *format_measures(vars(result)), minutes, result.commit])
     return rows
@@ -139,7 +157,14 @@ def _curve_rows(done: Runs) -> Cells:
     rows = [["run", "split", "step", HEADERS[0], "MMD"]]
     for run, result in done:
         for split, step, *values in result.curve:
-            rows.append([name_run(run), split, str(step), *("-" if v is None else f"{v:.4f}" for v in values)])
+            rows.append(
+                [
+                    name_run(run),
+                    split,
+                    str(step),
+                    *("-" if v is None else f"{v:.4f}" for v in values),
+                ]
+            )
     return rows
 
 
@@ -214,7 +239,16 @@ def _pose_rows(runs: Sequence[TrainConfig], results: Mapping[Path, Result]) -> C
             ious = [result.voxel_iou for result in both]
             values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
             by_category.setdefault(run.category, {})[str(run.seed)] = values
-    rows = [["category", "seed", *_POSE_ERRORS.values(), "IoU, known poses", "IoU, estimated poses", "ratio"]]
+    rows = [
+        [
+            "category",
+            "seed",
+            *_POSE_ERRORS.values(),
+            "IoU, known poses",
+            "IoU, estimated poses",
+            "ratio",
+        ]
+    ]
     for category, by_seed in by_category.items():
         if len(by_seed) > 1:
             by_seed["mean"] = np.mean(list(by_seed.values()), axis=0)

@@ -32,8 +32,8 @@ LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # files in a run's folder
 def estimate_poses(config: TrainConfig) -> None:
     """Write the table of estimated poses that a run needs, unless it exists, and a JSON file with its errors.
 
-    The estimate has the run's seed. It is turned into the frame of the data by the angle that fits the training
-    and validation images best.
+    The estimate has the run's seed. It is turned into the frame of the data by the angle that
+    fits the training and validation images best.
     """
     if config.poses.is_file():
         return
@@ -65,8 +65,8 @@ def _measure_updated_poses(config: TrainConfig) -> None:
 def train_and_test(config: TrainConfig) -> bool:
     """Estimate poses if the run needs them, train, measure and write test.json; False if a signal stopped the training.
 
-    An existing run continues; `train` checks that it has the same options and data. Raises as `train` and
-    `evaluate_runs` do.
+    An existing run continues; `train` checks that it has the same options and data. Raises as
+    `train` and `evaluate_runs` do.
     """
     if config.poses is not None:
         estimate_poses(config)
@@ -86,9 +86,10 @@ def train_and_test(config: TrainConfig) -> bool:
 def run_experiment(request: Request, *, work: Callable[[TrainConfig], bool] = train_and_test) -> int:
     """Train and test the missing runs of a table and write its report.
 
-    Returns the exit status: 0, 1 if a run failed, 130 if a signal stopped it. The report of the results so far is
-    written in any case. work: trains and tests a run, and returns False if a signal stopped it. Raises ValueError for
-    an unknown method or option, for runs with other options in the output folder, and for damaged files.
+    Returns the exit status: 0, 1 if a run failed, 130 if a signal stopped it. The report of the
+    results so far is written in any case. work: trains and tests a run, and returns False if a
+    signal stopped it. Raises ValueError for an unknown method or option, for runs with other
+    options in the output folder, and for damaged files.
     """
     threads = request.threads or request.workers.threads
     runs = plan_runs(dataclasses.replace(request, threads=threads))
@@ -161,6 +162,10 @@ def describe_tables() -> str:
         for label, row in table.rows.items():
             about = ["quoted"]
             if variant := VARIANTS.get(row.variant):
-                about = [row.variant, f"preset {variant.preset}", *(f"{n}={v}" for n, v in variant.changes.items())]
+                about = [
+                    row.variant,
+                    f"preset {variant.preset}",
+                    *(f"{n}={v}" for n, v in variant.changes.items()),
+                ]
             lines.append(f"  {label}: {', '.join(about)}")
     return "\n".join(lines)

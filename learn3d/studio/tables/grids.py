@@ -15,7 +15,8 @@ from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, g
 from learn3d.studio.tables.trained_models import TrainedModel
 
 TILE_SIZE = 128  # pixels of a picture in a comparison
-AZIMUTHS_DEG = (-135.0, -45.0)  # views of an interpolation: oblique, along whichever axis the objects face
+# Views of an interpolation: oblique, along whichever axis the objects face.
+AZIMUTHS_DEG = (-135.0, -45.0)
 STEPS = 4  # steps of an interpolation from one image to the next
 
 
@@ -25,9 +26,10 @@ def comparison_grid(
 ) -> np.ndarray:
     """Reconstructions of the same images by runs on one data set: uint8 [H,W,3].
 
-    A group of rows per image: the input, and a row per run with its shape from the input's view and from five more
-    around the object. `title` is above the inputs. All pictures are magnified by the same factor, as far as the shapes
-    allow. With `truth` the first row of a group has the true voxels; raises ValueError if there are none.
+    A group of rows per image: the input, and a row per run with its shape from the input's view
+    and from five more around the object. `title` is above the inputs. All pictures are magnified
+    by the same factor, as far as the shapes allow. With `truth` the first row of a group has the
+    true voxels; raises ValueError if there are none.
     """
     dataset = runs[0].dataset
     batch = dataset.batch(samples)
@@ -55,8 +57,9 @@ def comparison_grid(
 def interpolate(run: TrainedModel, samples: Tensor, *, title: str = "input") -> np.ndarray:
     """Shapes between a run's reconstructions of images, samples int64 [n]: uint8 [H,W,3].
 
-    The first row has the images, each above its reconstruction, and `title` before them. Below it are a row per view of
-    (n - 1) * STEPS + 1 shapes, whose codes are interpolated linearly. Raises ValueError for fewer than two images.
+    The first row has the images, each above its reconstruction, and `title` before them. Below it
+    are a row per view of (n - 1) * STEPS + 1 shapes, whose codes are interpolated linearly.
+    Raises ValueError for fewer than two images.
     """
     if len(samples) < 2:
         raise ValueError(f"an interpolation takes at least two images, got {len(samples)}")
@@ -80,7 +83,12 @@ def interpolate(run: TrainedModel, samples: Tensor, *, title: str = "input") -> 
 
 
 def save_grid(
-    runs: Sequence[TrainedModel], output: Path, *, images: int = 6, indices: Sequence[int] = (), truth: bool = False
+    runs: Sequence[TrainedModel],
+    output: Path,
+    *,
+    images: int = 6,
+    indices: Sequence[int] = (),
+    truth: bool = False,
 ) -> list[Path]:
     """Save a `comparison_grid` for each data set, below each other, as a PNG.
 
@@ -102,7 +110,10 @@ def save_interpolation(
     """Save the interpolation of each run, below each other, as a PNG. images, indices: see `choose_samples`."""
     samples = [choose_samples(run.dataset, images, indices) for run in runs]
     titles = [run.label for run in runs] if len(runs) > 1 else ["input"]
-    return _save([interpolate(*each, title=title) for *each, title in zip(runs, samples, titles, strict=True)], output)
+    return _save(
+        [interpolate(*each, title=title) for *each, title in zip(runs, samples, titles, strict=True)],
+        output,
+    )
 
 
 def choose_samples(dataset: ViewDataset, count: int, indices: Sequence[int] = ()) -> Tensor:

@@ -15,7 +15,8 @@ from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS, Row
 from learn3d.tasks import ONE_WORKER, Workers
 from learn3d.terminal import unknown_name
 
-_FIXED = (*USUAL_OPTIONS, "layout", "device", "threads", "poses")  # options that --set cannot change
+# Options that --set cannot change.
+_FIXED = (*USUAL_OPTIONS, "layout", "device", "threads", "poses")
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,8 @@ def select_rows(request: Request) -> dict[str, Row]:
 def plan_runs(request: Request) -> list[TrainConfig]:
     """The training runs of a request, by category, then row, then seed. Tables that need the same run share its folder.
 
-    Raises ValueError for an unknown method, for a layout without true voxels, and for options that do not fit (see
-    `TrainConfig`).
+    Raises ValueError for an unknown method, for a layout without true voxels, and for options
+    that do not fit (see `TrainConfig`).
     """
     table = TABLES[request.table]
     layout = request.layout or table.layout

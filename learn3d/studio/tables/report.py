@@ -50,7 +50,13 @@ TITLES = {
     "silhouette_iou": "silhouette IoU",
     "mmd": "MMD between views",
 }
-_FIRST = ("voxel_iou", "mmd", "projection", "total")  # the first curves; the others follow in the order of the log
+# The first curves; the others follow in the order of the log.
+_FIRST = (
+    "voxel_iou",
+    "mmd",
+    "projection",
+    "total",
+)
 _NOT_CURVES = {"hollow", "seconds"}
 SECTOR_DEG = 15
 POINTS = 500  # the most points of a curve: every n-th is drawn of a longer one
@@ -73,9 +79,11 @@ def write_report(
 ) -> int:
     """Measure runs on a split as `learn3d evaluate` does, and write the page; returns its size in bytes.
 
-    objects: number of objects whose shapes are shown, from the best to the worst, each in an image of typical IoU.
-    indices: images to show instead (object * views + view). The other options are those of `open_runs`. Raises
-    ValueError or OSError, before anything is measured, for missing files, several categories or different images.
+    objects: number of objects whose shapes are shown, from the best to the worst, each in an
+    image of typical IoU.
+    indices: images to show instead (object * views + view). The other options are those of
+    `open_runs`. Raises ValueError or OSError, before anything is measured, for missing files,
+    several categories or different images.
     """
     if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
         raise ValueError(f"the page can show the shapes of 1 to {MOST_SHOWN} images, got {count}")
@@ -93,7 +101,11 @@ def write_report(
     texts = {kind: Path(__file__).with_suffix(f".{kind}").read_text("utf-8") for kind in ("html", "css", "js")}
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["plain"] = plain
-    parts = {"style": Markup(texts["css"]), "script": Markup(texts["js"]), "plotly": Markup(get_plotlyjs())}
+    parts = {
+        "style": Markup(texts["css"]),
+        "script": Markup(texts["js"]),
+        "plotly": Markup(get_plotlyjs()),
+    }
     content = environment.from_string(texts["html"]).render(page, **parts).encode()
     writing.write_bytes(output, content)
     return len(content)
@@ -114,7 +126,10 @@ def _check_same_images(runs: Sequence[TrainedModel], data: Path | None) -> None:
 
 
 def _measure(
-    runs: Sequence[TrainedModel], results: Sequence[Evaluation], objects: int, indices: Sequence[int]
+    runs: Sequence[TrainedModel],
+    results: Sequence[Evaluation],
+    objects: int,
+    indices: Sequence[int],
 ) -> dict[str, Any]:
     """The values of the template; "browser" is for the script of the page."""
     dataset = runs[0].dataset
@@ -204,7 +219,8 @@ def _mean(values: np.ndarray, axis: int | None = None) -> np.ndarray:
 def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[dict[str, Any]]:
     """For each image the picture and its meshes: one of each run, then the true shape if it is known.
 
-    "reach" is the largest radius of the meshes, "eye" the direction of the camera (an oblique one if it is unknown).
+    "reach" is the largest radius of the meshes, "eye" the direction of the camera (an oblique one
+    if it is unknown).
     """
     dataset = max((run.dataset for run in runs), key=lambda dataset: dataset.image_size)
     batch = dataset.batch(torch.tensor(samples))
@@ -250,7 +266,8 @@ def _mesh(surface: Surface) -> dict[str, Any]:
 def read_metrics(folder: Path) -> Log:
     """The curves in a run folder's metrics.jsonl, but for damaged lines: the run may be writing the last one.
 
-    Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or without numbers.
+    Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or without
+    numbers.
     """
     file = Path(folder) / METRICS
     curves: Log = {}

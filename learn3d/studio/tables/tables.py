@@ -1,7 +1,8 @@
 """The tables of the paper (Peng et al. 2020), and three of our own: tables.csv, and rows.csv with the printed figures.
 
-A new table is a line of tables.csv, and a line of rows.csv for each row. Rows of several tables that name the same
-variant share their runs. Categories have the names of this package: the paper's "Dresser" is ShapeNet's cabinet.
+A new table is a line of tables.csv, and a line of rows.csv for each row. Rows of several tables
+that name the same variant share their runs. Categories have the names of this package: the
+paper's "Dresser" is ShapeNet's cabinet.
 """
 
 import csv
@@ -41,9 +42,21 @@ class Row(NamedTuple):
 
 _PLUS = PlusSettings()
 _PROPOSED, _VANILLA = "peng2020-kato", "peng2020-kato-vanilla"
-_SCHEDULE = {"lr_schedule": "cosine", "warmup_steps": 100, "ema_decay": 0.99, "learning_rate": _PLUS.learning_rate}
+_SCHEDULE = {
+    "lr_schedule": "cosine",
+    "warmup_steps": 100,
+    "ema_decay": 0.99,
+    "learning_rate": _PLUS.learning_rate,
+}
 _SYMMETRY = {"symmetry": "auto"}
-_SHARED_NAMES = ("encoder", "generator", "lambda_area", "clamp_to_cube", "lambda_smooth", "lambda_smooth_end")
+_SHARED_NAMES = (
+    "encoder",
+    "generator",
+    "lambda_area",
+    "clamp_to_cube",
+    "lambda_smooth",
+    "lambda_smooth_end",
+)
 _SHARED = _SCHEDULE | _SYMMETRY | {name: getattr(_PLUS, name) for name in _SHARED_NAMES}
 #: Networks, smoothness and schedule of the table of supervision, whose methods encode as many images as Plus.
 _SUPERVISION = _SCHEDULE | _SYMMETRY | {"encoder": "conv-light", "generator": "sphere", "clamp_to_cube": True}
@@ -105,7 +118,10 @@ def read_tables() -> dict[str, Table]:
         rows.setdefault(line["experiment"], {})[line["method"]] = row
     tables = {}
     for line in _read_csv("tables.csv"):
-        name, categories = line.pop("experiment"), tuple(line["categories"].split()) or tuple(SYNSETS)
+        name, categories = (
+            line.pop("experiment"),
+            tuple(line["categories"].split()) or tuple(SYNSETS),
+        )
         tables[name] = Table(**line | {"categories": categories, "seeds": int(line["seeds"]), "rows": rows[name]})
     return tables
 

@@ -36,8 +36,9 @@ def open_runs(
 ) -> list[TrainedModel]:
     """Open run folders (their checkpoint `which`) or checkpoint files, each with a split of its data.
 
-    `data` and `category` default to those of the training, `labels` to `name_runs`. Raises ValueError without runs, for
-    a wrong number of labels, and if a checkpoint or data set cannot be read.
+    `data` and `category` default to those of the training, `labels` to `name_runs`. Raises
+    ValueError without runs, for a wrong number of labels, and if a checkpoint or data set cannot
+    be read.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to draw")
@@ -48,7 +49,13 @@ def open_runs(
         note(f"opening {path}")
         method, config, metadata = checkpoint.load_method(path, which)
         configs.append(dataclasses.replace(config, data=data or config.data, category=category or config.category))
-        key = (config.layout, configs[-1].data.resolve(), configs[-1].category, method.image_size, config.view_bins)
+        key = (
+            config.layout,
+            configs[-1].data.resolve(),
+            configs[-1].category,
+            method.image_size,
+            config.view_bins,
+        )
         key += (config.poses, config.views_per_object) if data is None else ()
         if key not in datasets:
             datasets[key] = checkpoint.load_data(config, split, data=data, category=category)
@@ -59,7 +66,8 @@ def open_runs(
 def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()) -> list[str]:
     """The names of runs in a figure: `labels`, else those of the presets, with the category if there are several.
 
-    Runs of the same preset and category get the names of their folders. Raises ValueError for a wrong number of labels.
+    Runs of the same preset and category get the names of their folders. Raises ValueError for a
+    wrong number of labels.
     """
     if labels:
         if len(labels) != len(paths):

@@ -37,8 +37,8 @@ _styled = mpl.rc_context(  # a decorator: matplotlib's settings change in the de
 def draw_tsne(runs: Sequence[TrainedModel]) -> Figure:
     """The shape codes of up to 2,000 images by t-SNE: a map for each run, coloured by the azimuths of the cameras.
 
-    Above each map is how often the view is predicted from a code; a colour wheel is the legend. Raises ValueError for
-    data of fewer than 10 images or without poses.
+    Above each map is how often the view is predicted from a code; a colour wheel is the legend.
+    Raises ValueError for data of fewer than 10 images or without poses.
     """
     columns = min(4, len(runs))
     rows = -(-len(runs) // columns)
@@ -60,7 +60,15 @@ def draw_tsne(runs: Sequence[TrainedModel]) -> Figure:
         axes.set_title(run.label, fontsize=11, pad=18)
         accuracy = view_accuracy(codes, dataset.view_ids[samples.numpy()], dataset.object_ids[samples.numpy()])
         caption = "view told from the code: {:.0%} (chance {:.0%})".format(*accuracy) if accuracy else ""
-        axes.text(0.5, 1.02, caption.replace("%", " %"), transform=axes.transAxes, ha="center", va="bottom", fontsize=8)
+        axes.text(
+            0.5,
+            1.02,
+            caption.replace("%", " %"),
+            transform=axes.transAxes,
+            ha="center",
+            va="bottom",
+            fontsize=8,
+        )
         axes.margins(0.06)
         axes.spines[:].set_color("#bbbbbb")
     axes = figure.add_subplot(grid[:, -1], projection="polar")
@@ -88,9 +96,10 @@ def embed(codes: np.ndarray) -> np.ndarray:
 def view_accuracy(codes: np.ndarray, view_ids: np.ndarray, object_ids: np.ndarray) -> tuple[float, float] | None:
     """Accuracies of predicting the view class from codes float [M, C]: by 5 nearest neighbours, and by chance.
 
-    5-fold cross-validation over objects: neighbours are images of other objects. In a code without pose the nearest
-    neighbours are other views of the same object, which would count as errors. Chance always predicts the most frequent
-    view. None if there is a single object or view.
+    5-fold cross-validation over objects: neighbours are images of other objects. In a code
+    without pose the nearest neighbours are other views of the same object, which would count as
+    errors. Chance always predicts the most frequent view. None if there is a single object or
+    view.
     """
     objects = len(np.unique(object_ids))
     if objects < 2 or len(np.unique(view_ids)) < 2:
@@ -104,11 +113,14 @@ def view_accuracy(codes: np.ndarray, view_ids: np.ndarray, object_ids: np.ndarra
 def cyclic_colors(count: int = 256) -> np.ndarray:
     """A cyclic colour map, float [count, 3] in [0, 1], that is safe for every kind of colour vision.
 
-    A circle in CIE Lab through lightness and the blue-yellow axis: dark violet, blue, light green, brown. Opposite
-    directions differ clearly, and no colour is too light for a white page.
+    A circle in CIE Lab through lightness and the blue-yellow axis: dark violet, blue, light
+    green, brown. Opposite directions differ clearly, and no colour is too light for a white page.
     """
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    lab = np.stack([54 - 28 * np.cos(angle), 24 * np.cos(angle) - 16 * np.sin(angle), -50 * np.sin(angle)], axis=1)
+    lab = np.stack(
+        [54 - 28 * np.cos(angle), 24 * np.cos(angle) - 16 * np.sin(angle), -50 * np.sin(angle)],
+        axis=1,
+    )
     return skimage.color.lab2rgb(lab[None])[0].clip(0, 1)
 
 
