@@ -68,7 +68,11 @@ def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:
     if kind in (".3mf", ".dae"):
         from learn3d.files.meshes import read_3mf, read_dae
 
-        return (read_3mf if kind == ".3mf" else read_dae)(file)
+        read, packages = (read_3mf, "lxml networkx") if kind == ".3mf" else (read_dae, "pycollada")
+        try:
+            return read(file)
+        except ImportError:
+            raise ValueError(f"{kind} files need further packages; run `pip install {packages}`") from None
     from learn3d.files.meshes import read_off, read_ply, read_stl
 
     return {".off": read_off, ".ply": read_ply, ".stl": read_stl}[kind](file.read())

@@ -114,13 +114,18 @@ def _ply_element(
     found, offsets = {}, starts[:-1]
     if starts[-1] > len(body):
         raise end
-    content = np.frombuffer(body, np.uint8)
+    content, same = np.frombuffer(body, np.uint8), count > 0 and not np.ptp(sizes, axis=1).any()
     for (column, types), lengths in zip(columns, sizes, strict=True):
         item = types[-1].itemsize
         offsets = offsets + (types[0].itemsize if len(types) > 1 else 0)
-        bytes_of = np.repeat(offsets - item * (np.cumsum(lengths) - lengths), lengths)
-        bytes_of = bytes_of + item * np.arange(len(bytes_of))
-        found[column] = (content[bytes_of[:, None] + np.arange(item)].view(types[-1])[:, 0], lengths)
+        if same:
+            strides = (int(starts[1] - starts[0]), item)
+            values = np.ndarray((count, lengths[0]), types[-1], body, int(offsets[0]), strides).ravel()
+        else:
+            bytes_of = np.repeat(offsets - item * (np.cumsum(lengths) - lengths), lengths)
+            bytes_of = bytes_of + item * np.arange(len(bytes_of))
+            values = content[bytes_of[:, None] + np.arange(item)].view(types[-1])[:, 0]
+        found[column] = (values, lengths)
         offsets = offsets + item * lengths
     return found, int(starts[-1])
 
@@ -152,7 +157,7 @@ def _ply_rows(body: bytes, at: int, count: int, columns: list[list[np.dtype]]) -
                 offset += types[0].itemsize
             offset += length * types[-1].itemsize
         if same:
-            return starts, np.repeat(lengths[:, None], count, axis=1)
+            return starts, np.broadcast_to(lengths[:, None], (len(lengths), count))
     starts, rows = [at], []
     for _ in range(count):
         at, lengths = row(at)

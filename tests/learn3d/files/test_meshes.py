@@ -6,6 +6,7 @@ MESHES=2000 in the environment makes more of them than the usual few.
 from __future__ import annotations
 
 import base64
+import importlib.util
 import json
 import os
 import struct
@@ -317,3 +318,10 @@ def test_meshes_that_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(DamagedFile, match=said) as error:
         read_mesh(tmp_path / name)
     assert FETCH_AGAIN not in str(error.value)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("collada") is not None, reason="pycollada is installed")
+def test_a_missing_package_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.dae").write_text("<COLLADA/>")
+    with pytest.raises(DamagedFile, match="run `pip install pycollada`"):
+        read_mesh(tmp_path / "a.dae")
