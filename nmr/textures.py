@@ -239,7 +239,7 @@ class UVTexture:
 
     def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, int]:
         """All texels ``[., C]``, the place of each level of each image among them, and the number of texels."""
-        image, batch = check_values(self.image, "image", "H, W, C"), fragments.mesh.batch
+        image, batch = _once(check_values(self.image, "image", "H, W, C")), fragments.mesh.batch
         if len(image) not in (1, batch):
             raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
         sizes = [tuple(part.shape[:2]) for part in image]
@@ -287,7 +287,7 @@ def sample_texture(
     >>> nmr.sample_texture(torch.rand(16, 32, 3), torch.rand(1, 8, 8, 2)).shape
     torch.Size([1, 8, 8, 3])
     """
-    image = check_values(image, "image", "h, w, C")
+    image = _once(check_values(image, "image", "h, w, C"))
     if is_list(image) or 0 in image.shape[1:]:
         raise ValueError(f"image must be a tensor [h, w, C] or [B, h, w, C] with texels, got {describe(image)}")
     for values, name, channels in ((uv, "uv", 2), (derivatives, "derivatives", 4)):
@@ -310,6 +310,22 @@ def sample_texture(
         level = steps.square().sum(-2).amax(-1).clamp(min=1).log2() / 2
         level = level.nan_to_num(0).clamp(max=levels - 1)
     return sample_places(texels, grids, level, uv.to(image), wrap)
+
+
+def _once(image: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
+    """One image [1, H, W, C] instead of its copies if it was expanded over the batch; other images as they are.
+
+    The gradient then goes to the tensor that was expanded, which is ``_base`` unless that has more texels.
+    """
+    if is_list(image) or len(image) < 2 or image.stride(0) != 0 or torch.compiler.is_compiling():
+        return image
+    if not image.requires_grad:
+        return image[:1]
+    whole = image._base
+    if image.retains_grad or whole is None or whole.numel() != image[0].numel():
+        return image
+    same = whole.stride()[-3:] == image.stride()[1:] and whole.storage_offset() == image.storage_offset()
+    return whole.view(1, *image.shape[1:]) if same and whole.shape[-3:] == image.shape[1:] else image
 
 
 def level_grids(sizes: list[tuple[int, int]], levels: int) -> tuple[Tensor, int]:

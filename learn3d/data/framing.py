@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageOps
 
+from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile
 from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
@@ -43,6 +44,7 @@ class Framed(NamedTuple):
     mask: np.ndarray  # uint8 [64, 64]
     object_size: float  # larger side of the mask's bounding box over the longer side of the photograph
     touches_border: bool  # True if the mask touches the border of the photograph
+    left_out: str | None  # what its mask has beside the object, see `keep_object`
 
 
 def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
@@ -52,10 +54,11 @@ def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
         check_mask(mask)
     except ValueError as error:
         raise DamagedFile(path, str(error)) from None
+    mask, left_out = keep_object(mask)
     left, top, right, bottom = mask_box(mask)
     object_size = max(right - left, bottom - top) / max(mask.shape)
     touches_border = min(left, top) == 0 or bottom == mask.shape[0] or right == mask.shape[1]
-    return Framed(*frame(colors, mask, size), object_size, touches_border)
+    return Framed(*frame(colors, mask, size), object_size, touches_border, left_out)
 
 
 def _read(path: Path, mask_path: Path | None, optional: bool) -> tuple[np.ndarray, np.ndarray | None]:
@@ -72,28 +75,6 @@ def _read(path: Path, mask_path: Path | None, optional: bool) -> tuple[np.ndarra
     if mask is None and not optional:
         raise DamagedFile(path, "has no transparency and no mask: cut it out, or give a mask")
     return np.asarray(image.convert("RGBA"))[..., :3], mask
-
-
-def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
-    """Raise ValueError for a mask [H, W] that is empty, full, or probably inverted.
-
-    cropped: the object may touch the border of the picture, and cover much of it.
-    """
-    inside = mask > 127
-    if not inside.any():
-        raise ValueError("its mask is empty: no pixel is at least half white, or opaque; white must be the object")
-    if inside.all():
-        raise ValueError("its mask is all white: white must be the object, black the background")
-    border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
-    if border.mean() > (max(0.5, inside.mean()) if cropped else 0.5):
-        question = "is the object black, or is the background part of the mask?"
-        raise ValueError(f"its mask covers {border.mean():.0%} of the border; {question}")
-
-
-def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Bounding box of the pixels above 127: left, top, right, bottom; right and bottom are excluded."""
-    rows, columns = (np.flatnonzero((mask > 127).any(axis=axis)) for axis in (1, 0))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def frame(colors: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -111,8 +111,8 @@ class _Placed(SquarePixels):
         if which:
             warnings.warn(
                 f"camera {which[0]} of {len(rows)} looks along its up vector, or at its own place ({len(which)} in all)"
-                ": it has no left and right, and its image is empty. Give it another up, for example up=(0, 0, 1) to "
-                "look straight down, or another place.",
+                ": it has no left and right. Its image is squeezed to a part of its width, or empty. Give it another "
+                "up, for example up=(0, 0, 1) to look straight down, or another place.",
                 stacklevel=callers_level(),
             )
 

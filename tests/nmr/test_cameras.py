@@ -245,6 +245,10 @@ def test_looking_straight_down_warns_and_another_up_shows_the_object():
         camera = nmr.LookAt.from_angles(3.0, [30.0, 90.0], 0.0)
     alpha = nmr.render_silhouette(sphere, faces, camera, image_size=16)
     assert alpha[0].any() and not alpha[1].any()
+    with pytest.warns(UserWarning, match="squeezed to a part of its width, or empty"):
+        camera = nmr.LookAt.from_angles(3.0, 89.9999, 0.0)
+    squeezed = nmr.render_silhouette(sphere, faces, camera, image_size=16)
+    assert 0 < squeezed.sum() < 0.5 * alpha[0].sum()
     for down in (
         lambda up: nmr.Look([0.0, 3.0, 0.0], [0.0, -1.0, 0.0], up),
         lambda up: nmr.Orthographic([0.0, 3.0, 0.0], up=up),

@@ -238,6 +238,28 @@ def test_colours_have_true_derivatives(kind):
     )
 
 
+@pytest.mark.parametrize("filter", ["bilinear", "mipmap"])
+@pytest.mark.parametrize("kind", ["whole", "turned", "retained", "slice"])
+def test_an_image_that_was_expanded_over_the_batch_counts_once(kind, filter):
+    """The picture and the gradient are those of copies; only plain expansions are not copied."""
+    image = uniform(*((2,) if kind == "slice" else ()), 6, 6, 3).requires_grad_()
+    expanded = {"turned": lambda: image.transpose(0, 1), "slice": lambda: image[1]}.get(kind, lambda: image)()
+    expanded = expanded.expand(4, -1, -1, -1)
+    if kind == "retained":
+        expanded.retain_grad()
+    vertices, faces = screen((1.0, 2.0, 4.0, 3.0))
+    grads, pictures = [], []
+    for each in (expanded, expanded.clone()):
+        rgb = draw(nmr.UVTexture(each, CORNERS, filter=filter), (vertices.expand(4, -1, -1), faces))
+        weight = uniform(*rgb.shape, seed=1)
+        grads.append(torch.autograd.grad((weight * rgb).sum(), image, retain_graph=True)[0])
+        pictures.append(rgb)
+    assert torch.equal(*pictures)
+    torch.testing.assert_close(*grads)
+    assert len(nmr.textures._once(expanded)) == (1 if kind == "whole" else 4)
+    assert len(nmr.textures._once(expanded.detach())) == 1
+
+
 def test_write_your_own():
     class Stripes:
         def sample(self, fragments):

@@ -30,7 +30,7 @@ from learn3d.files import limits
 from learn3d.files.reading import STRICT, DamagedFile, Findings, faults_of, read_text
 from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
-from learn3d.terminal import is_watched
+from learn3d.terminal import is_watched, note
 
 PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("image_size",))
 _SCALE_ODD = 1.7  # factor between sizes in images and table that gives a warning; half angles for whole ones give 2
@@ -83,6 +83,18 @@ def load(
         elif result.touches_border:
             findings.warn(photo.file, "its object touches the border; parts outside the image count as empty")
         framed.append(findings.take(result))
+    left_out = {photo.file: each.left_out for photo, each in zip(chosen, framed, strict=True) if each and each.left_out}
+    for file, what in left_out.items():
+        findings.warn(file, what)
+    unlisted = _unlisted(table, photos)
+    if unlisted:
+        findings.warn(table, unlisted)
+    if findings.strict and split == "train":
+        if unlisted:
+            note(f"note: {table}: {unlisted}")
+        if left_out:
+            file, what = next(iter(left_out.items()))
+            note(f"note: masks with more than the object: {len(left_out)}; the first is of {file}: {what}")
     poses, view_ids, view_names = None, np.zeros(len(chosen), np.int64), ("unknown",)
     if chosen[0].distance is None:
         findings.warn(table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks")
@@ -162,6 +174,15 @@ def read_photo_table(table: Path, findings: Findings) -> list[Photo]:
             if photo := findings.attempt(_photo, table, reader.line_num, row, masks, photos):
                 photos[photo.file] = photo
     return list(photos.values())
+
+
+def _unlisted(table: Path, photos: list[Photo]) -> str | None:
+    """A sentence about images without a row in the table; None if there are none."""
+    listed = {photo.file for photo in photos}
+    files = sorted(path for path in (table.parent / "images").glob("[!.]*") if path not in listed)
+    if not files:
+        return None
+    return f"images without a row, which are not used: {len(files)}, the first is {files[0].name}"
 
 
 def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.framing import check_mask, mask_box
+from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.pictures.photograph import PALETTES, natural_look, photograph
 from learn3d.studio.picture_to_mesh.cutting import Box, correct, find_mask
 from learn3d.studio.picture_to_mesh.reconstruction import Model, mesh_bytes, reconstruct_picture
@@ -46,23 +46,22 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
     return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3].copy(), strokes, box)
 
 
-def find_object(picture: Picture) -> tuple[np.ndarray, bool]:
-    """The object's mask uint8 [H, W], and whether other large regions were found.
+def find_object(picture: Picture) -> tuple[np.ndarray, str | None]:
+    """The object's mask uint8 [H, W], and what was left out, see `keep_object`.
 
-    The mask is the given one, with its corrections; without one it is the largest region found in the box or picture.
+    The mask is the given one, or is found in the box or picture. If it was corrected, nothing is left out.
     """
     if picture.box is None and picture.strokes is not None:
-        return correct(picture.colors, picture.mask, picture.strokes), False
-    if picture.box is None and picture.mask.min() < 255:
-        return picture.mask, False
-    return find_mask(picture.colors, picture.box)
+        return correct(picture.colors, picture.mask, picture.strokes), None
+    given = picture.box is None and picture.mask.min() < 255
+    return keep_object(picture.mask if given else find_mask(picture.colors, picture.box))
 
 
 def make_meshes(models: Mapping[str, Model], picture: Picture, send: Send) -> None:
     """Send the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
     try:
-        mask, more = find_object(picture)
-        send({"mask": _base64(np.packbits(mask > 127).tobytes()), "more": more})
+        mask, left_out = find_object(picture)
+        send({"mask": _base64(np.packbits(mask > 127).tobytes()), "left_out": left_out})
         try:
             check_mask(mask, cropped=True)
         except ValueError:

@@ -18,15 +18,15 @@ _AROUND = 16  # width in pixels of the region around the strokes that GrabCut se
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
 
 
-def find_mask(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, bool]:
-    """Mask uint8 [H, W], 0 or 255, of the largest object in a photograph uint8 [H, W, 3]; whether there are others.
+def find_mask(colors: np.ndarray, box: Box | None = None) -> np.ndarray:
+    """Mask uint8 [H, W], 0 or 255, of the object in a photograph uint8 [H, W, 3], and of other things beside it.
 
     GrabCut finds the object in the box or, without one, in the middle. If there is no box and the background is plain,
     the object is everything that differs from the border's colour. Raises ValueError as `cut_out` does.
     """
     if box is None and is_plain(colors):
-        return largest_region(threshold_mask(colors))
-    return largest_region(cut_out(colors, box))
+        return threshold_mask(colors)
+    return cut_out(colors, box)
 
 
 def is_plain(colors: np.ndarray) -> bool:
@@ -58,16 +58,6 @@ def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarr
     share = ndimage.sum(holes > 0, holes, numbers) / max(1, inside.sum())
     seen_through = plain & (share > HOLES[0]) & (share < HOLES[1])
     return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
-
-
-def largest_region(mask: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The largest connected region of a mask uint8 [H, W], and whether another one has at least a tenth of its size."""
-    regions, count = ndimage.label(mask > 127)
-    if count < 2:
-        return mask, False
-    sizes = np.bincount(regions.ravel())[1:]
-    second, first = np.sort(sizes)[-2:]
-    return np.where(regions == 1 + sizes.argmax(), mask, np.uint8(0)), bool(10 * second >= first)
 
 
 def cut_out(colors: np.ndarray, box: Box | None = None) -> np.ndarray:

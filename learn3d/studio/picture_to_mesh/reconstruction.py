@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.framing import MEAN_OBJECT_SIZE, Crops, check_mask, mask_box, read_photo
+from learn3d.data.framing import MEAN_OBJECT_SIZE, Crops, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
+from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.data.poses import Poses
 from learn3d.files import writing
 from learn3d.methods.mesh_method import MeshMethod, refine
@@ -79,7 +80,8 @@ def cut_out_pictures(model: Model, folder: Path) -> Tensor:
     files = sorted(folder.rglob("*.png"))
     if not files:
         raise ValueError(f"there is no PNG file in {folder}")
-    return torch.from_numpy(np.stack([model.prepare(*read_photo(path)) for path in files]))
+    photos = ((colors, keep_object(mask)[0]) for colors, mask in map(read_photo, files))
+    return torch.from_numpy(np.stack([model.prepare(*photo) for photo in photos]))
 
 
 def reconstruct_files(
@@ -189,14 +191,15 @@ def _read(path: Path, mask_path: Path | None = None, box: Box | None = None) -> 
             how = "as all that differs from the plain background" if is_plain(colors) else "by GrabCut in the middle"
             wrong = "if the outline in the strip of views is wrong, give --box or --masks"
             note(f"note: {path} has no transparency, so the object was searched, {how}; {wrong}")
-        mask, more = find_mask(colors, box)
-        if more:
-            note(f"note: {path}: several parts were found, and only the largest is used")
+        mask = find_mask(colors, box)
     try:
         check_mask(mask, cropped=not searched)
     except ValueError as error:
         missed = "no object was found in this photograph. Give --box or --masks, or cut the object out (transparency)"
         raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
+    mask, left_out = keep_object(mask)
+    if left_out:
+        note(f"note: {path}: {left_out}")
     return colors, mask
 
 
@@ -341,14 +344,14 @@ def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
     """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed, normals outwards.
 
     The object frame is left-handed, so the mesh is reflected and the order of each face reversed. A GLB has the texture
-    or else the vertex colours, a PLY only the vertex colours. `name` is the node's in a GLB, whose material is
+    or else the vertex colours, OBJ and PLY only the vertex colours. `name` is the node's in a GLB, whose material is
     double-sided: learnt surfaces cross themselves, and viewers would hide the faces that are seen from behind.
     """
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
     if kind == "glb" and surface.texture is not None:
         mesh = _with_texture(mesh, *surface.texture)
-    elif surface.colors is not None and kind != "obj":
+    elif surface.colors is not None:
         colors = surface.colors.detach().cpu().clamp(0, 1)
         colors = colors**2.2 if kind == "glb" else colors  # colours of vertices in a GLB are linear
         mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()

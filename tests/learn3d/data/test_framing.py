@@ -10,7 +10,8 @@ import torch
 from PIL import Image
 
 import nmr
-from learn3d.data.framing import check_mask, frame, mask_box, read_photo
+from learn3d.data.framing import frame, read_photo
+from learn3d.data.masks import mask_box
 
 
 def silhouette(size: int) -> np.ndarray:
@@ -112,23 +113,3 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
     path = save(tmp_path / "b.png", np.full((8, 6), 30_000, np.uint16))
     with pytest.raises(ValueError, match=r"b.png: has more than 8 bits a pixel and channel \(.*\); save it with 8"):
         read_photo(path, path)
-
-
-@pytest.mark.parametrize(("outside", "message"), [(100, "its mask is empty"), (255, "its mask is all white")])
-def test_empty_and_full_masks_are_told_apart(outside: int, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        check_mask(np.full((5, 5), outside, np.uint8))
-
-
-def test_inverted_masks_are_refused_but_not_tight_ones() -> None:
-    inverted = np.full((50, 50), 255, np.uint8)
-    inverted[10:40, 10:40] = 0
-    check_mask(255 - inverted)
-    for cropped in (False, True):
-        with pytest.raises(ValueError, match=r"its mask covers 100% of the border; is the object black"):
-            check_mask(inverted, cropped=cropped)
-    tight = np.full((50, 50), 255, np.uint8)
-    tight[:8, :8] = 0  # a cabinet, cut out at its edges
-    check_mask(tight, cropped=True)
-    with pytest.raises(ValueError, match="of the border"):
-        check_mask(tight)

@@ -294,3 +294,22 @@ def test_objects_that_are_cut_off_are_warned_of(chairs: Path) -> None:
     Image.fromarray(mask).save(path)
     message = "its object touches the border; parts outside the image count as empty"
     assert check(chairs, "warning") == [("chair002_0.jpg", message)]
+
+
+def test_masks_with_more_than_the_object_and_images_without_a_row_are_said(chairs: Path, capsys) -> None:
+    clean = photos.load(chairs.parent, "chair", "train")
+    path = chairs / "masks" / "chair002_0.png"
+    mask = np.array(Image.open(path))
+    mask[4:20, 4:20] = 255
+    mask[200, 300] = 255
+    Image.fromarray(mask).save(path)
+    for name in ("b.jpg", "a.jpg", ".hidden"):
+        shutil.copyfile(chairs / "images" / "chair002_0.jpg", chairs / "images" / name)
+    unlisted = "images without a row, which are not used: 2, the first is a.jpg"
+    (first, left_out), second = check(chairs, "warning")
+    assert (first, second) == ("chair002_0.jpg", ("poses.csv", unlisted))
+    assert re.fullmatch(r"2 parts away from the object, \d% of its size, were left out", left_out)
+    assert capsys.readouterr().err == ""
+    np.testing.assert_array_equal(photos.load(chairs.parent, "chair", "train").images, clean.images)
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].endswith(unlisted) and said[1].startswith("note: masks with more than the object: 1; the first is of")

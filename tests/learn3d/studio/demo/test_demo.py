@@ -14,11 +14,12 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
+from learn3d.data.masks import keep_object
 from learn3d.data.poses import wrap_deg
 from learn3d.pictures.surfaces import Surface
 from learn3d.studio.demo import picture as pictures
 from learn3d.studio.picture_to_mesh import reconstruction
-from learn3d.studio.picture_to_mesh.cutting import largest_region, threshold_mask
+from learn3d.studio.picture_to_mesh.cutting import threshold_mask
 from learn3d.studio.picture_to_mesh.export import export
 from learn3d.studio.picture_to_mesh.reconstruction import input_azimuth_deg, load_model
 from learn3d.studio.shapes import make_shape
@@ -36,14 +37,14 @@ def photo() -> np.ndarray:
 
 
 def test_the_mask_is_the_largest_region_and_only_the_background_makes_holes(photo) -> None:
-    mask, more = largest_region(threshold_mask(photo, 0.2))
+    mask, left_out = keep_object(threshold_mask(photo, 0.2))
     assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
     assert np.array_equal(mask > 0, np.hypot(*np.ogrid[-50:50, -80:80]) < 30)
-    assert not more and not threshold_mask(photo, 0.9).any()
+    assert left_out is None and not threshold_mask(photo, 0.9).any()
     photo[45:55, 75:85] = photo[:10, :10]
-    assert (largest_region(threshold_mask(photo, 0.05))[0] == 0)[45:55, 75:85].all(), "the background is seen"
+    assert (keep_object(threshold_mask(photo, 0.05))[0] == 0)[45:55, 75:85].all(), "the background is seen"
     photo[5:40, 5:40] = 0
-    assert largest_region(threshold_mask(photo, 0.2))[1], "a second thing"
+    assert keep_object(threshold_mask(photo, 0.2))[1], "a second thing"
 
 
 def test_pixels_are_unpacked_as_the_page_packs_them() -> None:
@@ -58,12 +59,19 @@ def test_pixels_are_unpacked_as_the_page_packs_them() -> None:
 def test_the_object_is_given_or_found_or_corrected(photo) -> None:
     unknown, given = np.full((100, 160), 255, np.uint8), np.zeros((100, 160), np.uint8)
     given[20:40, 20:40] = 200
-    ring, _ = largest_region(threshold_mask(photo))
+    ring, _ = keep_object(threshold_mask(photo))
     assert np.array_equal(pictures.find_object(pictures.Picture(photo, unknown))[0], ring)
     assert np.array_equal(pictures.find_object(pictures.Picture(photo, given))[0], given)
+    apart = given.copy()
+    apart[60:80, 100:120] = 255
+    found, left_out = pictures.find_object(pictures.Picture(photo, apart))
+    assert np.array_equal(found, given) and left_out.startswith("several objects of similar size")
     strokes = np.zeros_like(given)
     strokes[10:20, 20:40] = 1
+    given[90, 150] = 255
     corrected, _ = pictures.find_object(pictures.Picture(photo, given, strokes))
+    assert corrected[90, 150], "a correction keeps everything"
+    corrected[90] = 0
     assert np.flatnonzero(corrected.any(axis=1)).tolist() == list(range(10, 40))
     assert (pictures.find_object(pictures.Picture(photo, unknown, None, (40, 10, 80, 80)))[0] != ring).mean() < 0.02
 
@@ -75,7 +83,7 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
     sent: list[dict] = []
     models = {"my run": load_model(finished_run)}
     pictures.make_meshes(models, pictures.Picture(colors.copy(), alpha[..., 0]), sent.append)
-    assert "mask" in sent[0] and not sent[0]["more"] and [each["part"] for each in sent[1:-1]] == [0.0, 0.3, 0.7, 0.9]
+    assert "mask" in sent[0] and sent[0]["left_out"] is None and [each["part"] for each in sent[1:-1]] == [0.0, 0.3, 0.7, 0.9]
     (result,) = sent[-1]["meshes"]
     glb = base64.b64decode(result["glb"])
     assert result["label"] == "my run" and b"COLOR_0" in glb

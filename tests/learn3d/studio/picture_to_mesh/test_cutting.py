@@ -56,7 +56,7 @@ def test_plain_backgrounds_need_no_opencv(scene, monkeypatch) -> None:
     plain = np.where(inside[..., None], colors, np.uint8(230))
     assert is_plain(plain)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    assert overlap(find_mask(plain)[0], inside) > 0.99
+    assert overlap(find_mask(plain), inside) > 0.99
     with pytest.raises(ValueError, match=r"nmr-learn3d\[photos\]"):
         find_mask(colors)
 

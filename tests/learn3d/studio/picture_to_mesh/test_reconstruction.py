@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import numpy as np
@@ -9,11 +10,13 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scipy.ndimage import maximum_filter
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.framing import Crops
 from learn3d.pictures.surfaces import Surface
+from learn3d.studio.demo.picture import example
 from learn3d.studio.picture_to_mesh.reconstruction import (
     _read,
     export_mesh,
@@ -23,6 +26,7 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     reconstruct,
     reconstruct_dataset,
     reconstruct_files,
+    reconstruct_picture,
 )
 
 
@@ -50,9 +54,27 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
         _read(tmp_path / "plain.png")
     picture[40:80, 120:150] = 0
     Image.fromarray(picture).save(tmp_path / "two.png")
-    for name, said in (("box.png", "differs from the plain background; if"), ("two.png", "several parts were found")):
+    for name, said in (("box.png", "differs from the plain background; if"), ("two.png", "one part away from the object, 33% of its size")):
         mask = _read(tmp_path / name)[1]
         assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60 and said in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("category", "specks"), [("chair", 1), ("airplane", 12), ("sofa", 30)])
+def test_specks_change_neither_kind_nor_outline(category: str, specks: int, tmp_path, capsys) -> None:
+    rng, model = np.random.default_rng(specks), load_model(None)
+    with Image.open(io.BytesIO(example(category))) as image:
+        clean = np.pad(np.asarray(image), ((40, 90), (130, 20), (0, 0)))
+    dirty = clean.copy()
+    free = np.argwhere(maximum_filter(clean[..., 3], 9) == 0)
+    for y, x in free[rng.integers(len(free), size=specks)]:
+        dirty[y - 2 : y + rng.integers(1, 3), x - 2 : x + rng.integers(1, 3)] = (*rng.integers(0, 256, 3), 255)
+    made = []
+    for name, picture in (("clean", clean), ("dirty", dirty)):
+        Image.fromarray(picture).save(tmp_path / f"{name}.png")
+        made.append(reconstruct_picture(model, *_read(tmp_path / f"{name}.png")))
+    assert made[0].kind == made[1].kind == category and (made[0].warning is None) == (made[1].warning is None)
+    assert made[0].silhouette_iou == pytest.approx(made[1].silhouette_iou, abs=0.02)
 
 
 def test_results_never_replace_the_images(finished_run, tmp_path) -> None:
@@ -132,11 +154,12 @@ def test_mesh_files_are_right_handed_with_normals_outwards(tmp_path, kind: str) 
     assert np.allclose(mesh.extents, [0.4, 0.6, 1.0], atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["glb", "ply"])
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
 def test_colours_of_vertices_are_kept(tmp_path, kind: str) -> None:
     vertices, faces = nmr.icosphere(1)
     colors = (vertices - vertices.min()) / (vertices.max() - vertices.min())
     export_mesh(tmp_path / f"chair.{kind}", Surface(vertices, faces, colors))
+    assert [path.name for path in tmp_path.iterdir()] == [f"chair.{kind}"]
     (mesh,) = trimesh.load(tmp_path / f"chair.{kind}", force="scene", process=False).geometry.values()
     found = mesh.visual.vertex_attributes["color"] if kind == "glb" else mesh.visual.vertex_colors
     wanted = colors.numpy() ** (2.2 if kind == "glb" else 1)  # those of a GLB are linear
