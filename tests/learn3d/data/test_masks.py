@@ -27,7 +27,7 @@ def rectangle(mask: np.ndarray, x: int, y: int, width: int, height: int, factor:
     [
         ([], 0, None),
         ([(390, 290, 1, 1)], 0, None),
-        ([(390, 290, 1, 1), (0, 0, 3, 3), (184, 150, 1, 1)], 0, None),
+        ([(390, 290, 1, 1), (0, 0, 3, 3), (190, 150, 1, 1)], 0, None),
         ([(330, 20, 20, 20)], 0, "one part away from the object, 4% of its size, was left out"),
         ([(330, 20, 8, 8), (5, 5, 10, 9)], 0, "2 parts away from the object, 1% of its size, were left out"),
         ([(260, 90, 100, 100)], 0, "several objects of similar size were found, and only the largest is used"),

@@ -83,7 +83,11 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
     sent: list[dict] = []
     models = {"my run": load_model(finished_run)}
     pictures.make_meshes(models, pictures.Picture(colors.copy(), alpha[..., 0]), sent.append)
-    assert "mask" in sent[0] and sent[0]["left_out"] is None and [each["part"] for each in sent[1:-1]] == [0.0, 0.3, 0.7, 0.9]
+    assert (
+        "mask" in sent[0]
+        and sent[0]["left_out"] is None
+        and [each["part"] for each in sent[1:-1]] == [0.0, 0.3, 0.7, 0.9]
+    )
     (result,) = sent[-1]["meshes"]
     glb = base64.b64decode(result["glb"])
     assert result["label"] == "my run" and b"COLOR_0" in glb

@@ -54,9 +54,15 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
         _read(tmp_path / "plain.png")
     picture[40:80, 120:150] = 0
     Image.fromarray(picture).save(tmp_path / "two.png")
-    for name, said in (("box.png", "differs from the plain background; if"), ("two.png", "one part away from the object, 33% of its size")):
+    sentences = {
+        "box.png": "differs from the plain background; if",
+        "two.png": "one part away from the object, 33% of its size",
+    }
+    for name, said in sentences.items():
         mask = _read(tmp_path / name)[1]
-        assert mask[30:90, 50:110].all() and mask.sum() == 255 * 60 * 60 and said in capsys.readouterr().err
+        assert mask[30:90, 50:110].all()
+        assert mask.sum() == 255 * 60 * 60
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.slow
