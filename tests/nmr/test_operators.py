@@ -137,6 +137,21 @@ print("torch._dynamo" in sys.modules)
     assert run.stdout.strip() == "False"
 
 
+@pytest.mark.parametrize("kernel", ["silhouette", "silhouette_backward"])
+@pytest.mark.parametrize("differentiate", [gradient, lambda f, v: torch.func.grad(f)(v)], ids=["autograd", "func"])
+def test_an_allocation_that_fails_in_a_kernel_is_reported_once(kernel, differentiate, monkeypatch):
+    calls = []
+
+    def fail(**arguments):
+        calls.append(kernel)
+        raise MemoryError("std::bad_alloc")
+
+    monkeypatch.setattr(nmr._C, kernel, fail)
+    with pytest.raises(MemoryError, match=r"^std::bad_alloc$"):
+        differentiate(FUNCTIONS["silhouette"], SPHERE)
+    assert calls == [kernel]
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_a_forked_process_renders_with_one_thread():
     """As docs/performance.md says: with more threads it would wait for those of its parent, in torch, too."""

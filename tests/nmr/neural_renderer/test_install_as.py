@@ -39,7 +39,7 @@ def no_alias(monkeypatch, tmp_path):
     """No test sees the alias of another, and none leaves one."""
 
     def belongs(key):
-        return key.partition(".")[0] in ("neural_renderer", "body", "nmr_alias")
+        return key.partition(".")[0] in ("neural_renderer", "body", "external", "nmr_alias")
 
     for key in filter(belongs, list(sys.modules)):
         monkeypatch.delitem(sys.modules, key)
@@ -112,15 +112,13 @@ def test_a_copy_inside_of_a_package(tmp_path):
     assert namespace["nr"] is namespace["same"] is nr
 
 
-def test_a_copy_inside_of_a_package_that_does_not_exist():
-    nr.install_as("nmr_alias.external.neural_renderer")
+@pytest.mark.parametrize("parent", ["external", "nmr_alias.external"])
+def test_a_copy_inside_of_a_package_that_does_not_exist(parent):
+    nr.install_as(f"{parent}.neural_renderer")
     namespace = {}
-    exec(
-        "import nmr_alias.external.neural_renderer as nr\nfrom nmr_alias.external import neural_renderer as same",
-        namespace,
-    )
+    exec(f"import {parent}.neural_renderer as nr\nfrom {parent} import neural_renderer as same", namespace)
     assert namespace["nr"] is namespace["same"] is nr
-    assert importlib.import_module("nmr_alias.external.neural_renderer.look").look is nr.look
+    assert importlib.import_module(f"{parent}.neural_renderer.look").look is nr.look
 
 
 def test_an_alias_by_hand_has_its_modules():
