@@ -89,12 +89,11 @@ def load(
     unlisted = _unlisted(table, photos)
     if unlisted:
         findings.warn(table, unlisted)
-    if findings.strict and split == "train":
-        if unlisted:
-            note(f"note: {table}: {unlisted}")
-        if left_out:
-            file, what = next(iter(left_out.items()))
-            note(f"note: masks with more than the object: {len(left_out)}; the first is of {file}: {what}")
+    if findings.strict and unlisted and split == "train":
+        note(f"note: {table}: {unlisted}")
+    if findings.strict and left_out:
+        file, what = next(iter(left_out.items()))
+        note(f"note: masks with more than the object: {len(left_out)}; the first is of {file}: {what}")
     poses, view_ids, view_names = None, np.zeros(len(chosen), np.int64), ("unknown",)
     if chosen[0].distance is None:
         findings.warn(table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks")

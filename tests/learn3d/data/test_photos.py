@@ -297,7 +297,7 @@ def test_objects_that_are_cut_off_are_warned_of(chairs: Path) -> None:
 
 
 def test_masks_with_more_than_the_object_and_images_without_a_row_are_said(chairs: Path, capsys) -> None:
-    clean = photos.load(chairs.parent, "chair", "train")
+    clean = {split: photos.load(chairs.parent, "chair", split).images for split in ("train", "val", "test")}
     path = chairs / "masks" / "chair002_0.png"
     mask = np.array(Image.open(path))
     mask[4:20, 4:20] = 255
@@ -312,7 +312,8 @@ def test_masks_with_more_than_the_object_and_images_without_a_row_are_said(chair
     assert found["poses.csv"] == unlisted
     assert re.fullmatch(r"2 parts away from the object, \d% of its size, were left out", left_out)
     assert capsys.readouterr().err == ""
-    np.testing.assert_array_equal(photos.load(chairs.parent, "chair", "train").images, clean.images)
+    for split, images in clean.items():
+        np.testing.assert_array_equal(photos.load(chairs.parent, "chair", split).images, images)
     said = capsys.readouterr().err.splitlines()
     assert said[0].endswith(unlisted)
     assert said[1].startswith("note: masks with more than the object: 1; the first is of")
