@@ -7,6 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from learn3d.runs.distributed import all_reduce_mean
+
 
 def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:
     """L_cls: mean over the batch of -log p(view | code) (the paper's eq. 3).
@@ -41,8 +43,9 @@ def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     error = (depth - target) * both
     rows, columns = both[:, 2:] & both[:, :-2], both[:, :, 2:] & both[:, :, :-2]
     down, right = (error[:, 2:] - error[:, :-2]).abs() * rows, (error[:, :, 2:] - error[:, :, :-2]).abs() * columns
-    slope = down.sum() / rows.sum().clamp(min=1) + right.sum() / columns.sum().clamp(min=1)
-    return error.abs().sum() / both.sum().clamp(min=1), slope
+    counts = torch.stack([pixels.sum().float() for pixels in (both, rows, columns)])
+    all_pixels, in_rows, in_columns = all_reduce_mean(counts).clamp(min=1)
+    return error.abs().sum() / all_pixels, down.sum() / in_rows + right.sum() / in_columns
 
 
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:

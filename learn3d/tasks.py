@@ -113,7 +113,7 @@ def _executor(workers: Workers) -> Iterator[tuple[concurrent.futures.Executor, A
     except ModuleNotFoundError:
         raise ValueError("--cluster needs the package distributed; install the extra cluster of this package") from None
     try:
-        client = Client(workers.cluster, timeout=10, set_as_default=False)
+        client = Client(workers.cluster, timeout=30, set_as_default=False)
     except (OSError, ValueError) as error:
         advice = "start one (dask scheduler), and give the address that it prints (tcp://HOST:8786)"
         raise OSError(f"no Dask scheduler answers at {workers.cluster} ({error}); {advice}") from None

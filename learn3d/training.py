@@ -7,7 +7,7 @@ import time
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.mirror_plane import find_mirror_plane
-from learn3d.data.sampling import batches
+from learn3d.data.sampling import VIEWS_OF_OBJECT, batches
 from learn3d.device import keep_freed_memory, resolve_precision
 from learn3d.evaluation import NO_MMD, evaluate, spread_samples
 from learn3d.methods import create_method
@@ -16,9 +16,10 @@ from learn3d.methods.method import Losses, Method
 from learn3d.methods.pose_updates import update_poses, update_steps
 from learn3d.pictures.grid import picture_grid
 from learn3d.pictures.sheets import save_png
+from learn3d.runs import distributed
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress, load_data
-from learn3d.runs.log import RunLog, check_log
+from learn3d.runs.log import RunLog, check_log, open_log
 from learn3d.runs.run import Run, Summary, describe_images
 from learn3d.runs.threads import ThreadTuner
 from learn3d.terminal import stop_on_signal
@@ -51,9 +52,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **options)
         empty_masks = train_set.check_masks()  # it may raise, like the next line, before `begin` removes an older run
-        method.check_batch(next(batches(train_set, config)))
+        rows = distributed.own_rows(config.batch_size, VIEWS_OF_OBJECT[config.settings.sampling or "views"])
+        method.check_batch(next(batches(train_set, config, rows=rows)))
         run = Run(config, method, info, describe_images(train_set), train_set.candidates)
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
+        distributed.check_same(options=config, data=run.data, step=progress.step, versions=run.versions)
+        distributed.synchronize(method.networks, method.optimizers.values())
         if progress.step == config.iterations:
             return Summary(folder, progress, True, time.monotonic() - started)
         estimated = train_set.candidates is not None and isinstance(method, MeshMethod)
@@ -64,14 +68,14 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         with (
             run_folder.advice_on_errors(folder),
             stop_on_signal() as stop,
-            RunLog(config, start=progress.step) as log,
+            open_log(config, start=progress.step) as log,
         ):
             for warning in filter(None, (*notes, empty_masks)):
                 log.say(f"warning: {warning}")
             log.say(run.describe(progress, train_set, val_set, threads))
-            for step, batch in enumerate(batches(train_set, config, start), start):
+            for step, batch in enumerate(batches(train_set, config, start, rows), start):
                 step_began = time.monotonic()
-                losses = take_step(method, batch, step)
+                losses, stopped_by = distributed.mean_losses(take_step(method, batch, step), stop.name)
                 if chosen := threads.after_step(time.monotonic() - step_began):
                     log.say(f"step {step}: {chosen}")
                 recent = progress.losses | losses  # the last two steps: some methods alternate between two networks
@@ -79,7 +83,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                 progress = dataclasses.replace(progress, **state, seconds=before + time.monotonic() - started)
                 log.step(step, losses)
 
-                last, stopped_by = step == config.iterations, stop.name
+                last = step == config.iterations
                 if last or step % config.log_every == 0:
                     log.metrics(step, "train", recent)
                 if step in updates:
@@ -114,7 +118,7 @@ def take_step(method: Method, batch: Batch, step: int) -> dict[str, float]:
         values |= loss_values(losses, step)
         total += sum(weight * values[name] for name, (weight, _) in losses.items())
         weighted = sum(weight * loss for weight, loss in losses.values())
-        weighted.backward()
+        (weighted / distributed.size()).backward()
         for name in names:
             optimizers[name].step()
         for optimizer in optimizers.values():
@@ -158,6 +162,8 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
     """Write pictures/<step>.png: the same few validation images of different objects and views each time."""
+    if distributed.rank() > 0:
+        return
     samples = spread_samples(val_set.object_ids, val_set.view_ids, PICTURE_ROWS)
     grid = picture_grid(method, val_set, samples)
     folder = config.output / run_folder.PICTURES

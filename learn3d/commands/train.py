@@ -9,6 +9,7 @@ from learn3d.commands.command import Command, OnDataset, Runs
 from learn3d.config import DEFAULT_PRESET, FROM_PRESET, TrainConfig, load_config
 from learn3d.files.writing import check_target, write_json
 from learn3d.presets import PRESETS, SHORT_NAMES, full_name
+from learn3d.runs.distributed import join_ranks, rank
 from learn3d.runs.measurement import MEASURES, class_means, evaluate_runs, format_table
 from learn3d.terminal import INTERRUPTED, align, say
 from learn3d.training import train
@@ -59,8 +60,10 @@ class Train(Command):
         """Train and print a summary. The exit status is 130 if a signal stopped the training."""
         if self.resume and self.overwrite:
             raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
-        summary = train(self.config, resume=self.resume, overwrite=self.overwrite)
-        say(str(summary))
+        with join_ranks(self.config.device):
+            summary = train(self.config, resume=self.resume, overwrite=self.overwrite)
+            if rank() == 0:
+                say(str(summary))
         return 0 if summary.finished else INTERRUPTED
 
 

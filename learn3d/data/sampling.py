@@ -17,21 +17,23 @@ from torch import Tensor
 from learn3d.data.dataset import Batch, ViewDataset
 
 Sampling = Literal["views", "pairs", "groups", "classes"]
+ALL_ROWS = slice(None)
 GROUP_SIZE = 5  # views per object of sampling "groups"
 #: Views of each object in a batch, ordered [a_1 .. a_n, b_1 .. b_n, ...]; 1 if views are drawn independently.
 VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_SIZE, "classes": 1}
 
 
-def batches(dataset: ViewDataset, options: Any, start: int = 1) -> Iterator[Batch]:
+def batches(dataset: ViewDataset, options: Any, start: int = 1, rows: Tensor | slice = ALL_ROWS) -> Iterator[Batch]:
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
     options: `sampling`, `batch_size`, `augment`, `seed` and `iterations`, as in `TrainConfig`.
+    rows: int64 [b], the rows that this rank takes of each batch (default: all). Random numbers are drawn for all rows.
     A thread reads the next batch during a step.
     """
 
     def read(step: int) -> tuple[Tensor, Batch]:
         indices = sample_indices(dataset, options.sampling, options.batch_size, options.seed, step)
-        return indices, dataset.batch(indices, voxels=False)
+        return indices, dataset.batch(indices[rows], voxels=False)
 
     with ThreadPoolExecutor(1, "read ahead") as reader:
         ahead = reader.submit(read, start)
@@ -41,8 +43,9 @@ def batches(dataset: ViewDataset, options: Any, start: int = 1) -> Iterator[Batc
                 ahead = reader.submit(read, step + 1)
             if dataset.candidates is not None:  # their weights may have changed in the last step
                 poses, view_ids = dataset.candidates.draw(indices, options.seed, step)
-                batch = dataclasses.replace(batch, poses=poses, view_ids=view_ids)
-            yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted)
+                batch = dataclasses.replace(batch, poses=poses[rows], view_ids=view_ids[rows])
+            whole = {"count": len(indices), "rows": rows}
+            yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted, **whole)
 
 
 def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int) -> Tensor:
@@ -101,7 +104,16 @@ COLOR_GAIN = 0.3  # "colors" multiplies each colour by a factor in 1 - COLOR_GAI
 WITHOUT_COLOR = 0.3  # share of the images that "colors" makes white
 
 
-def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *, inverted: bool) -> Batch:
+def augment(
+    batch: Batch,
+    names: Sequence[Augmentation],
+    seed: int,
+    step: int,
+    *,
+    inverted: bool,
+    count: int | None = None,
+    rows: Tensor | slice = ALL_ROWS,
+) -> Batch:
     """The batch with the named augmentations, in this order, each drawn independently for every sample.
 
     "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato and Harada 2019).
@@ -113,29 +125,31 @@ def augment(batch: Batch, names: Sequence[Augmentation], seed: int, step: int, *
     "crop": the colours cropped anew from the original image, each side of the padded box moved by up to 15 % of the
     box (Pascal3D+, both papers). It must come first.
 
+    count, rows: the batch has these rows of a batch of `count`, for which all random numbers are drawn.
+
     Raises ValueError for "crop" if it is not first or there are no original images.
     """
     rng = np.random.default_rng([seed, step, 1])
-    count = len(batch)
+    count = len(batch) if count is None else count
     for position, name in enumerate(names):
         images, colors = batch.images, batch.images[:, :3]
         if name == "crop":
             if position > 0 or batch.crops is None:
                 wanted = "the original images, which only the layout pascal3d without shards has"
                 raise ValueError(f"crop must be the first augmentation, and needs {wanted}; got {', '.join(names)}")
-            colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))))
+            colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))[rows]))
         elif name in ("channels", "colors"):
-            order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1))
+            order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1)[rows])
             colors = torch.gather(colors, 1, order[:, :, None, None].expand_as(colors))
             if name == "colors":
                 gain = rng.uniform(1 - COLOR_GAIN, 1 + COLOR_GAIN, (count, 3))
                 gain[rng.random(count) < WITHOUT_COLOR] = 0
-                gain = torch.from_numpy(gain.astype(np.float32))[:, :, None, None]
+                gain = torch.from_numpy(gain.astype(np.float32)[rows])[:, :, None, None]
                 darkness = colors if inverted else 255 - colors
                 darkness = (darkness * gain).round_().clamp_(max=255).to(torch.uint8)
                 colors = darkness if inverted else 255 - darkness
         else:
-            mirrored = torch.from_numpy(rng.random(count) < 0.5)
+            mirrored = torch.from_numpy((rng.random(count) < 0.5)[rows])
             colors = _flip(colors, mirrored)
             if name == "flip":
                 images = _flip(images, mirrored)

@@ -17,6 +17,7 @@ from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.networks.discriminators import pose_discriminator
 from learn3d.networks.encoders import EncoderName
 from learn3d.networks.generators import GeneratorName, SymmetryOption
+from learn3d.runs.distributed import all_gather, whole_batch
 from learn3d.settings import Count, Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks in the mask bank
@@ -121,12 +122,14 @@ class Plus(PoseInvariant):
         """Render all shapes of the batch at one of its cameras. The loss is the energy distance between these
         silhouettes and the masks of this view class in the mask bank, mostly of other objects.
         """
-        self.mask_bank.add(_reduced(batch.masks), batch.view_ids)
-        seen_by = int(torch.randint(len(batch), ()))
+        whole, _ = whole_batch(batch)
+        self.mask_bank.add(all_gather(_reduced(batch.masks)), whole.view_ids)
+        seen_by = int(torch.randint(len(whole.view_ids), ()))
         if not self.mask_bank.full:
             return {}
-        silhouettes = _reduced(self.render(vertices, batch.poses[torch.full((len(vertices),), seen_by)]))
-        masks = self.mask_bank.of_view(int(batch.view_ids[seen_by])).to(silhouettes.device)
+        silhouettes = self.render(vertices, whole.poses[torch.full((len(vertices),), seen_by)])
+        silhouettes = all_gather(_reduced(silhouettes))
+        masks = self.mask_bank.of_view(int(whole.view_ids[seen_by])).to(silhouettes.device)
         return {"novel_view": (self.settings.lambda_novel_view, silhouette_energy_distance(silhouettes, masks))}
 
 

@@ -29,6 +29,7 @@ from learn3d.networks.voxel_gan import (
     VoxelGenerator,
     project,
 )
+from learn3d.runs.distributed import all_reduce_mean, rank, size
 from learn3d.settings import Items, LayerChannels, Positive, Share, Step, checked
 
 BETAS = (0.5, 0.999)  # Adam's decays for the two networks of the GAN
@@ -142,7 +143,7 @@ class PrGAN(Method):
         discriminator's logits, and then from statistics of the discriminator's first layer. All three use the same z,
         as in the published code.
         """
-        z = self.sample_z(len(batch))
+        z = self.sample_z(size() * len(batch)).chunk(size())[rank()]
         if step >= self.settings.encoder_from_step:
             yield {"encoder": (1.0, self.encoder_loss(z))}, ("encoder",)
             return
@@ -180,7 +181,7 @@ class PrGAN(Method):
         with self.autocast():
             estimate = self.encoder(images)
         difference = estimate.float() - z.to(self.device, non_blocking=True)
-        return difference.square().sum()
+        return size() * difference.square().sum()  # the sum over all ranks, whose losses are averaged
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> Tensor:
@@ -188,16 +189,17 @@ class PrGAN(Method):
         self.networks.eval()
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
-        return (of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2
+        accuracy = (of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2
+        return all_reduce_mean(accuracy)
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
     """Sum over all features [B, ...] of the squared differences of their batch means and batch variances."""
     means, variances = [], []  # torch.var takes ten times as long over the first axis
     for features in (of_real, of_fake):
-        mean = features.mean(0)
+        mean = all_reduce_mean(features.mean(0))
         means.append(mean)
-        variances.append((features - mean).square().mean(0))
+        variances.append(all_reduce_mean((features - mean).square().mean(0)))
     return torch.sub(*means).square().sum() + torch.sub(*variances).square().sum()
 
 

@@ -25,6 +25,7 @@ from learn3d.networks.encoders import ENCODERS, PreactResNet18
 from learn3d.networks.generators import GENERATORS
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.resnet import ResNet18Encoder
+from learn3d.runs.distributed import whole_batch
 from learn3d.settings import Channels, Pixels, Positive, Weight, checked
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object if alpha is at least this
@@ -143,12 +144,12 @@ class VPL(MeshMethod):
         generator on lambda_D softplus(-D(other view)); D and its running means do not change. Reversal: every step
         trains D on its loss, and encoder and generator on -lambda_D times its gradient.
         """
-        settings, own = self.settings, torch.arange(len(batch))
+        settings, (whole, own) = self.settings, whole_batch(batch)
         is_baseline = settings.lambda_discriminator == 0
-        others = own[:0] if is_baseline else other_views(batch, settings.other_views)
+        others = own[:0] if is_baseline else other_views(whole, settings.other_views)[own]
         vertices = self.predict(batch.images)[1].cpu()
         both = torch.cat([vertices, vertices[: len(others)]])  # both views of each shape in one call
-        silhouettes, elsewhere = self.render(both, batch.poses[torch.cat([own, others])]).tensor_split([len(batch)])
+        silhouettes, elsewhere = self.render(both, whole.poses[torch.cat([own, others])]).tensor_split([len(batch)])
         projection = self._projection_loss(silhouettes, batch)
         losses: Losses = {"projection": (1.0, projection), **self.surface_losses(vertices, step)}
         if is_baseline:
@@ -158,11 +159,11 @@ class VPL(MeshMethod):
         elif step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
         else:
-            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, others, batch)
+            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, whole, others, own)
             losses["adversarial"] = (settings.lambda_discriminator, F.softplus(-logits).mean())
             return losses
-        of_real = self._discriminate(self.discriminator, real, own, batch)
-        of_fake = self._discriminate(self.discriminator, fake, others, batch)
+        of_real = self._discriminate(self.discriminator, real, whole, own, own)
+        of_fake = self._discriminate(self.discriminator, fake, whole, others, own)
         losses["discrimination"] = (1.0, F.softplus(-of_real).mean() + F.softplus(of_fake).mean())
         return losses
 
@@ -192,9 +193,9 @@ class VPL(MeshMethod):
         return (silhouette_pyramid_loss if pyramid else nmr.losses.soft_iou_loss)(silhouettes, masks)
 
     def _discriminate(
-        self, network: Callable[..., Tensor], silhouettes: Tensor, seen_at: Tensor, batch: Batch
+        self, network: Callable[..., Tensor], silhouettes: Tensor, batch: Batch, seen_at: Tensor, own: Tensor
     ) -> Tensor:
-        """Logits for silhouettes [B,S,S] of the batch's shapes, seen at the views `seen_at`."""
+        """Logits for silhouettes [b,S,S] of the shapes `own` of a whole batch, seen at its views `seen_at`."""
         silhouettes = silhouettes.to(self.device, non_blocking=True)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
@@ -202,7 +203,7 @@ class VPL(MeshMethod):
         # autocast is off: with it, spectral normalisation mixes dtypes
         conditions = [batch.poses[seen_at].features().to(self.device, non_blocking=True)]
         if self.settings.class_conditional:
-            conditions.append(batch.class_ids.to(self.device, non_blocking=True))
+            conditions.append(batch.class_ids[own].to(self.device, non_blocking=True))
         return network(silhouettes, *conditions)
 
 
@@ -213,7 +214,7 @@ def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> 
     "reversed" gives the middle sample of an odd batch its own view, and "next" does so for the only sample of a
     category.
     """
-    count = len(batch)
+    count = len(batch.view_ids)
     if choice == "reversed":
         return torch.arange(count).flip(0)
     if choice == "next":

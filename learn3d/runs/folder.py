@@ -20,6 +20,8 @@ from pathlib import Path
 
 import filelock
 
+from learn3d.runs.distributed import rank
+
 CONFIG, METRICS, METRICS_CSV, WANDB_ID = "config.json", "metrics.jsonl", "metrics.csv", "wandb.txt"
 LAST, PREVIOUS, BEST = "last.safetensors", "previous.safetensors", "best.safetensors"
 PICTURES, TENSORBOARD, LOCK = "pictures", "tensorboard", ".lock"
@@ -35,6 +37,9 @@ def lock_folder(folder: Path) -> Iterator[None]:
     The operating system releases the lock when the process ends, even if it is killed. Raises OSError if another
     process holds the lock, or if the folder cannot be written to.
     """
+    if rank() > 0:  # rank 0 has locked it
+        yield
+        return
     lock = filelock.FileLock(folder / LOCK, timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -62,8 +67,10 @@ def is_run(folder: Path) -> bool:
 def check_can_start(folder: Path, overwrite: bool) -> None:
     """Raise a ValueError unless a new run may begin in a folder: an empty one, or with `overwrite` any folder.
 
-    Even then no file may have the name of a run's file, unless it belongs to a run.
+    Even then no file may have the name of a run's file, unless it belongs to a run. Only rank 0 checks.
     """
+    if rank() > 0:
+        return
     if is_run(folder):
         if not overwrite:
             resume = "continue it (--resume), " if checkpoints(folder) else ""

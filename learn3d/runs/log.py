@@ -21,6 +21,7 @@ from tqdm import tqdm
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
+from learn3d.runs.distributed import rank
 from learn3d.runs.folder import METRICS, METRICS_CSV, TENSORBOARD, WANDB_ID
 from learn3d.terminal import is_watched, note
 
@@ -95,6 +96,14 @@ class RunLog(contextlib.ExitStack):
         """Flush all metrics to the disk, before a checkpoint is saved."""
         os.fsync(self._metrics.fileno())
         self._writer.flush()
+
+
+def open_log(config: TrainConfig, *, start: int) -> contextlib.AbstractContextManager[Any]:
+    """The log of a run, see `RunLog`; for other ranks than 0 one that writes nothing."""
+    if rank() == 0:
+        return RunLog(config, start=start)
+    silent = dict.fromkeys(("step", "metrics", "picture", "say", "sync"), lambda *_: None)
+    return contextlib.nullcontext(types.SimpleNamespace(**silent))
 
 
 def check_log(config: TrainConfig) -> None:

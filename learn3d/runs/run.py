@@ -15,7 +15,7 @@ from learn3d.files.reading import DamagedFile
 from learn3d.methods.mesh_method import is_compact
 from learn3d.methods.method import Method
 from learn3d.presets import PRESETS
-from learn3d.runs import checkpoint
+from learn3d.runs import checkpoint, distributed
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress, versions
 from learn3d.runs.folder import BEST, CONFIG, LAST, PREVIOUS
@@ -72,6 +72,8 @@ class Run:
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
             raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
+        if distributed.rank() > 0:
+            return progress, notes
         if resume:
             run_folder.remove_partials(folder)
         if progress.step < config.iterations:
@@ -86,7 +88,7 @@ class Run:
         verb = f"resuming at step {progress.step}" if progress.step else "training"
         name = f"{PRESETS[config.preset].label} ({config.preset})"
         data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
-        where = f"{config.device}, {config.precision}, {threads}"
+        where = f"{config.device}, {config.precision}, {threads}{distributed.describe()}"
         text = f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"
         if config.settings.wants_mirror_plane and info.mirror_plane_deg is None:
             text += "\nno mirror plane found in the masks (about 150 are needed); set it with --symmetry"
@@ -131,6 +133,9 @@ class Run:
 
         The checkpoint before it becomes previous.safetensors. Neither file is ever incomplete.
         """
+        if distributed.rank() > 0:
+            distributed.wait_for_writer()
+            return
         log.sync()
         method, last = self.method, self.config.output / LAST
         tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
@@ -145,9 +150,12 @@ class Run:
         if last.is_file():
             writing.give_second_name(last, last.with_name(PREVIOUS))
         self._write(last, tensors, progress)
+        distributed.wait_for_writer()
 
     def save_best(self, progress: Progress) -> None:
         """Write best.safetensors: the networks, with EMA weights if the run has them."""
+        if distributed.rank() > 0:
+            return
         with self.method.ema_weights():
             self._write(self.config.output / BEST, checkpoint.network_tensors(self.method), progress)
 
@@ -173,7 +181,7 @@ def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] |
         except DamagedFile as error:
             notes.append(str(error))
             continue
-        if path.name == PREVIOUS:
+        if path.name == PREVIOUS and distributed.rank() == 0:
             writing.give_second_name(path, folder / LAST)
             notes.append("going on from the checkpoint before it; the steps since then are repeated")
         return saved, tuple(notes)

@@ -10,6 +10,8 @@ from collections import deque
 
 import torch
 
+from learn3d.runs.distributed import size
+
 WARM_UP, TRIAL = 1, 5  # steps at the start of a trial that are not timed, and all of its steps
 WINDOW = 20  # steps whose median is compared with the smallest median so far
 SLOWER = 3.0  # ratio of the two medians at which both numbers of threads are measured again
@@ -19,12 +21,13 @@ REST = 1000  # steps with one thread after which both are measured again; it dou
 class ThreadTuner:
     """Chooses between one thread and all by the duration of training steps.
 
-    The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, or if there is only one core.
+    The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, if there is only one core, or if
+    several ranks train together.
     """
 
     def __init__(self, threads: int | None) -> None:
         self.all = threads or torch.get_num_threads()
-        self.fixed = threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1
+        self.fixed = threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1 or size() > 1
         self._seconds: deque[float] = deque(maxlen=WINDOW)  # durations of the last steps
         self._best = float("inf")  # smallest median of WINDOW steps
         self._medians: dict[int, float] = {}  # medians of the current trial, by the number of threads

@@ -1,0 +1,145 @@
+"""Two ranks learn what one process learns, and go on after one of them was killed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import train_ranks
+from runs import check_same
+
+from learn3d.config import TrainConfig, config_to_dict
+from learn3d.presets import PRESETS
+from learn3d.runs import checkpoint, distributed
+
+SMALL = {"encoder": "conv-small", "generator": "sphere-small"}
+RUNS = {  # for each: its preset, options, and the bound of relative differences of losses and weights
+    "proposed": ("peng2020-kato", SMALL, 1e-5),
+    "plus": ("plus-kato", SMALL | {"symmetry": "x", "bank_size": 16, "lambda_view": 0.1}, 1e-5),
+    "pairs": ("kato2018-kato", SMALL, 1e-5),
+    "groups": ("many-views-kato", SMALL | {"symmetry": "x", "batch_size": 20}, 1e-5),
+    "vpl": ("peng2020-kato-vpl", {"generator": "sphere-small", "discriminator_channels": 2}, 1e-4),
+    "vpl-kar": (
+        "kato2019-kar",
+        {
+            "layout": "kato",
+            "image_size": 64,
+            "silhouette_size": 64,
+            "discriminator_channels": 2,
+            "augment": ("flip", "channels"),
+        },
+        1e-3,
+    ),
+    "prgan": (
+        "gadelha2017-kato",
+        {"encoder_from_step": 3, "generator_channels": (2, 2, 2, 1), "discriminator_channels": (2, 2, 2, 2)},
+        1e-3,
+    ),
+}
+OFTEN = {"log_every": 1, "validate_every": 2, "checkpoint_every": 2, "pictures_every": 4}
+
+
+def run(tasks: list[dict], path: Path, ranks: int = 1) -> subprocess.CompletedProcess:
+    """Run tasks of `train_ranks` in one process or in several ranks."""
+    path.write_text(json.dumps(tasks))
+    torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"] if ranks > 1 else []
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *torchrun, train_ranks.__file__, path]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
+
+
+def task(config: TrainConfig, output: Path, **how: object) -> dict:
+    return {"config": config_to_dict(dataclasses.replace(config, output=output)), **how}
+
+
+def losses(metrics: list[dict]) -> dict[int, dict[str, float]]:
+    """The losses of each step."""
+    lines = [dict(line) for line in metrics if line["split"] == "train"]
+    return {line.pop("step"): {name: value for name, value in line.items() if name != "split"} for line in lines}
+
+
+def difference(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> float:
+    """The largest |a - b| / |a| over the networks."""
+    assert one.keys() == other.keys()
+    parts = [(a.double(), other[k].double()) for k, a in one.items() if k.startswith("network.")]
+    return max(float((a - b).norm() / a.norm().clamp(min=1e-3)) for a, b in parts)
+
+
+@pytest.fixture(scope="module")
+def folders(tiny_config, tmp_path_factory) -> tuple[Path, Path]:
+    """Folders of runs of four steps in one process and in two ranks."""
+    root = tmp_path_factory.mktemp("ranks")
+    for ranks in (1, 2):
+        tasks = []
+        for name, (preset, options, _) in RUNS.items():
+            config = tiny_config(root, **{"preset": preset, "batch_size": 8} | OFTEN | options)
+            tasks.append(task(config, root / str(ranks) / name, linear=True))
+        ended = run(tasks, root / f"{ranks}.json", ranks)
+        assert ended.returncode == 0, ended.stderr
+    return root / "1", root / "2"
+
+
+def test_every_method_has_a_run() -> None:
+    kinds = {type(preset.settings) for preset in PRESETS.values()}
+    assert {type(PRESETS[preset].settings) for preset, *_ in RUNS.values()} == kinds
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_two_ranks_learn_what_one_process_learns(folders, read_metrics, name) -> None:
+    bound = RUNS[name][2]
+    one, two = (losses(read_metrics(folder / name)) for folder in folders)
+    assert list(one) == list(two) == [1, 2, 3, 4]
+    for step, values in one.items():
+        assert two[step] == pytest.approx(values, rel=bound, abs=bound), step
+    saved = [checkpoint.load(folder / name / "last.safetensors")[0] for folder in folders]
+    assert difference(*saved) < bound
+    assert torch.equal(*(tensors["random.cpu"] for tensors in saved)), "random numbers do not depend on the ranks"
+    files = [sorted(path.name for path in (folder / name).iterdir()) for folder in folders]
+    assert files[0] == files[1]
+
+
+def test_a_run_continues_with_another_number_of_ranks(folders, tiny_config, tmp_path, read_metrics) -> None:
+    config = tiny_config(tmp_path, **SMALL | OFTEN, batch_size=8, iterations=6)
+    half = dataclasses.replace(config, iterations=4)
+    for first, then in ((1, 2), (2, 1)):
+        output = tmp_path / str(first)
+        for ranks, steps, resume in ((first, half, False), (then, config, True)):
+            ended = run([task(steps, output, linear=True, resume=resume)], tmp_path / "tasks.json", ranks)
+            assert ended.returncode == 0, ended.stderr
+    one, two = (losses(read_metrics(tmp_path / name)) for name in "12")
+    assert list(one) == list(two) == [1, 2, 3, 4, 5, 6]
+    assert all(two[step] == pytest.approx(values, rel=1e-5, abs=1e-5) for step, values in one.items())
+
+
+def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp_path) -> None:
+    config = tiny_config(tmp_path, **SMALL | OFTEN, batch_size=8, iterations=8)
+    ended = run([task(config, tmp_path / "whole")], tmp_path / "tasks.json", 2)
+    assert ended.returncode == 0, ended.stderr
+    resume = False
+    for kill in ([1, 1], [0, 3], [1, 4], [0, 5], [1, 8]):
+        started = time.monotonic()
+        tasks = [task(config, tmp_path / "killed", kill=kill, resume=resume)]
+        ended = run(tasks, tmp_path / "tasks.json", 2)
+        assert ended.returncode == 1 and time.monotonic() - started < 60
+        assert f"rank {1 - kill[0]}: another rank ended or does not answer" in ended.stderr, ended.stderr
+        assert "--resume" in ended.stderr
+        resume = (tmp_path / "killed" / "config.json").exists()
+    ended = run([task(config, tmp_path / "killed", resume=resume)], tmp_path / "tasks.json", 2)
+    assert ended.returncode == 0, ended.stderr
+    check_same(tmp_path / "killed", tmp_path / "whole")
+
+
+def test_a_batch_that_ranks_cannot_share_is_refused(monkeypatch) -> None:
+    assert distributed.own_rows(5, 2).tolist() == [0, 1, 2, 3]
+    monkeypatch.setattr(distributed, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "rank", lambda: 1)
+    assert distributed.own_rows(16, 2).tolist() == [4, 5, 6, 7, 12, 13, 14, 15]
+    with pytest.raises(ValueError, match="batch_size must be a multiple of 8 for 2 ranks"):
+        distributed.own_rows(12, 2)
