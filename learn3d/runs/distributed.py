@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from learn3d.data.dataset import Batch
 from learn3d.terminal import stop_on_signal
 
-TIMEOUT = timedelta(seconds=60)  # time that a rank waits in a step for the others
+TIMEOUT = timedelta(seconds=50)  # time that a rank waits in a step for the others
 PATIENCE = timedelta(minutes=30)  # time that it waits for others that read data or save a checkpoint
 
 
@@ -87,19 +87,19 @@ def own_rows(batch_size: int, views: int) -> Tensor:
     return torch.arange(objects * views).view(views, size(), -1)[:, rank()].flatten()
 
 
-def all_gather_objects(value: Any) -> list[Any]:
-    """The values of all ranks, by rank. It waits for `PATIENCE`."""
+def all_gather_objects(value: Any, *, patient: bool = False) -> list[Any]:
+    """The values of all ranks, by rank. patient: wait for `PATIENCE`."""
     if size() == 1:
         return [value]
     found = [None] * size()
     with _lost_ranks():
-        dist.all_gather_object(found, value, group=_patient)
+        dist.all_gather_object(found, value, group=_patient if patient else None)
     return found
 
 
 def check_same(**values: Any) -> None:
     """Raise a ValueError that names those of the values that differ between the ranks."""
-    everywhere = all_gather_objects(values)
+    everywhere = all_gather_objects(values, patient=True)
     if different := [name for name in values if any(found[name] != values[name] for found in everywhere)]:
         advice = "give all ranks the same options, data and output folder, on a disk that all machines share"
         raise ValueError(f"the ranks of this run differ in {', '.join(different)}; {advice}")
@@ -196,7 +196,7 @@ def _batch_norm(norm: nn.Module, x: Tensor) -> Tensor:
 
 def wait_for_writer() -> None:
     """Wait until rank 0 has saved a checkpoint."""
-    all_gather_objects(None)
+    all_gather_objects(None, patient=True)
 
 
 _patient: Any = None  # the group of all ranks whose operations wait for `PATIENCE`
