@@ -102,13 +102,13 @@ def test_bad_meshes_are_listed_and_another_list_of_meshes_is_refused(tmp_path, h
 @pytest.mark.parametrize("where", ["here", "cluster"])
 def test_killed_workers_change_nothing(where, config, here, monkeypatch, request) -> None:
     """A worker that makes shards is killed five times; the call goes on, and ends with the same bytes."""
-    config = dataclasses.replace(config, procedural=24)
+    config = dataclasses.replace(config, procedural=12)
     whole = dataclasses.replace(config, output=config.output.with_name("whole"))
     assert render.make_shards(whole) == 0
     monkeypatch.undo()
     monkeypatch.setattr(render, "OBJECTS_PER_SHARD", 2)
     workers = request.getfixturevalue("cluster") if where == "cluster" else Workers(2)
-    killed, done = [], threading.Event()
+    killed, done = set(), threading.Event()
 
     def kill_five() -> None:
         while len(killed) < 5 and not done.is_set():
@@ -116,7 +116,7 @@ def test_killed_workers_change_nothing(where, config, here, monkeypatch, request
             for pid in find_workers(where)[:1]:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
-                    killed.append(pid)
+                    killed.add(pid)
 
     thread = threading.Thread(target=kill_five)
     thread.start()
@@ -125,7 +125,7 @@ def test_killed_workers_change_nothing(where, config, here, monkeypatch, request
     finally:
         done.set()
         thread.join()
-    assert len(set(killed)) == 5
+    assert len(killed) == 5
     assert contents(config.output) == contents(whole.output)
     assert not list(config.output.rglob(".*"))
 
