@@ -17,7 +17,7 @@ from .draw import (
     shares,
     spread,
 )
-from .parts import Part, X, bar, between, crossbar, join, post, sheet, slab, strip, tube
+from .parts import Part, X, bar, between, board, crossbar, join, post, sheet, slab, strip, tube
 from .sofa import upholstered
 from .supports import cantilever, cross, disc, legs, loops, panels, rocker, star
 
@@ -211,12 +211,12 @@ def _back(draw: Draw, family: Family, half: float, height: float, curve: float) 
     elif draw.maybe(0.5):
         back = _plate(draw, 1.05 * half, top, curve, thickness)
     else:
-        back = between((-half - 0.03, -0.02, -thickness / 2), (half + 0.03, top, thickness / 2), 0.03)
+        back = board(half + 0.03, (-0.02, top), (-thickness / 2, thickness / 2), 0.03)
     return back, thickness / 2
 
 
-@recipe(stile=(0.022, 0.045), board=(0.015, 0.028), rounded=0.4, taper=(0.7, 1))
-def _frame(draw: Draw, half: float, height: float, curve: float, kind: str, *, stile, board, rounded, taper) -> Part:
+@recipe(stile=(0.022, 0.045), thick=(0.015, 0.028), rounded=0.4, taper=(0.7, 1))
+def _frame(draw: Draw, half: float, height: float, curve: float, kind: str, *, stile, thick, rounded, taper) -> Part:
     """Two stiles and a rail on top, filled with boards, slats, spindles, a splat, a cross, a lattice, or open."""
     top = height + 0.02
     high = height > 0.3
@@ -224,7 +224,7 @@ def _frame(draw: Draw, half: float, height: float, curve: float, kind: str, *, s
     part = post((half, -0.02, curve), (half, top, curve), outline, [(0, 1), (1, taper)]).both_sides()
     rail = draw(0.04, 0.12) if high else draw(0.03, 0.06)
     arch = draw.of(Perhaps(0.4, (0.01, 0.07)))
-    part += _rail(half, top - 0.45 * rail, rail, board, curve, arch)
+    part += _rail(half, top - 0.45 * rail, rail, thick, curve, arch)
     if kind == "open":
         return part
     low = draw(0.06, 0.3) * height
@@ -232,42 +232,42 @@ def _frame(draw: Draw, half: float, height: float, curve: float, kind: str, *, s
         count = draw.count(1, 4) if high else 1
         pitch = (top - rail - low) / (count + 0.5)
         each = min(draw(0.25, 0.6) * pitch, 0.08)
-        return part + join(_rail(half, low + (k + 0.5) * pitch, each, board, curve, 0.6 * arch) for k in range(count))
+        return part + join(_rail(half, low + (k + 0.5) * pitch, each, thick, curve, 0.6 * arch) for k in range(count))
     if kind in ("panel", "band"):
         x = np.linspace(-half, half, 9)
         y = np.array([[low if kind == "panel" else 0.55 * height], [top - 0.5 * rail]])
-        return part + sheet(points(x, y, _bow(x, half, curve)), board)
+        return part + sheet(points(x, y, _bow(x, half, curve)), thick)
     bottom = -0.01
     upper = top - 0.6 * rail
     if draw.maybe(0.5) or kind == "lattice":
         bottom = low
-        part += _rail(half, low, draw(0.025, 0.05), board, curve)
+        part += _rail(half, low, draw(0.025, 0.05), thick, curve)
     if kind == "splat":
-        return part + _splat(draw, bottom, upper + arch * 0.8, half, board)
+        return part + _splat(draw, bottom, upper + arch * 0.8, half, thick)
     if kind == "cross":
         x = np.linspace(-half, half, 7)
         path = points(x, np.linspace(bottom + 0.01, upper, 7), _bow(x, half, curve))
-        return part + join(strip(path * [side, 1, 1], board, draw(0.02, 0.04)) for side in (-1, 1))
+        return part + join(strip(path * [side, 1, 1], thick, draw(0.02, 0.04)) for side in (-1, 1))
     count = draw.measures(slats=range(2, 8), spindles=range(4, 9), lattice=range(2, 5))[kind]
     wide = draw(0.25, 0.6) * 2 * half / (count + 1)
-    size = (0.018, None) if kind == "spindles" else (0.8 * board, min(wide, 0.07))
+    size = (0.018, None) if kind == "spindles" else (0.8 * thick, min(wide, 0.07))
     for x in spread(half, count):
         z = _bow(x, half, curve)
         part += bar((x, bottom, z), (x, upper + arch * (1 - (x / half) ** 2), z), *size)
     if kind == "lattice":
         for y in np.linspace(bottom, upper, draw.count(1, 3) + 2)[1:-1]:
-            part += _rail(half, y, draw(0.015, 0.03), 0.7 * board, curve)
+            part += _rail(half, y, draw(0.015, 0.03), 0.7 * thick, curve)
     return part
 
 
 @recipe(wide=(0.25, 0.5), swell=(0.1, 0.5), waves=(0.6, 1.4), phase=(0, 1))
-def _splat(draw: Draw, low: float, high: float, half: float, board: float, *, wide, swell, waves, phase) -> Part:
+def _splat(draw: Draw, low: float, high: float, half: float, thick: float, *, wide, swell, waves, phase) -> Part:
     """A vase-shaped board in the middle of a back."""
     wide *= half
     t = shares(9)[:, None]
     width = wide * (1 + swell * np.sin(2 * np.pi * (waves * t + phase)))
     x = np.linspace(-1, 1, 5) * np.minimum(width, 1.8 * wide)
-    return sheet(points(x, low + t * (high - low), 0.0), board)
+    return sheet(points(x, low + t * (high - low), 0.0), thick)
 
 
 def _bow(x: np.ndarray, half: float, curve: float) -> np.ndarray:
@@ -444,9 +444,9 @@ def bench(draw: Draw, *, width, depth, height, boards, thick, gap, support) -> P
     """A long seat of boards, half of them with a back of boards."""
     step = depth / boards
     part = support(draw, 0.44 * width, 0.38 * depth, height - 0.02)
-    part += between((-0.46 * width, height - 0.04, -depth / 2), (0.46 * width, height, depth / 2))
+    part += board(0.46 * width, (height - 0.04, height), (-depth / 2, depth / 2))
     for z in np.arange(boards) * step - depth / 2:
-        part += between((-width / 2, height - 0.01, z + gap), (width / 2, height + thick, z + step - gap))
+        part += board(width / 2, (height - 0.01, height + thick), (z + gap, z + step - gap))
     if draw.maybe(0.5):
         lean = draw(0.05, 0.2)
         top = draw(0.3, 0.45)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .draw import Draw, ellipse, points, recipe, rectangle, rounded_path, shares
-from .parts import Part, bar, crossbar, ellipsoid, join, revolve, slab, tube
+from .parts import Part, bar, crossbar, ellipsoid, join, pole, revolve, slab, tube
 
 
 def _shell(radius: np.ndarray, y: np.ndarray, sides: int = 20) -> Part:
@@ -27,7 +27,7 @@ def _shade(draw: Draw, radius: float, height: float, *, top, form, sides) -> Par
     shade += crossbar((-reach, 0.85 * height, 0), 0.012)
     shade += bar((0, 0.85 * height, -reach), (0, 0.85 * height, reach), 0.012)
     shade += ellipsoid((0.07, 0.11, 0.07), (0, 0.62 * height, 0), 10, 6)
-    return shade + bar((0, -0.02, 0), (0, 0.88 * height, 0), 0.02)
+    return shade + pole(-0.02, 0.88 * height, 0.02)
 
 
 @recipe(outline=[ellipse, rectangle], thickness=(0.02, 0.05))
@@ -58,7 +58,7 @@ def table_lamp(draw: Draw, *, height, width, belly, balls, form, sides, neck, sh
     }[form]
     profile = np.r_[[(1.0, 0.0), (1.0, 0.04)], np.c_[radius, 0.06 + 0.94 * t]]
     top = height + neck
-    lamp = revolve(profile * [width, height], sides) + bar((0, 0.7 * height, 0), (0, top + 0.03, 0), 0.025)
+    lamp = revolve(profile * [width, height], sides) + pole(0.7 * height, top + 0.03, 0.025)
     return lamp + _shade(draw, shade * max(width, 0.09), shade_height).moved(y=top - 0.02)
 
 
@@ -66,11 +66,11 @@ def table_lamp(draw: Draw, *, height, width, belly, balls, form, sides, neck, sh
 def floor_lamp(draw: Draw, *, height, thick, plate) -> Part:
     """A tall pole on a plate or on three legs, with a shade on top."""
     if plate:
-        lamp = _foot(draw, draw(0.26, 0.4)) + bar((0, 0.01, 0), (0, height, 0), thick)
+        lamp = _foot(draw, draw(0.26, 0.4)) + pole(0.01, height, thick)
     else:
         reach = draw(0.22, 0.34)
         knee = draw(0.5, 0.95) * height
-        lamp = bar((0, knee - 0.03, 0), (0, height, 0), 1.3 * thick)
+        lamp = pole(knee - 0.03, height, 1.3 * thick)
         for angle in np.radians([90, 210, 330]):
             lamp += bar((reach * np.cos(angle), 0, reach * np.sin(angle)), (0, knee, 0), thick)
     return lamp + _shade(draw, draw(0.17, 0.3), draw(0.2, 0.36)).moved(y=height - 0.02)
@@ -136,7 +136,7 @@ def pendant(draw: Draw, *, count, radius, height, cord) -> Part:
     """One to three shades of the same kind hanging from a ceiling plate."""
     ceiling = height + cord
     pitch = 2.4 * radius
-    shade = _shade(draw, radius, height) + bar((0, 0.6 * height, 0), (0, ceiling + 0.01, 0), 0.014)
+    shade = _shade(draw, radius, height) + pole(0.6 * height, ceiling + 0.01, 0.014)
     plate = slab(rectangle(pitch * (count - 1) + 0.12, 0.12, 0.05, 4), 0.03).moved(y=ceiling)
     return plate + join(shade.moved(x=x) for x in pitch * (np.arange(count) - (count - 1) / 2))
 
@@ -161,7 +161,7 @@ def chandelier(draw: Draw, *, count, reach, drop, swing, rise, globes, waves) ->
         arm += bar((reach, rise, 0), (reach, rise + 0.1, 0), 0.026)
     t = shares(9)
     column = revolve(np.c_[0.02 + 0.04 * np.abs(np.sin(waves * np.pi * t)), -0.12 + 0.3 * t], 12)
-    column += bar((0, 0.1, 0), (0, drop, 0), 0.016) + slab(ellipse(0.13, 0.13), 0.03).moved(y=drop - 0.01)
+    column += pole(0.1, drop, 0.016) + slab(ellipse(0.13, 0.13), 0.03).moved(y=drop - 0.01)
     return column + arm.around(90 + 360 / count * np.arange(count))
 
 

@@ -183,6 +183,16 @@ def strip(path: ArrayLike, width: float, height: float, scale: ArrayLike = 1.0, 
     return tube(path, scale, rectangle(width, height, segments=1), side=side)
 
 
+def pole(low: float, high: float, width: float) -> Part:
+    """A round bar on the y axis."""
+    return bar((0, low, 0), (0, high, 0), width)
+
+
+def board(half: float, y: tuple[float, float], z: tuple[float, float], radius: float | None = None) -> Part:
+    """The rounded box from x = -half to half between two heights and two depths."""
+    return between((-half, y[0], z[0]), (half, y[1], z[1]), radius)
+
+
 def crossbar(start: Point, width: float, height: float | None = None) -> Part:
     """The straight bar from a point to its mirror image in the plane x = 0."""
     return bar(start, np.asarray(start) * [-1, 1, 1], width, height)

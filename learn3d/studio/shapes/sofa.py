@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from .draw import Draw, ellipse, points, recipe, shares
-from .parts import Part, X, bar, between, crossbar, join, sheet, slab
+from .parts import Part, X, bar, between, board, crossbar, join, sheet, slab
 from .supports import feet, legs, loops, panels
 
 
@@ -32,9 +32,9 @@ def upholstered(draw: Draw, *, seats, half, depth, foot, seat) -> Part:
     low = seat - draw(0.1, 0.17)
     front = depth / 2
     rear = -depth / 2
-    part = between((-half, foot, rear), (half, low + 0.005, front - 0.03), 0.02)
+    part = board(half, (foot, low + 0.005), (rear, front - 0.03), 0.02)
     part += _cushions((-half, low, rear + 0.7 * back), (half, seat, front), draw.pick([1, seats, seats]))
-    upright = between((-half, low - 0.1, rear), (half, high, rear + back), soft)
+    upright = board(half, (low - 0.1, high), (rear, rear + back), soft)
     if draw.maybe(0.5):
         top = high + draw(-0.08, 0.08)
         upright += _cushions((-half, seat - 0.05, rear + 0.4 * back), (half, top, rear + 1.6 * back), seats)
@@ -79,9 +79,9 @@ def corner_sofa(
     """An L-shaped sofa: a long side along x, and a chaise or a second side towards +z, left or right."""
     low = seat - 0.14
     inner = half - wing
-    sofa = between((-half, foot, 0), (half, low + 0.005, depth), 0.02)
+    sofa = board(half, (foot, low + 0.005), (0, depth), 0.02)
     sofa += between((inner, foot, 0.3), (half, low + 0.005, reach), 0.02)
-    sofa += between((-half, low - 0.08, 0), (half, high, back), 0.04)
+    sofa += board(half, (low - 0.08, high), (0, back), 0.04)
     sofa += between((inner + 0.01, low, back - 0.05), (half - 0.005, seat, reach), 0.04)
     sofa += between((-half - arm, foot, 0), (-half + 0.01, level, depth), 0.04)
     sofa += _cushions((-half, low, back - 0.05), (inner, seat, depth), count)
@@ -115,7 +115,7 @@ def settee(draw: Draw, *, seats, half, depth, size, seat, high, rest, sink, supp
     front = depth / 2
     rear = -depth / 2
     sofa = support(draw, half - 0.02, 0.85 * front, low)
-    sofa += between((-half, low - 0.05, rear + 0.03), (half, low + 0.01, front - 0.03), 0.01)
+    sofa += board(half, (low - 0.05, low + 0.01), (rear + 0.03, front - 0.03), 0.01)
     sofa += _cushions((-half, low, rear + 0.04), (half, seat, front), seats)
     lean = draw(5, 16)
     z = rear + 0.04

@@ -12,6 +12,7 @@ from .parts import (
     Y,
     bar,
     between,
+    board,
     crossbar,
     ellipsoid,
     join,
@@ -73,7 +74,7 @@ def legs(
 def _hairpin_legs(half_x: float, half_z: float, height: float, splay: float) -> Part:
     foot = (half_x + 0.5 * splay, 0.006, half_z + 0.5 * splay)
     heads = (half_x - 0.1, height + 0.01, half_z), (half_x, height + 0.01, half_z - 0.1)
-    plate = between((-half_x - 0.01, height - 0.012, -half_z), (half_x + 0.01, height + 0.005, half_z))
+    plate = board(half_x + 0.01, (height - 0.012, height + 0.005), (-half_z, half_z))
     return join(bar(foot, head, 0.013) for head in heads).four_corners() + plate
 
 
@@ -111,7 +112,7 @@ def apron(half_x: float, half_z: float, top: float, depth: float, thickness: flo
     low = top - depth
     high = top + 0.005
     part = between((half_x - t, low, -half_z), (half_x + t, high, half_z)).both_sides()
-    return part + join(between((-half_x, low, z - t), (half_x, high, z + t)) for z in (half_z, -half_z))
+    return part + join(board(half_x, (low, high), (z - t, z + t)) for z in (half_z, -half_z))
 
 
 @recipe(size=(0.045, 0.08), kind=["block", "cone", "bun"])
@@ -249,9 +250,9 @@ def panels(draw: Draw, half_x: float, half_z: float, height: float, *, thick, up
     if upright:
         low = draw(0.0, 0.7) * height
         z = draw(-1, 0) * (half_z - 0.02)
-        return part + between((-half_x, low, z - thick / 2), (half_x, height, z + thick / 2))
+        return part + board(half_x, (low, height), (z - thick / 2, z + thick / 2))
     y = draw(0.25, 0.6) * height
-    return part + between((-half_x, y, -0.8 * half_z), (half_x, y + 0.8 * thick, 0.8 * half_z))
+    return part + board(half_x, (y, y + 0.8 * thick), (-0.8 * half_z, 0.8 * half_z))
 
 
 @recipe(size=(0.025, 0.04), radius=(0.8, 1.4), reach=(1.35, 1.9))

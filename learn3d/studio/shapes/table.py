@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from .draw import Draw, ellipse, inset, recipe, rectangle, rounded_path, shares
-from .parts import Part, X, bar, between, crossbar, join, revolve, slab, strip
+from .parts import Part, X, bar, between, board, crossbar, join, revolve, slab, strip
 from .supports import apron, cross, disc, legs, loops, panels, star
 
 # Length, width over length and height of each kind of table, and the weight of the kind.
@@ -90,7 +90,7 @@ def _pedestal(draw: Draw, reach: float, under: float) -> Part:
     if kind == "block":
         wide = draw(0.2, 0.5) * reach
         foot = slab(rectangle(1.8 * reach, 1.8 * reach), draw(0.03, 0.08))
-        return foot + between((-wide, 0.02, -wide), (wide, top, wide))
+        return foot + board(wide, (0.02, top), (-wide, wide))
     thick = draw(0.035, 0.06) * (0.6 + reach)
     low = draw(0.12, 0.3) * under
     radius = thick * (1 + 0.4 * np.sin(draw(2, 4) * np.pi * t))
@@ -157,12 +157,12 @@ def desk(draw: Draw, *, half_x, half_z, height) -> Part:
     other = draw.pick([drawers, panel])
     side = draw.pick([-1.0, 1.0])
     rear = draw(0.1, 0.6) * height
-    board = between((-half_x + 0.03, rear, -half_z + 0.03), (half_x - 0.03, high, -half_z + 0.05))
-    part = top + drawers + other.scaled(x=-1.0) + board
+    back = between((-half_x + 0.03, rear, -half_z + 0.03), (half_x - 0.03, high, -half_z + 0.05))
+    part = top + drawers + other.scaled(x=-1.0) + back
     if draw.maybe(0.4):
         tall = height + draw(0.15, 0.5)
         deep = draw(0.16, 0.26) - half_z
-        part += between((-half_x, tall - 0.025, -half_z), (half_x, tall, deep))
+        part += board(half_x, (tall - 0.025, tall), (-half_z, deep))
         for x in np.linspace(-half_x + 0.0125, half_x - 0.0125, draw.count(2, 5)):
             part += between((x - 0.0125, height - 0.01, -half_z), (x + 0.0125, tall - 0.01, deep))
     return part.scaled(x=side)
