@@ -81,7 +81,7 @@ def folders(tiny_config, tmp_path_factory) -> tuple[Path, Path]:
         tasks = []
         for name, (preset, options, _) in RUNS.items():
             config = tiny_config(root, **{"preset": preset, "batch_size": 8} | OFTEN | options)
-            tasks.append(task(config, root / str(ranks) / name, rate=3e-4 if name == "long" else 3e-3))
+            tasks.append(task(config, root / str(ranks) / name, rate=1e-4 if name == "long" else 3e-3))
         ended = run(tasks, root / f"{ranks}.json", ranks)
         assert ended.returncode == 0, ended.stderr
     return root / "1", root / "2"
