@@ -9,6 +9,11 @@
 #include <cstring>
 #include <ctime>
 #include <exception>
+#include <limits>
+
+#if !defined(_WIN32)
+#include <pthread.h>
+#endif
 
 #include "scratch.h"
 
@@ -62,6 +67,12 @@ class Company {
  public:
   static Company& shared() {
     static Company company;
+#if !defined(_WIN32)
+    // fork copies OpenMP's list of threads, but not the threads: a loop in the child would wait for
+    // them. If the parent has never wanted several threads, the child may start its own.
+    static const int registered = pthread_atfork(nullptr, nullptr, [] { company.alone_until_ = kForEver; });
+    static_cast<void>(registered);
+#endif
     return company;
   }
 
@@ -90,6 +101,7 @@ class Company {
 
  private:
   static constexpr int64_t kPatience = 100000;  // nanoseconds
+  static constexpr int64_t kForEver = std::numeric_limits<int64_t>::max();
   std::atomic<int64_t> alone_until_{0};
 };
 
