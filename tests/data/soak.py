@@ -44,5 +44,5 @@ if __name__ == "__main__":
     Soaked.every = int(sys.argv[2])
     tiny_networks.put_in_place()
     training.PICTURE_ROWS = 1
-    training.RunLog = Soaked
+    training.open_log = Soaked
     training.train(config)

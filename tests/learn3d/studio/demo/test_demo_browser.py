@@ -138,7 +138,7 @@ def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(page, box, tm
         image.paste((0, 0, 0), (240, 60, 290, 140))
         image.save(tmp_path / "two.png")
     page.locator("#file").set_input_files(tmp_path / "two.png")
-    page.get_by_text("only the largest is used").wait_for()
+    page.get_by_text("away from the object").wait_for()
     content = base64.b64encode(box.read_bytes()).decode()
     page.evaluate(
         """text => { const data = new DataTransfer(), bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
