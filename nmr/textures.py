@@ -239,9 +239,11 @@ class UVTexture:
 
     def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, int]:
         """All texels ``[., C]``, the place of each level of each image among them, and the number of texels."""
-        image, batch = _once(check_values(self.image, "image", "H, W, C")), fragments.mesh.batch
+        image = check_values(self.image, "image", "H, W, C")
+        batch = fragments.mesh.batch
         if len(image) not in (1, batch):
             raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
+        image = _once(image)
         sizes = [tuple(part.shape[:2]) for part in image]
         levels = max([1, *(max(size).bit_length() for size in sizes)]) if self.filter == "mipmap" else 1
         grids, count = level_grids(sizes, levels)
@@ -287,7 +289,7 @@ def sample_texture(
     >>> nmr.sample_texture(torch.rand(16, 32, 3), torch.rand(1, 8, 8, 2)).shape
     torch.Size([1, 8, 8, 3])
     """
-    image = _once(check_values(image, "image", "h, w, C"))
+    image = check_values(image, "image", "h, w, C")
     if is_list(image) or 0 in image.shape[1:]:
         raise ValueError(f"image must be a tensor [h, w, C] or [B, h, w, C] with texels, got {describe(image)}")
     for values, name, channels in ((uv, "uv", 2), (derivatives, "derivatives", 4)):
@@ -299,6 +301,7 @@ def sample_texture(
             raise ValueError(f"{name} must have shape [B, H, W, {channels}], got {describe(values)}")
     if len(image) not in (1, len(uv)):
         raise ValueError(f"image must be one for all {len(uv)} images drawn, or one for each, got {len(image)}")
+    image = _once(image)
     check_choice(wrap, "wrap", ops.WRAPS)
     height, width = image.shape[1:3]
     levels = 1 if derivatives is None else max(height, width).bit_length()
