@@ -122,18 +122,24 @@ def whole_batch(batch: Batch) -> tuple[Batch, Tensor]:
     return dataclasses.replace(batch, poses=poses[0].join(poses), **parts), own
 
 
+def _all_reduce(values: Tensor) -> Tensor:
+    """The sum over all ranks."""
+    total = values.clone(memory_format=torch.contiguous_format)
+    with _lost_ranks():
+        dist.all_reduce(total)
+    return total
+
+
 class _AllReduce(torch.autograd.Function):
     """The sum over all ranks. The loss of every rank depends on it, so its gradient is the sum of their gradients."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
-        with _lost_ranks():
-            dist.all_reduce(values := values.contiguous().clone())
-        return values
+        return _all_reduce(values)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:
-        return _AllReduce.forward(ctx, grad)
+        return _all_reduce(grad)
 
 
 def all_reduce_mean(values: Tensor) -> Tensor:
@@ -177,21 +183,50 @@ def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]
             module.forward = functools.partial(_batch_norm, module)
 
 
+class _BatchNorm(torch.autograd.Function):
+    """Normalizes the channels of x [B, C, ...] with mean and variance [C] over the rows of all ranks.
+
+    With y = w x' + b, x' = (x - mean) / s and N numbers of a channel in all ranks, the gradient of the sum of the
+    ranks' losses is dx = w / s (dy - sum(dy) / N - x' sum(dy x') / N), with sums over the rows of all ranks.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, moments: tuple[Tensor, ...], eps: float) -> Tensor:
+        ctx.save_for_backward(x, weight, *moments)
+        ctx.eps = eps
+        return nn.functional.batch_norm(x, *moments, weight, bias, eps=eps)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, mean, variance = ctx.saved_tensors
+        # as if mean and variance did not depend on x
+        statistics = (mean, variance, None, None, False, ctx.eps)
+        backward = torch.ops.aten.native_batch_norm_backward
+        grad_x, grad_weight, grad_bias = backward(grad, x, weight, *statistics, [True, True, True])
+        # what passes through mean and variance
+        count = size() * x.numel() / x.shape[1]
+        slope, offset = _all_reduce(torch.stack([grad_weight, grad_bias])) / count
+        scale = (variance + ctx.eps).rsqrt()
+        slope, offset = weight * scale.square() * slope, weight * scale * offset
+        shape = [1, -1] + [1] * (x.ndim - 2)
+        grad_x -= x * slope.view(shape) + (offset - mean * slope).view(shape)
+        return grad_x, grad_weight, grad_bias, None, None
+
+
 def _batch_norm(norm: nn.Module, x: Tensor) -> Tensor:
     """A batch norm with mean and variance over the rows of all ranks, which have equally many."""
     if not norm.training:
         return type(norm).forward(norm, x)
-    axes, shape = [0, *range(2, x.ndim)], [1, -1] + [1] * (x.ndim - 2)
-    values = x.double()
-    mean = all_reduce_mean(values.mean(axes)).view(shape)
-    variance = all_reduce_mean((values - mean).square().mean(axes)).view(shape)
-    count = size() * x.numel() / x.shape[1]
     with torch.no_grad():
+        running = norm.running_mean.clone(), norm.running_var.clone()  # given so that the results are float32, too
+        mean, variance = (values.double() for values in torch.batch_norm_update_stats(x, *running, 0.0))
+        mean, square = _all_reduce(torch.stack([mean, variance + mean.square()])) / size()
+        variance = square - mean.square()
+        count = size() * x.numel() / x.shape[1]
         norm.num_batches_tracked.add_(1)
-        norm.running_mean.lerp_(mean.flatten().float(), norm.momentum)
-        norm.running_var.lerp_((variance.flatten() * count / max(1, count - 1)).float(), norm.momentum)
-    scaled = (values - mean) * (variance + norm.eps).rsqrt()
-    return (scaled * norm.weight.view(shape) + norm.bias.view(shape)).to(x.dtype)
+        norm.running_mean.lerp_(mean.float(), norm.momentum)
+        norm.running_var.lerp_((variance * count / max(1, count - 1)).float(), norm.momentum)
+    return _BatchNorm.apply(x, norm.weight, norm.bias, (mean.float(), variance.float()), norm.eps)
 
 
 def wait_for_writer() -> None:
