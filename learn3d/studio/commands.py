@@ -151,6 +151,10 @@ class Reconstruct(OnDataset):
 
     output: Path
     """Folder for the results: a mesh, a turntable GIF and a PNG strip of each image."""
+    category: str | None = None
+    """Category of the object in the image files (default: recognized), or of the data set (default: the run's)."""
+    guesses: Count = 1
+    """Largest number of different shapes for each image file, the best first; a model without templates makes one."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model (default: the small model of the package)."""
     images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
@@ -179,14 +183,14 @@ class Reconstruct(OnDataset):
             raise ValueError("give either image files, or --data with --indices")
         if self.box is not None and (len(self.images) > 1 or self.masks):
             raise ValueError("--box is for one photograph, without --masks")
-        own = ("masks", "box", "crop")  # options for image files
-        self.refuse(*(("--data", *own) if self.data else ("image files", "category", "split", "indices")))
+        own = ("masks", "box", "crop", "guesses")  # options for image files
+        self.refuse(*(("--data", *own) if self.data else ("image files", "split", "indices")))
         check_target(self.output, "--output", folder=True)
         if self.data is not None:
             options = self.pick("indices") | {"refined": bool(self.refine)}
             paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
         else:
-            options = {name: getattr(self, name) for name in ("images", "which", *own)}
+            options = {name: getattr(self, name) for name in ("images", "which", "category", *own)}
             options["refined"] = self.refine is not False
             paths = reconstruct_files(self.model, self.output, mesh_format=self.format, **options)
         say("\n".join(map(str, paths)))

@@ -93,15 +93,17 @@ def reconstruct_files(
     crop: bool = True,
     box: Box | None = None,
     refined: bool = True,
+    category: str | None = None,
+    guesses: int = 1,
     which: str = "last",
     mesh_format: MeshFormat = "glb",
 ) -> list[Path]:
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
     masks: a file for each image. Without them the object is searched in images without transparency, and in all of them
-    with a `box` (see `cutting`). refined: see `reconstruct_picture`. Returns the files, named after the
-    images (see `save`). Raises ValueError if a mask is empty, or if a result would replace an input file. A file that
-    cannot be used is an error after all others are done.
+    with a `box` (see `cutting`). refined, category, guesses: see `reconstruct_guesses`. Returns the files, named after
+    the images, with "-2" and so on for further guesses (see `save`). Raises ValueError if a mask is empty, or if a
+    result would replace an input file. A file that cannot be used is an error after all others are done.
     """
     if masks and len(masks) != len(images):
         raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
@@ -112,6 +114,8 @@ def reconstruct_files(
     if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
         raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
     model = load_model(run, which)
+    if category is not None:
+        check_category(model, category)
     paths, faults = [], []
     for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
         try:
@@ -119,12 +123,13 @@ def reconstruct_files(
         except (ValueError, OSError) as error:
             faults.append(error)
             continue
-        made = reconstruct_picture(model, *photo, crop=crop, refined=refined)
-        if made.warning:
-            note(f"warning: {name}: {made.warning}")
-        elif made.kind:
-            note(f"{name}: category {made.kind}")
-        paths += save(folder, [name], [made], model, mesh_format)
+        options = {"crop": crop, "refined": refined, "category": category, "guesses": guesses}
+        made = reconstruct_guesses(model, *photo, **options)
+        if made[0].warning:
+            note(f"warning: {name}: {made[0].warning}")
+        elif made[0].kind:
+            note(f"{name}: category {', '.join(each.kind for each in made)}")
+        paths += save(folder, [name, *(f"{name}-{k}" for k in range(2, len(made) + 1))], made, model, mesh_format)
     for error in faults[1:]:
         note(f"error: {error}")
     if faults:
@@ -257,7 +262,6 @@ class Reconstruction(NamedTuple):
     warning: str | None = None  # a reason to doubt the shape; None without a fit
 
 
-@torch.no_grad()
 def reconstruct_picture(
     model: Model,
     colors: np.ndarray,
@@ -265,35 +269,72 @@ def reconstruct_picture(
     *,
     crop: bool = True,
     refined: bool = True,
+    category: str | None = None,
     progress: Progress = lambda *_: None,
 ) -> Reconstruction:
+    """The first of `reconstruct_guesses`."""
+    options = {"crop": crop, "refined": refined, "category": category, "progress": progress}
+    return reconstruct_guesses(model, colors, mask, **options)[0]
+
+
+@torch.no_grad()
+def reconstruct_guesses(
+    model: Model,
+    colors: np.ndarray,
+    mask: np.ndarray,
+    *,
+    crop: bool = True,
+    refined: bool = True,
+    category: str | None = None,
+    guesses: int = 1,
+    progress: Progress = lambda *_: None,
+) -> list[Reconstruction]:
     """Reconstruct a picture uint8 [H, W, 3] with its mask uint8 [H, W]; its camera is unknown.
 
     refined: fit camera, shape and colours to the picture; methods with voxels only predict.
+    category: the object's, None if unknown. With a known one there is no warning.
+    guesses: largest number of different shapes, the best first; a model without templates makes one.
     progress: called with the name of each stage and the share that is done.
+
+    Raises ValueError if the model was not trained on the category.
     """
+    if category is not None:
+        check_category(model, category)
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
     if not refined or not isinstance(method, MeshMethod):
         (surface,) = reconstruct(method, image[None])
         found = method.view_probabilities(image[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
-        return Reconstruction(surface, stored, azimuth_deg)
+        return [Reconstruction(surface, stored, azimuth_deg)]
     framed = frame(colors, mask)
     mask = reduce_mask(framed[3])
     progress("camera", 0.0)
     predicted = predict(method, image, mask)
-    kind, warning = recognize(model, predicted.code[0])
+    kind, warning = (category, None) if category else recognize(model, predicted.code[0])
     templates = model.templates if warning is None else None
     if templates is not None:
-        fitted, kind = fit_template(templates, model.categories, predicted, mask, progress)
-        mesh, mirror = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), MIRROR
+        options = {"category": category, "guesses": guesses}
+        fits = fit_template(templates, model.categories, predicted, mask, progress, **options)
+        meshes = [(divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), fitted, kind) for fitted, kind in fits]
+        mirror = MIRROR
     else:
         fitted = fit(method, predicted, mask, progress)
-        mesh, mirror = outer_surface(fitted.vertices, fitted.faces), method.generator.reflection
+        meshes = [(outer_surface(fitted.vertices, fitted.faces), fitted, kind)]
+        mirror = method.generator.reflection
     progress("colours", 0.9)
-    surface = color_mesh(mesh, fitted.view, framed, mirror, textured=templates is not None)
-    return Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
+    made = []
+    for mesh, fitted, kind in meshes:
+        surface = color_mesh(mesh, fitted.view, framed, mirror, textured=templates is not None)
+        made.append(Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning))
+    return made
+
+
+def check_category(model: Model, category: str) -> None:
+    """Raise ValueError if the model was not trained on a category."""
+    if category not in model.categories:
+        known = ", ".join(model.categories)
+        raise ValueError(f"the model was trained on {known}, not on {category!r}; give one of its categories, or none")
 
 
 def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:

@@ -4,6 +4,8 @@ A template has the thin legs, gaps and straight edges that a deformed sphere can
 templates; the shapes themselves are made again from their numbers.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,6 +28,7 @@ COUNT = 1000  # templates of each category
 AXES = 24  # principal axes of the codes that are kept
 CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
 KEPT = 16  # best of them, which are stretched
+DIFFERENT = 0.5  # voxel IoU below which two shapes are different guesses
 VOXELS, NEARNESS = 0.5, 0.5  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
 EDGES, FARTHEST = 0.15, 6.0  # weight of the distance of two outlines in pixels, and the largest that counts
 STRETCHING, STRETCH_STEPS = 1.0, 30  # weight of unequal factors along the axes, steps
@@ -41,12 +44,21 @@ class Templates(NamedTuple):
     codes: Tensor  # float [N, M, K]
     axes: Tensor  # float [K + 1, C]: the mean of all codes, and K axes
 
-    def nearest(self, code: Tensor, categories: Sequence[str]) -> tuple[list[tuple[str, int]], Tensor]:
-        """The `CANDIDATES` shapes with codes nearest to a code [C]: category and number of each, and the cosines."""
+    def nearest(
+        self, code: Tensor, categories: Sequence[str], category: str | None = None
+    ) -> tuple[list[tuple[str, int]], Tensor]:
+        """The `CANDIDATES` shapes with codes nearest to a code [C]: category and number of each, and the cosines.
+
+        category: only its shapes are taken; None for those of all categories.
+        """
         mean, *axes = self.axes.float()
         place = torch.stack(axes) @ (F.normalize(code, dim=0) - mean)
-        cosines = 1 - (self.codes.float().flatten(0, 1) - place).square().sum(1) / 2
-        best = cosines.topk(min(CANDIDATES, len(cosines)))
+        cosines = 1 - (self.codes.float() - place).square().sum(2) / 2
+        if category is not None:
+            others = torch.tensor([name != category for name in categories])
+            cosines[others] = -math.inf
+        cosines = cosines.flatten()
+        best = cosines.topk(min(CANDIDATES, int(cosines.isfinite().sum())))
         count = self.numbers.shape[1]
         names = [(categories[row // count], int(self.numbers.flatten()[row])) for row in best.indices.tolist()]
         return names, best.values
@@ -89,6 +101,36 @@ def template(category: str, number: int) -> tuple[Tensor, Tensor]:
     return torch.tensor(vertices, dtype=torch.float32), torch.from_numpy(faces.astype(np.int64))
 
 
+class Candidates(NamedTuple):
+    """Shapes that a picture may show, and how likely they are."""
+
+    shapes: list[Tensor]  # N tensors float32 [V_n, 3]
+    faces: list[Tensor]  # N tensors int64 [F_n, 3]
+    kinds: list[str]  # their categories
+    prior: Tensor  # float32 [N]: likeness to the predicted shape and of the codes
+
+    def select(self, rows: Sequence[int]) -> Candidates:
+        """The candidates `rows`."""
+        lists = ([values[row] for row in rows] for values in self[:3])
+        return Candidates(*lists, self.prior[list(rows)])
+
+
+def find_candidates(
+    templates: Templates, categories: Sequence[str], predicted: Sequence[Prediction], category: str | None = None
+) -> Candidates:
+    """The templates with codes nearest to the mean of those that were predicted for one or several pictures.
+
+    category: the only one whose templates are taken, None if unknown.
+    """
+    code = torch.stack([F.normalize(each.code[0], dim=0) for each in predicted]).mean(0)
+    names, nearness = templates.nearest(code, categories, category)
+    shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
+    voxels = torch.cat([_voxels(*mesh) for mesh in zip(shapes, faces, strict=True)])
+    alike = [nmr.metrics.voxel_iou(voxels, _voxels(*each.shape[:2]).expand_as(voxels)) for each in predicted]
+    prior = VOXELS * torch.stack(alike).mean(0).float() + NEARNESS * nearness
+    return Candidates(shapes, faces, [name for name, _ in names], prior)
+
+
 @torch.no_grad()
 def fit_template(
     templates: Templates,
@@ -96,32 +138,47 @@ def fit_template(
     predicted: Prediction,
     mask: Tensor,
     progress: Progress = lambda *_: None,
-) -> tuple[Fit, str]:
-    """Fit a template to a framed mask float32 [64, 64]; also returns its category.
+    *,
+    category: str | None = None,
+    guesses: int = 1,
+) -> list[tuple[Fit, str]]:
+    """Fit templates to a framed mask float32 [64, 64]: up to `guesses` different ones, the best first, with categories.
 
     Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel IoU with the predicted
-    shape, and the cosine of the two codes. The best are stretched along the axes, and the best of these is bent.
+    shape, and the cosine of the two codes. The best are stretched along the axes. Of these the best is bent, and those
+    whose voxel IoU with a better one is below `DIFFERENT`. category: see `find_candidates`.
     """
     progress("shape", 0.3)
-    names, nearness = templates.nearest(predicted.code[0], categories)
-    shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
-    voxels = torch.cat([_voxels(*mesh) for mesh in zip(shapes, faces, strict=True)])
-    alike = nmr.metrics.voxel_iou(voxels, _voxels(*predicted.shape[:2]).expand_as(voxels))
-    prior = VOXELS * alike.float() + NEARNESS * nearness
-    views = predicted.shape.view.select(torch.zeros(len(shapes), dtype=torch.int64))
-    best = (_likeness(views, shapes, faces, mask) + prior).topk(min(KEPT, len(shapes))).indices
-    shapes, faces, prior = [shapes[i] for i in best], [faces[i] for i in best], prior[best]
+    found = find_candidates(templates, categories, [predicted], category)
+    views = predicted.shape.view.select(torch.zeros(len(found.shapes), dtype=torch.int64))
+    scores = _likeness(views, found.shapes, found.faces, mask) + found.prior
+    best = scores.topk(min(KEPT, len(scores))).indices
+    found = found.select(best.tolist())
     progress("stretch", 0.5)
-    views, shapes, cost = _stretch(views.select(best), shapes, faces, mask)
-    scores = _likeness(views, shapes, faces, mask) + belief(views.azimuth_deg, predicted.azimuths) + prior - cost
-    one = int(scores.argmax())
+    views, shapes, cost = _stretch(views.select(best), found.shapes, found.faces, mask)
+    scores = _likeness(views, shapes, found.faces, mask) + belief(views.azimuth_deg, predicted.azimuths)
+    order = (scores + found.prior - cost).argsort(descending=True).tolist()
     progress("surface", 0.8)
-    view, vertices = _bend(views.select(torch.tensor([one])), shapes[one], faces[one], mask)
-    size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
-    view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * view.shift)
-    vertices = size * vertices
-    iou = float(view.ious(vertices[None], faces[one], mask))
-    return Fit(vertices, faces[one], view, iou), names[int(best[one])][0]
+    fits = []
+    for row in _choose_different([_voxels(shapes[row], found.faces[row]) for row in order], guesses):
+        row = order[row]
+        view, vertices = _bend(views.select(torch.tensor([row])), shapes[row], found.faces[row], mask)
+        size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
+        view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * view.shift)
+        vertices = size * vertices
+        iou = float(view.ious(vertices[None], found.faces[row], mask))
+        fits.append((Fit(vertices, found.faces[row], view, iou), found.kinds[row]))
+    return fits
+
+
+def _choose_different(voxels: list[Tensor], count: int) -> list[int]:
+    """Up to `count` of N shapes, of which each differs from all before it."""
+    chosen = [0]
+    for row in range(1, len(voxels)):
+        alike = [float(nmr.metrics.voxel_iou(voxels[row], voxels[other])) for other in chosen]
+        if len(chosen) < count and max(alike) < DIFFERENT:
+            chosen.append(row)
+    return chosen
 
 
 def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:

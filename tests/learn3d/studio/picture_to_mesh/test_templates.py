@@ -18,7 +18,13 @@ from learn3d.pictures.photograph import photograph
 from learn3d.pictures.surfaces import Surface
 from learn3d.studio.make_data.render import DatasetConfig, make_shards
 from learn3d.studio.picture_to_mesh.coloring import paint
-from learn3d.studio.picture_to_mesh.reconstruction import Model, load_model, mesh_bytes, reconstruct_picture
+from learn3d.studio.picture_to_mesh.reconstruction import (
+    Model,
+    load_model,
+    mesh_bytes,
+    reconstruct_guesses,
+    reconstruct_picture,
+)
 from learn3d.studio.picture_to_mesh.smoothing import divide, sharpen, smooth
 from learn3d.studio.picture_to_mesh.templates import learn_templates, template
 
@@ -53,6 +59,19 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
     unknown = model.known_codes._replace(output=model.known_codes.output + 100)
     lump = reconstruct_picture(model._replace(known_codes=unknown), *shown)
     assert lump.warning and bodies(lump.surface) < 3, "other things get the predicted shape"
+
+
+def test_guesses_differ_and_a_known_category_is_obeyed(model: Model) -> None:
+    shown = picture("chair", int(model.templates.numbers[2, 8]))
+    first, *others = reconstruct_guesses(model, *shown, guesses=3)
+    assert first.kind == "chair" and 1 <= len(others) <= 2
+    grids = [nmr.voxelize(0.99 * made.surface.vertices + 0.5, made.surface.faces) for made in (first, *others)]
+    assert all(nmr.metrics.voxel_iou(grids[0], grid) < 0.7 for grid in grids[1:])
+    assert all(made.silhouette_iou > 0.6 for made in others), "each explains the outline"
+    table = reconstruct_picture(model, *shown, category="table")
+    assert table.kind == "table" and table.warning is None
+    with pytest.raises(ValueError, match=r"trained on airplane, car.*not on 'boat'"):
+        reconstruct_picture(model, *shown, category="boat")
 
 
 def test_generated_shapes_of_a_training_set_become_templates(model: Model, tmp_path) -> None:
