@@ -12,7 +12,7 @@ import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.pictures.photograph import PALETTES, natural_look, photograph
-from learn3d.studio.picture_to_mesh.cutting import Box, correct, find_mask
+from learn3d.studio.picture_to_mesh.cutting import Box, Judge, Outline, correct, find_outline
 from learn3d.studio.picture_to_mesh.reconstruction import Model, mesh_bytes, reconstruct_picture
 from learn3d.studio.shapes import make_shape
 
@@ -46,26 +46,33 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
     return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3].copy(), strokes, box)
 
 
-def find_object(picture: Picture) -> tuple[np.ndarray, str | None]:
-    """The object's mask uint8 [H, W], and what was left out, see `keep_object`.
+def find_object(picture: Picture, judge: Judge | None = None) -> tuple[Outline, str | None]:
+    """The object's outline, and what was left out, see `keep_object`.
 
     The mask is the given one, or is found in the box or picture. If it was corrected, nothing is left out.
     """
     if picture.box is None and picture.strokes is not None:
-        return correct(picture.colors, picture.mask, picture.strokes), None
-    given = picture.box is None and picture.mask.min() < 255
-    return keep_object(picture.mask if given else find_mask(picture.colors, picture.box))
+        return Outline(correct(picture.colors, picture.mask, picture.strokes), "by hand"), None
+    if picture.box is None and picture.mask.min() < 255:
+        outline = Outline(picture.mask, "by the picture's transparency")
+    else:
+        outline = find_outline(picture.colors, picture.box, judge)
+    mask, left_out = keep_object(outline.mask)
+    return outline._replace(mask=mask), left_out
 
 
 def make_meshes(models: Mapping[str, Model], picture: Picture, send: Send) -> None:
     """Send the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
     try:
-        mask, left_out = find_object(picture)
-        send({"mask": _base64(np.packbits(mask > 127).tobytes()), "left_out": left_out})
+        outline, left_out = find_object(picture, next(iter(models.values())).judge)
+        mask = outline.mask
+        send({"mask": _base64(np.packbits(mask > 127).tobytes()), "left_out": left_out, "how": outline.how})
         try:
             check_mask(mask, cropped=True)
         except ValueError:
             raise ValueError("No object was found. Draw a box around it, or paint it with Add.") from None
+        if outline.doubt:
+            raise ValueError(f"Is this the object? {outline.doubt.capitalize()}. Draw a box around it (Box).")
         send({"meshes": [_mesh(label, model, picture.colors, mask, send) for label, model in models.items()]})
     except ValueError as error:
         send({"error": str(error)})

@@ -8,16 +8,18 @@ import contextlib
 import ipaddress
 import json
 import logging
+import re
 import socket
 import threading
 import webbrowser
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import h11
 import uvicorn
 from starlette.applications import Starlette
 from starlette.datastructures import Headers, MutableHeaders
@@ -28,14 +30,20 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response, Strea
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from learn3d.studio.demo.picture import EXAMPLES, SIDE, Picture, example, make_meshes, unpack
 from learn3d.studio.picture_to_mesh.reconstruction import Model, load_model
 from learn3d.terminal import plain, say
 
 MOST_BYTES = 5 * SIDE**2  # largest body of a request
-VISITORS = 200  # simultaneous requests, 260 MB in all; the browser of a later one tries again
+VISITORS = 200  # pictures that are received or wait, 260 MB in all; the browser of a later one tries again
+OF_ADDRESS = 40  # pictures of one address among them
+CONNECTIONS = 400  # connections of one address; further ones are closed at once
 PATIENCE = 30  # seconds in which a picture must arrive
+SILENCE = 10  # seconds that a connection may be silent,
+CROWD, CROWD_SILENCE = 20, 1  # and if its address has so many silent ones already
+_PIECE = 2**16  # bytes of an answer that a visitor must take within `SILENCE`
 _TICK = 0.05  # seconds
 #: The browser loads nothing from other servers, and does not show the page in a frame of another page.
 _HEADERS = {
@@ -45,6 +53,66 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+
+
+class Connection(H11Protocol):
+    """A connection that is closed if it is silent for too long, or if it sends more than a picture.
+
+    It is silent until the header of a request has come, after an answer, and while it does not read
+    an answer. uvicorn alone waits for ever for the end of a header.
+    """
+
+    _limit: asyncio.TimerHandle | None = None  # its end closes the connection; None if not silent
+    _received = 0  # bytes of this request
+
+    def connection_made(self, transport: asyncio.Transport) -> None:
+        super().connection_made(transport)
+        address = self.client and self.client[0]
+        near = [each for each in self.connections if each.client and each.client[0] == address]
+        if len(near) > CONNECTIONS:
+            transport.abort()
+            return
+        crowded = sum(each._limit is not None for each in near) >= CROWD
+        self._limit = self.loop.call_later(CROWD_SILENCE if crowded else SILENCE, transport.abort)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        if self._limit is not None:
+            self._limit.cancel()
+
+    def data_received(self, data: bytes) -> None:
+        self._received += len(data)
+        if self._received > MOST_BYTES + 2 * _PIECE:
+            self.transport.abort()
+        else:
+            super().data_received(data)
+
+    def handle_events(self) -> None:
+        super().handle_events()
+        self._watch()
+
+    def on_response_complete(self) -> None:
+        if self.conn.their_state is not h11.SEND_BODY:
+            self._received = 0
+        super().on_response_complete()
+        self._watch()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._watch()
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._watch()
+
+    def _watch(self) -> None:
+        is_at_work = self.cycle is not None and not self.cycle.response_complete
+        silent = self.flow.write_paused or not is_at_work
+        if silent and self._limit is None and not self.transport.is_closing():
+            self._limit = self.loop.call_later(SILENCE, self.transport.abort)
+        elif not silent and self._limit is not None:
+            self._limit.cancel()
+            self._limit = None
 
 
 class JobQueue:
@@ -57,12 +125,13 @@ class JobQueue:
     async def run(self, job: Callable[[Callable[[dict], None]], None]) -> AsyncIterator[bytes]:
         """Run a job and yield the messages that it sends, each a line of JSON; before them {"place": jobs ahead of it}.
 
-        A waiting job is dropped if the iteration ends early, because the visitor has left.
+        If the iteration ends early, because the visitor has left, a waiting job is dropped, and one
+        in work ends with the next message that it sends.
         """
         messages, ticket, place = deque(), object(), 0
 
         def send(message: dict) -> None:
-            if self.closed():
+            if self.closed() or ticket not in self._line:
                 raise asyncio.CancelledError  # ends the job
             messages.append(message)
 
@@ -79,7 +148,9 @@ class JobQueue:
                     yield _json_line({"place": ahead})
                 place = ahead
                 while messages:
-                    yield _json_line(messages.popleft())
+                    line = _json_line(messages.popleft())
+                    for start in range(0, len(line), _PIECE):
+                        yield line[start : start + _PIECE]
                 await asyncio.wait([work], timeout=_TICK)
             if not self.closed():
                 await work  # raises the job's error
@@ -126,7 +197,7 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
 async def _receive(request: Request) -> Picture:
     """The picture in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with its bytes in the body."""
     query = request.query_params
-    box = tuple(map(int, query["box"].split(","))) if "box" in query else None
+    box = tuple(map(_number, query["box"].split(","))) if "box" in query else None
     if box is not None and len(box) != 4:
         raise ValueError("a box has four numbers")
     content = bytearray()
@@ -134,11 +205,17 @@ async def _receive(request: Request) -> Picture:
         content += chunk
         if len(content) > MOST_BYTES:
             raise HTTPException(413, f"a picture has at most {MOST_BYTES} bytes")
-    return unpack(bytes(content), int(query["width"]), int(query["height"]), box)
+    return unpack(bytes(content), _number(query["width"]), _number(query["height"]), box)
+
+
+def _number(text: str) -> int:
+    if not re.fullmatch("-?[0-9]{1,6}", text):
+        raise ValueError("numbers are written with the digits 0 to 9")
+    return int(text)
 
 
 class Gate:
-    """ASGI middleware that refuses requests of other web pages, and those to another host name.
+    """ASGI middleware that refuses requests of other web pages, those to another host name, and too many pictures.
 
     An attacker's host name can point to this server (DNS rebinding). So the Host header must be an IP address, `host`
     or a name of this machine.
@@ -147,6 +224,7 @@ class Gate:
     def __init__(self, app: ASGIApp, host: str) -> None:
         machine = socket.gethostname()
         self._app, self._names = app, {host, "localhost", machine, f"{machine}.local"}
+        self._pictures: Counter[str] = Counter()  # pictures in work or in the queue by address
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def send_with_headers(message: Message) -> None:
@@ -155,20 +233,30 @@ class Gate:
             await send(message)
 
         headers = Headers(scope=scope)
-        host, origin = headers.get("host", ""), headers.get("origin")
-        app = self._app
-        if not self._is_this_machine(host):
-            app = PlainTextResponse("open this page by the address of its machine", 403)
-        elif origin is not None and urlsplit(origin).netloc != host:
-            app = PlainTextResponse("this request comes from another page", 403)
-        await app(scope, receive, send_with_headers)
+        address, app = (scope["client"] or ("",))[0], self._app
+        sent = Counter([address] if scope["method"] == "POST" else [])
+        if reason := self._refuse(headers.get("host", ""), headers.get("origin")):
+            app = PlainTextResponse(reason, 403)
+        elif sent and (self._pictures.total() >= VISITORS or self._pictures[address] >= OF_ADDRESS):
+            app = PlainTextResponse("many visitors are here; try again later", 503)
+        self._pictures += sent
+        try:
+            await app(scope, receive, send_with_headers)
+        finally:
+            self._pictures -= sent
 
-    def _is_this_machine(self, host: str) -> bool:
+    def _refuse(self, host: str, origin: str | None) -> str | None:
+        """The reason to refuse a request with these headers, None for one of the page."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
-            return name in self._names or bool(ipaddress.ip_address(name))
+            if name not in self._names:
+                ipaddress.ip_address(name)
         except ValueError:
-            return False
+            return "open this page by the address of its machine"
+        with contextlib.suppress(ValueError):
+            if origin is None or urlsplit(origin).netloc == host:
+                return None
+        return "this request comes from another page"
 
 
 def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
@@ -188,9 +276,9 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     errors.format = lambda record: plain(logging.Handler.format(errors, record))  # it may contain a visitor's text
     logging.getLogger("uvicorn").addHandler(errors)
     jobs = JobQueue()
-    limits = {"limit_concurrency": VISITORS, "timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
+    limits = {"timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
     off = dict.fromkeys(("access_log", "server_header", "proxy_headers"), False)
-    options = {"http": "h11", "ws": "none", "lifespan": "off", "log_config": None, "log_level": "error"}
+    options = {"http": Connection, "ws": "none", "lifespan": "off", "log_config": None, "log_level": "error"}
     server = uvicorn.Server(uvicorn.Config(application(models, host, jobs), **limits, **options, **off))
     jobs.closed = lambda: server.should_exit
     name = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host

@@ -34,11 +34,15 @@ class KnownCodes(NamedTuple):
         """The category whose codes are nearest to a code [C]."""
         return int(self._distances(code).argmin())
 
+    def distance(self, code: Tensor) -> float:
+        """The distance of a code [C] to the nearest category."""
+        return float(self._distances(code).min())
+
     def is_strange(self, code: Tensor) -> bool:
         """Whether a code [C] is of no category: by its distance to the centres, and by the network if it was learnt."""
         if self.hidden is None:
             return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
-        if float(self._distances(code).min()) < NEAR:
+        if self.distance(code) < NEAR:
             return False
         hidden, output = self.hidden.float(), self.output.float()
         units = F.relu(hidden[:, :-1] @ (_SCALE * F.normalize(code, dim=0)) + hidden[:, -1])

@@ -27,9 +27,10 @@ from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turnta
 from learn3d.runs import checkpoint
 from learn3d.settings import split_names
 from learn3d.studio.picture_to_mesh.coloring import color_mesh
-from learn3d.studio.picture_to_mesh.cutting import Box, find_mask, is_plain
+from learn3d.studio.picture_to_mesh.cutting import Box, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
+from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.smoothing import divide, outer_surface
 from learn3d.studio.picture_to_mesh.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.terminal import note
@@ -63,6 +64,14 @@ class Model(NamedTuple):
         """Call `prepare_image` with the image size, object size and layout of these networks."""
         size, layout = self.method.image_size, self.config.layout
         return prepare_image(colors, mask, crop=crop, object_size=self.object_size, size=size, layout=layout)
+
+    @torch.no_grad()
+    def judge(self, colors: np.ndarray, mask: np.ndarray) -> float:
+        """How much the object of a mask uint8 [H, W] resembles a known kind; 0 if the model has no known codes."""
+        if self.known_codes is None:
+            return 0.0
+        (code,) = self.method.encode(torch.from_numpy(self.prepare(colors, mask))[None])
+        return -self.known_codes.distance(code)
 
 
 def load_model(run: Path | None, which: str = "last") -> Model:
@@ -119,7 +128,7 @@ def reconstruct_files(
     paths, faults = [], []
     for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
         try:
-            photo = _read(image, mask, box)
+            photo = _read(model, image, mask, box)
         except (ValueError, OSError) as error:
             faults.append(error)
             continue
@@ -184,24 +193,30 @@ def reconstruct(
     return method.decode(method.encode(images)).surfaces()
 
 
-def _read(path: Path, mask_path: Path | None = None, box: Box | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _read(
+    model: Model, path: Path, mask_path: Path | None = None, box: Box | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path`, or found in the image."""
     colors, mask = read_photo(path, mask_path, optional=True)
     searched = mask is None or box is not None  # a box counts even if the file has transparency
+    doubt = None
     if searched:
         if box is None:
             photo = Image.fromarray(colors)
             photo.thumbnail((_SEARCHED_SIDE, _SEARCHED_SIDE))
             colors = np.asarray(photo)
-            how = "as all that differs from the plain background" if is_plain(colors) else "by GrabCut in the middle"
+        mask, how, doubt = find_outline(colors, box, model.judge)
+        if box is None:
             wrong = "if the outline in the strip of views is wrong, give --box or --masks"
             note(f"note: {path} has no transparency, so the object was searched, {how}; {wrong}")
-        mask = find_mask(colors, box)
+    advice = "Give --box or --masks, or cut the object out (transparency)"
     try:
         check_mask(mask, cropped=not searched)
     except ValueError as error:
-        missed = "no object was found in this photograph. Give --box or --masks, or cut the object out (transparency)"
+        missed = f"no object was found in this photograph. {advice}"
         raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
+    if doubt:
+        raise ValueError(f"{path}: no object was found for certain: {doubt}. {advice}")
     mask, left_out = keep_object(mask)
     if left_out:
         note(f"note: {path}: {left_out}")
@@ -312,7 +327,11 @@ def reconstruct_guesses(
     progress("camera", 0.0)
     predicted = predict(method, image, mask)
     kind, warning = (category, None) if category else recognize(model, predicted.code[0])
-    templates = model.templates if warning is None else None
+    if warning is not None:
+        surface, view = inflate(framed)
+        iou = float(view.ious(surface.vertices[None], surface.faces, mask))
+        return [Reconstruction(surface, stored, 0.0, iou, None, warning)]
+    templates = model.templates
     if templates is not None:
         options = {"category": category, "guesses": guesses}
         fits = fit_template(templates, model.categories, predicted, mask, progress, **options)
@@ -349,7 +368,7 @@ def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
     if not model.known_codes.is_strange(code):
         return kind, None
     known = ", ".join(kinds)
-    advice = "so its shape is a guess; check the outline"
+    advice = "so its outline was inflated, and its back is its front; check the outline"
     return kind, f"this looks like nothing that the model was trained on ({known}), {advice}"
 
 

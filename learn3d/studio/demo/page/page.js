@@ -226,7 +226,7 @@ async function handle(message, pixels, signal) {
   if (message.mask) {
     const bits = bytes(message.mask);
     mask = Uint8ClampedArray.from({ length: pixels }, (_, i) => (bits[i >> 3] >> (7 - (i & 7))) & 1 ? 255 : 0);
-    $("hint").textContent = message.left_out ? `Note: ${message.left_out}. ${HINT}` : HINT;
+    $("hint").textContent = `Found ${message.how}. ${message.left_out ? `Note: ${message.left_out}. ` : ""}${HINT}`;
     show();
   }
   if (message.progress) { say(WORDS[message.progress]); busy(0.1 + 0.85 * message.part); }

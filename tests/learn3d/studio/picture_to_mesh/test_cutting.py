@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from learn3d.studio.picture_to_mesh.cutting import cut_out, find_mask, is_plain
+from learn3d.studio.picture_to_mesh import cutting
+from learn3d.studio.picture_to_mesh.cutting import cut_out, find_doubt, find_outline, is_plain
 
 
 @pytest.fixture
@@ -56,9 +58,9 @@ def test_plain_backgrounds_need_no_opencv(scene, monkeypatch) -> None:
     plain = np.where(inside[..., None], colors, np.uint8(230))
     assert is_plain(plain)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    assert overlap(find_mask(plain), inside) > 0.99
+    assert overlap(find_outline(plain).mask, inside) > 0.99
     with pytest.raises(ValueError, match=r"nmr-learn3d\[photos\]"):
-        find_mask(colors)
+        find_outline(colors)
 
 
 def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -> None:
@@ -66,7 +68,8 @@ def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -
     Image.fromarray(scene[0]).save(tmp_path / "disc.png")
     words = ("reconstruct", tmp_path / "disc.png", "--run", finished_run, "--output", tmp_path / "out")
     status, _, said = command(*words)
-    assert status == 0 and "by GrabCut in the middle; if the outline in the strip of views is wrong, give --box" in said
+    how = "by its difference from the background at the border"
+    assert status == 0 and f"{how}; if the outline in the strip of views is wrong, give --box" in said
     status, _, said = command(*words, "--box", 80, 50, 220, 220)
     assert status == 0, said
     with Image.open(tmp_path / "out" / "disc.png") as strip:
@@ -80,3 +83,91 @@ def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -
     assert status == 0 and (tmp_path / "out" / "disc.png").read_bytes() == cut, "the box goes before transparency"
     status, _, said = command(*words, "--box", 80, 50, 220, 220, "--masks", tmp_path / "disc.png")
     assert status == 1 and "--box is for one photograph" in said
+
+
+@pytest.fixture
+def room() -> tuple[np.ndarray, np.ndarray]:
+    """A table with open legs before a wall with a picture and a floor, its soft shadow on both, and its mask."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:300, :400].astype(float)
+    colors = np.where(y[..., None] < 170, (214.0, 208, 190), (150.0, 122, 96))
+    colors[164:170] = (235, 235, 230)
+    colors[20:70, 30:100] = (70, 90, 60)
+    inside = (np.abs(x - 210) < 90) & (np.abs(y - 150) < 9)
+    inside |= (np.abs(np.abs(x - 210) - 80) < 7) & (y > 150) & (y < 262)
+    colors *= 1 - 0.45 * np.exp(-((((x - 235) / 90) ** 2 + ((y - 258) / 16) ** 2) ** 2))[..., None]
+    colors[inside] = (140, 40, 45)
+    return (colors + rng.normal(0, 2, colors.shape)).clip(0, 255).astype(np.uint8), inside
+
+
+@pytest.mark.parametrize("box", [None, (114, 136, 192, 130)])
+def test_wall_floor_and_shadow_stay_outside(room, box) -> None:
+    pytest.importorskip("cv2", reason="needs the extra photos")
+    colors, inside = room
+    assert not is_plain(colors)
+    center = np.hypot(*(np.indices(inside.shape) - [[[170]], [[210]]]))
+    outline = find_outline(colors, box, lambda seen, mask: -float(center[::2, ::2][:150, :200].mean()))
+    assert overlap(outline.mask, inside) > 0.9 and outline.doubt is None
+    whole = cutting._grab_cut(colors, *[np.pad(np.ones((280, 380), bool), 10)] * 2, 5)
+    assert overlap(whole, inside) < 0.85, "GrabCut alone keeps more of the room"
+
+
+def test_doubtful_outlines(room) -> None:
+    y, x = np.indices((400, 400))
+    disc = np.hypot(x - 200, y - 200)
+    cases = {
+        "its outline touches 2 sides of the picture": np.abs(y - 200) < 90,
+        "its outline touches 4 sides of the picture": disc < 230,
+        "its outline is ragged": (disc < 150) & (np.random.default_rng(0).random((400, 400)) < 0.7),
+    }
+    for doubt, mask in cases.items():
+        assert find_doubt(255 * mask.astype(np.uint8)) == doubt
+    for mask in (disc < 150, (np.abs(x - 200) < 90) & (y > 200), room[1]):
+        assert find_doubt(255 * mask.astype(np.uint8)) is None
+
+
+def test_a_doubtful_outline_needs_a_box(finished_run, tmp_path: Path, command) -> None:
+    pytest.importorskip("cv2", reason="needs the extra photos")
+    noise = np.random.default_rng(0).integers(0, 256, (120, 120, 3)).astype(np.uint8)
+    noise[50:70] = (200, 30, 30)
+    Image.fromarray(noise).save(tmp_path / "band.png")
+    words = ("reconstruct", tmp_path / "band.png", "--run", finished_run, "--output", tmp_path / "out")
+    status, _, said = command(*words)
+    assert status == 1 and "no object was found" in said and "Give --box or --masks" in said
+    assert not (tmp_path / "out").exists()
+    status, _, said = command(*words, "--box", 10, 45, 100, 30)
+    assert status == 0, said
+
+
+class Rembg:
+    """A stand-in for the package: everything red is the object."""
+
+    failure: OSError | None = None
+
+    def new_session(self) -> Rembg:
+        return self
+
+    def remove(self, photo: Image.Image, session: Rembg, only_mask: bool) -> Image.Image:
+        assert session is self and only_mask
+        if self.failure is not None:
+            raise self.failure
+        red, green, _ = photo.split()
+        return Image.fromarray(np.where(np.asarray(red) > 2.0 * np.asarray(green), 240, 10).astype(np.uint8))
+
+
+def test_rembg_is_used_if_installed_and_says_so(room, finished_run, tmp_path: Path, monkeypatch, command) -> None:
+    colors, inside = room
+    rembg = Rembg()
+    rembg.__spec__ = ModuleSpec("rembg", None)
+    monkeypatch.setitem(sys.modules, "rembg", rembg)
+    cutting._rembg_session.cache_clear()
+    outline = find_outline(colors)
+    assert overlap(outline.mask, inside) > 0.99 and outline.doubt is None
+    Image.fromarray(colors).save(tmp_path / "table.png")
+    words = ("reconstruct", tmp_path / "table.png", "--run", finished_run, "--output", tmp_path / "out")
+    status, _, said = command(*words)
+    assert status == 0 and "by rembg, which loads its weights from the internet at its first use" in said
+    rembg.failure = OSError("no route to host")
+    status, _, said = command(*words)
+    assert status == 1 and "rembg does not cut the object out (no route to host); give a box or a mask" in said
+    cutting._rembg_session.cache_clear()

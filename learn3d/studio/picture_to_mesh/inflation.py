@@ -1,0 +1,70 @@
+"""Inflates the outline of a picture to a smooth shape with the picture on it, for objects of unknown kinds."""
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import spsolve
+from torch import Tensor
+
+from learn3d.pictures.surfaces import Surface, Texture, grid_surface
+from learn3d.studio.picture_to_mesh.fit import View, frame_view
+from learn3d.studio.picture_to_mesh.smoothing import smooth
+
+CELLS = 72  # cells along each side of the grid in which the surface lies
+DEPTH = 0.8  # thickness of the shape of a disc, over the disc's diameter
+_EDGE = 2  # pixels inside the outline that may have the background's colours
+_ROUNDS = 4  # of smoothing
+_SOLID = 0.2  # share of inner cells, up to which all cells that the object touches belong to it
+
+
+@torch.no_grad()
+def inflate(picture: np.ndarray) -> tuple[Surface, View]:
+    """A shape with the outline of a picture, mirror-symmetric about the picture's plane, and its view.
+
+    picture: R, G, B and mask, uint8 [4, S, S], framed as in `fit`. With u = 0 on the outline and Laplace(u) = -4
+    within, the surface is where z^2 = DEPTH^2 u, so that a disc becomes an ellipsoid. Both sides show the picture.
+    """
+    mask = torch.from_numpy(picture[3])[None, None].float()
+    inside = torch.nn.functional.interpolate(mask, (CELLS, CELLS), mode="area")[0, 0].numpy() > 127
+    if ndimage.binary_erosion(inside).sum() <= _SOLID * inside.sum():  # lines, dots: smoothing would remove them
+        inside = torch.nn.functional.adaptive_max_pool2d(mask, CELLS)[0, 0].numpy() > 127
+    square = DEPTH**2 * _solve(inside) - 4 * ndimage.distance_transform_edt(~inside)
+    z = np.arange(CELLS) - (CELLS - 1) / 2
+    field = square[::-1].T[:, :, None] - z**2
+    surface = grid_surface(torch.from_numpy(0.5 + 0.5 * field / (np.abs(field) + 2)))
+    vertices, faces = smooth(surface.vertices, surface.faces, rounds=_ROUNDS), surface.faces
+    view = frame_view(vertices, torch.zeros(1), torch.zeros(1))
+    x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
+    image = _spread(picture)
+    size = image.shape[0]
+    column, row = ((value * size).long().clamp(0, size - 1) for value in ((1 + x) / 2, (1 - y) / 2))
+    texture = Texture(image, torch.stack([(1 + x) / 2, (1 + y) / 2], 1)[faces])
+    return Surface(vertices, faces, image[row, column], texture), view
+
+
+def _solve(inside: np.ndarray) -> np.ndarray:
+    """u [H, W] with Laplace(u) = -4 in a mask, bool [H, W], and 0 elsewhere. The border of the array is outside."""
+    padded = np.pad(inside, 1)
+    count = int(padded.sum())
+    number = np.full(padded.shape, -1)
+    number[padded] = np.arange(count)
+    rows, columns = [], []
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        near = np.roll(number, step, axis)[padded]
+        rows.append(np.flatnonzero(near >= 0))
+        columns.append(near[near >= 0])
+    pairs = np.concatenate(rows), np.concatenate(columns)
+    system = diags_array(np.full(count, 4.0)) - coo_array((np.ones(len(pairs[0])), pairs), (count, count))
+    solved = np.zeros(padded.shape)
+    solved[padded] = spsolve(system.tocsc(), np.full(count, 4.0))
+    return solved[1:-1, 1:-1]
+
+
+def _spread(picture: np.ndarray) -> Tensor:
+    """The colours of a picture uint8 [4, S, S], float32 [S, S, 3]; outside of the object those of its nearest pixel."""
+    inside = picture[3] > 127
+    inner = ndimage.binary_erosion(inside, iterations=_EDGE)
+    source = inner if inner.any() else inside
+    y, x = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
+    return torch.from_numpy(np.moveaxis(picture[:3, y, x], 0, -1).astype(np.float32) / 255)

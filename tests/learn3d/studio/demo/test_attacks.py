@@ -1,0 +1,345 @@
+"""Attacks on the page of `learn3d demo`: each is refused or ended, and the next visitor gets a mesh."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import json
+import re
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("uvicorn", reason="needs the extra demo")
+
+from learn3d.studio.demo import server as serving
+from learn3d.studio.demo.picture import Picture, example, make_meshes
+from learn3d.studio.picture_to_mesh.reconstruction import load_model
+
+SIZE = 64
+ADDRESS = f"mesh?width={SIZE}&height={SIZE}"
+SILENCE, PATIENCE = 1.5, 3  # seconds; the page has 10 and 30
+
+
+class Page(NamedTuple):
+    """The page of a tiny model, and the pictures that were started and finished."""
+
+    url: str
+    held: list[int]  # connections of the server whenever one was made
+    started: list[int]
+    finished: list[int]
+
+    def most(self) -> int:
+        """The largest number of connections."""
+        return max(self.held)
+
+    @property
+    def host(self) -> str:
+        return self.url.split("/")[2]
+
+    def connect(self, source: str = "127.0.0.1") -> socket.socket:
+        name, port = self.host.split(":")
+        return socket.create_connection((name, int(port)), source_address=(source, 0), timeout=30)
+
+    def head(self, length: str = f"Content-Length: {4 * SIZE**2}") -> bytes:
+        return f"POST /{ADDRESS} HTTP/1.1\r\nHost: {self.host}\r\n{length}\r\n\r\n".encode()
+
+    def get(self, path: str = "about") -> bytes:
+        return f"GET /{path} HTTP/1.1\r\nHost: {self.host}\r\n\r\n".encode()
+
+    def visit(self, source: str = "127.0.0.1") -> list[dict]:
+        """The messages to a visitor with a picture."""
+        transport = httpx.HTTPTransport(local_address=source)
+        with httpx.Client(transport=transport, timeout=300) as client:
+            answer = client.post(self.url + ADDRESS, content=box())
+        assert answer.status_code == 200, answer.text
+        return [json.loads(line) for line in answer.text.splitlines()]
+
+
+def box() -> bytes:
+    """R, G, B, mask of a blue box on grey; the mask is unknown."""
+    pixels = np.full((SIZE, SIZE, 4), 255, np.uint8)
+    pixels[..., :3] = 200
+    pixels[16:48, 16:48, :3] = (40, 60, 120)
+    return pixels.tobytes()
+
+
+@pytest.fixture(scope="module")
+def page(finished_run) -> Iterator[Page]:
+    """The page in this process, with short limits."""
+    held: list[int] = []
+    started: list[int] = []
+    finished: list[int] = []
+    ready = threading.Event()
+    servers, addresses = [], []
+
+    class Server(serving.uvicorn.Server):
+        def run(self, sockets: list[socket.socket]) -> None:
+            servers.append(self)
+            addresses.append("http://{}:{}/".format(*sockets[0].getsockname()))
+            ready.set()
+            super().run(sockets)
+
+    class Connection(serving.Connection):
+        def connection_made(self, transport: asyncio.Transport) -> None:
+            super().connection_made(transport)
+            held.append(sum(not each.transport.is_closing() for each in self.connections))
+
+    def count(*arguments: object) -> None:
+        started.append(1)
+        make_meshes(*arguments)
+        finished.append(1)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serving, "SILENCE", SILENCE)
+        patch.setattr(serving, "PATIENCE", PATIENCE)
+        patch.setattr(serving, "make_meshes", count)
+        patch.setattr(serving, "Connection", Connection)
+        patch.setattr(serving.uvicorn, "Server", Server)
+        options = {"host": "127.0.0.1", "port": 0, "browser": False}
+        thread = threading.Thread(target=serving.serve, args=[[finished_run]], kwargs=options)
+        thread.start()
+        assert ready.wait(60)
+        yield Page(addresses[0], held, started, finished)
+        servers[0].should_exit = True
+        thread.join()
+
+
+def read_to_end(visitor: socket.socket, within: float) -> bytes:
+    """All that the server sends until it closes the connection, which it must do in time."""
+    content, end = b"", time.monotonic() + within
+    with contextlib.suppress(ConnectionError):
+        while True:
+            visitor.settimeout(max(0.01, end - time.monotonic()))
+            if not (part := visitor.recv(2**16)):
+                break
+            content += part
+    return content
+
+
+def flood(visitor: socket.socket, piece: bytes, most: int) -> int:
+    """The bytes that the server takes before it closes the connection, at most `most`."""
+    sent = 0
+    with contextlib.suppress(ConnectionError, TimeoutError):
+        while sent < most:
+            visitor.sendall(piece)
+            sent += len(piece)
+    return sent
+
+
+def silent_crowd(page: Page) -> None:
+    api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    if (chromium := shutil.which("chromium")) is None:
+        pytest.skip("needs Chromium (apt-get install chromium)")
+    with contextlib.ExitStack() as crowd, api.sync_playwright() as playwright:
+        for number in range(250):
+            silent = crowd.enter_context(page.connect())
+            silent.sendall(page.get()[:20] if number % 2 else b"")
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        shown = browser.new_page()
+        shown.set_default_timeout(60_000)
+        shown.goto(page.url)
+        shown.get_by_role("button", name="sofa").click()
+        shown.get_by_text("Drag the mesh to turn it").wait_for()
+        browser.close()
+
+
+def crowd_of_silent_and_busy(page: Page) -> None:
+    """Each of thirty visitors beside two hundred silent connections gets a mesh or a place in the queue."""
+
+    def first_words(_: int) -> set[str]:
+        with httpx.stream("POST", page.url + ADDRESS, content=box(), timeout=60) as answer:
+            assert answer.status_code == 200
+            line = next(answer.iter_lines())
+            together.wait(60)  # all are there at once
+        return set(json.loads(line))
+
+    together = threading.Barrier(30)
+    with contextlib.ExitStack() as crowd, ThreadPoolExecutor(30) as visitors:
+        for _ in range(200):
+            crowd.enter_context(page.connect()).sendall(page.get()[:20])
+        said = list(visitors.map(first_words, range(30)))
+    assert said.count({"place"}) >= 28, said
+
+
+def too_many_connections(page: Page) -> None:
+    with contextlib.ExitStack() as crowd:
+        for _ in range(serving.CONNECTIONS + 50):
+            crowd.enter_context(page.connect("127.0.0.2"))
+        assert "meshes" in page.visit()[-1]
+        assert page.most() <= serving.CONNECTIONS + 1, "the visitor has another address"
+
+
+def dripping_header(page: Page) -> None:
+    with page.connect() as visitor:
+        assert flood_slowly(visitor, page.get() * 9) < 3 * SILENCE
+
+
+def flood_slowly(visitor: socket.socket, content: bytes) -> float:
+    """The seconds for which the server takes a byte every twentieth of a second."""
+    start = time.monotonic()
+    with contextlib.suppress(ConnectionError):
+        for byte in content:
+            visitor.sendall(bytes([byte]))
+            time.sleep(0.05)
+    return time.monotonic() - start
+
+
+def byte_after_an_answer(page: Page) -> None:
+    with page.connect() as visitor:
+        visitor.sendall(page.get() + b"G")
+        assert b" 200 " in read_to_end(visitor, 3 * SILENCE)
+
+
+def slow_body(page: Page) -> None:
+    with page.connect() as visitor:
+        visitor.sendall(page.head() + box()[:100])
+        assert b" 408 " in read_to_end(visitor, PATIENCE + 3 * SILENCE)
+
+
+def body_without_end(page: Page) -> None:
+    piece = b"10000\r\n" + bytes(2**16) + b"\r\n"
+    with page.connect() as visitor:
+        visitor.sendall(page.head("Transfer-Encoding: chunked"))
+        assert flood(visitor, piece, 2**28) < 2**24
+
+
+def body_for_a_small_answer(page: Page) -> None:
+    with page.connect() as visitor:
+        visitor.sendall(page.get().replace(b"\r\n\r\n", b"\r\nContent-Length: 10000000000\r\n\r\n"))
+        assert flood(visitor, bytes(2**16), 2**28) < 2**24
+
+
+def unread_answers(page: Page) -> None:
+    with page.connect() as visitor:
+        visitor.settimeout(0.5)
+        flood(visitor, page.get("page.js") * 100, 2**22)
+        time.sleep(2 * SILENCE)
+        with pytest.raises(ConnectionError):
+            for _ in range(3):
+                visitor.sendall(page.get())
+                time.sleep(0.1)
+
+
+def visitors_who_leave(page: Page) -> None:
+    before = len(page.started)
+    for _ in range(30):
+        with page.connect() as visitor:
+            visitor.sendall(page.head() + box())
+    page.visit()
+    assert len(page.started) - before <= 5, "pictures of those who have left are not started"
+
+
+def visitor_who_leaves_at_work(page: Page) -> None:
+    started, finished = len(page.started), len(page.finished)
+    with page.connect() as visitor:
+        visitor.sendall(page.head() + box())
+        assert b"progress" in b"".join(visitor.recv(2**12) for _ in range(3))
+    page.visit()
+    assert (len(page.started) - started, len(page.finished) - finished) == (2, 1)
+
+
+def pictures_of_one_address(page: Page) -> None:
+    with contextlib.ExitStack() as crowd:
+        for _ in range(serving.OF_ADDRESS + 10):
+            crowd.enter_context(page.connect("127.0.0.2")).sendall(page.head() + box()[:100])
+        time.sleep(0.5)
+        with crowd.enter_context(page.connect("127.0.0.2")) as one_more:
+            one_more.sendall(page.head() + box())
+            assert b" 503 " in one_more.recv(2**12)
+        assert "meshes" in page.visit()[-1]
+
+
+def odd_origins_and_hosts(page: Page) -> None:
+    origins = ["http://[", "http://[::1", "null", "http://evil.example", f"http://{page.host}@evil.example", "\x80"]
+    hosts = ["evil.example", "", "[", "[::1", "localhost.evil.example", "127.0.0.1.evil.example"]
+    for header in [{"Origin": text} for text in origins] + [{"Host": text} for text in hosts]:
+        encoded = {name: text.encode("latin-1") for name, text in header.items()}
+        for method in ("GET", "POST"):
+            assert httpx.request(method, page.url + ADDRESS, headers=encoded).status_code == 403, header
+
+
+def odd_numbers(page: Page) -> None:
+    for number in ("٦٤", "６４", "6_4", "+64", " 64", "64.0", "6e1", "9" * 5000, ""):
+        answers = [httpx.post(page.url + "mesh", params={"width": number, "height": SIZE}, content=box())]
+        answers += [httpx.post(page.url + ADDRESS, params={"box": f"8,8,{number},40"}, content=box())]
+        assert [answer.status_code for answer in answers[:1]] == [400], number
+
+
+def large_header(page: Page) -> None:
+    with page.connect() as visitor:
+        assert flood(visitor, page.get()[:-2] + b"X-Padding: " + b"x" * 2**16, 2**26) < 2**22
+
+
+def two_requests_in_one(page: Page) -> None:
+    """A body that a proxy would take for a second request."""
+    hidden = page.get()
+    before = len(page.started)
+    both = f"Content-Length: {len(hidden) + 5}\r\nTransfer-Encoding: chunked"
+    twice = f"Content-Length: 0\r\nContent-Length: {len(hidden)}"
+    for length in (both, twice):
+        with page.connect() as visitor:
+            visitor.sendall(page.head(length) + (b"0\r\n\r\n" if length == both else b"") + hidden)
+            said = read_to_end(visitor, PATIENCE + 3 * SILENCE)
+        assert re.findall(rb"HTTP/1.1 (\d+)", said)[0] == b"400"
+    assert len(page.started) == before
+
+
+def pictures_full_of_holes(page: Page) -> None:
+    """They cost at most twice as much as an ordinary one."""
+    models = {"small model": load_model(None)}
+    with Image.open(io.BytesIO(example("chair"))) as image:
+        colors, alpha = np.split(np.asarray(image), [3], axis=2)
+    ordinary = Picture(np.ascontiguousarray(colors), alpha[..., 0].copy())
+    y, x = np.indices((512, 512))
+    ring = np.abs(np.hypot(x - 256, y - 256) - 200) < 3
+    boxed = (np.abs(x - 256) < 230) & (np.abs(y - 256) < 230)
+    dots = (x % 2 == 0) & (y % 2 == 0)
+    masks = [(x // 8 + y // 8) % 2 == 0, ring, boxed & ~dots, np.random.default_rng(0).random((512, 512)) < 0.6]
+    grey = np.full((512, 512, 3), 200, np.uint8)
+    pictures = [Picture(grey // 2, 255 * mask.astype(np.uint8)) for mask in masks]
+    found = [Picture(np.where(mask[..., None], np.uint8(30), grey), np.full_like(grey[..., 0], 255)) for mask in masks]
+    seconds = []
+    for picture in (ordinary, ordinary, *pictures, *found):
+        start = time.process_time()
+        make_meshes(models, picture, lambda _: None)
+        seconds.append(time.process_time() - start)
+    assert max(seconds[2:]) < 2 * seconds[1], seconds
+
+
+ATTACKS: list[Callable[[Page], None]] = [
+    silent_crowd,
+    crowd_of_silent_and_busy,
+    too_many_connections,
+    dripping_header,
+    byte_after_an_answer,
+    slow_body,
+    body_without_end,
+    body_for_a_small_answer,
+    unread_answers,
+    visitors_who_leave,
+    visitor_who_leaves_at_work,
+    pictures_of_one_address,
+    odd_origins_and_hosts,
+    odd_numbers,
+    large_header,
+    two_requests_in_one,
+    pictures_full_of_holes,
+]
+
+
+@pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.__name__)
+def test_the_page_stands_and_the_next_visitor_gets_a_mesh(page, attack, caplog) -> None:
+    attack(page)
+    assert "meshes" in page.visit()[-1]
+    assert not [record for record in caplog.records if record.levelname == "ERROR"], caplog.text

@@ -1,0 +1,61 @@
+"""Inflated outlines of unknown objects."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from learn3d.pictures.surfaces import draw_around
+from learn3d.studio.picture_to_mesh.inflation import CELLS, DEPTH, inflate
+from learn3d.studio.picture_to_mesh.reconstruction import frame, load_model, reconstruct_picture, reduce_mask
+
+SIZE = 200
+Y, X = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
+MASKS = {
+    "disc": np.hypot(X, Y) < 60,
+    "mug": ((np.abs(X + 15) < 45) & (np.abs(Y) < 55)) | (np.abs(np.hypot(X - 35, Y) - 28) < 7),
+    "two": np.hypot(np.abs(X) - 45, Y) < 30,
+    "line": (np.abs(Y) < 1) & (np.abs(X) < 80),
+    "full": np.hypot(X, Y) < 400,
+    "dots": (X.astype(int) % 6 < 3) & (Y.astype(int) % 6 < 3) & (np.hypot(X, Y) < 80),
+}
+
+
+def framed(mask: np.ndarray) -> np.ndarray:
+    colors = np.stack([128 + X, 128 + Y, 0 * X + 90], -1).astype(np.uint8)
+    return frame(colors, 255 * mask.astype(np.uint8))
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_the_shape_is_closed_symmetric_and_has_the_outline(name) -> None:
+    picture = framed(MASKS[name])
+    surface, view = inflate(picture)
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    assert mesh.is_watertight and mesh.volume > 0, "closed, normals outwards"
+    mirrored = surface.vertices * torch.tensor([1, 1, -1])
+    assert torch.cdist(mirrored, surface.vertices).min(1).values.max() < 1 / CELLS
+    wanted = {"line": 0.2, "dots": 0.2}.get(name, 0.9)
+    assert float(view.ious(surface.vertices[None], surface.faces, reduce_mask(picture[3]))) > wanted
+
+
+def test_a_disc_becomes_an_ellipsoid_with_the_picture_on_both_sides() -> None:
+    picture = framed(MASKS["disc"])
+    surface, _ = inflate(picture)
+    low, high = surface.vertices.amin(0), surface.vertices.amax(0)
+    wide, _, deep = (high - low).tolist()
+    assert deep / wide == pytest.approx(DEPTH, rel=0.05)
+    front, back = (image.astype(int) for image in draw_around(surface, [0, 180], image_size=64))
+    assert front[32, 44, 0] > front[32, 20, 0] + 20, "red grows to the right"
+    assert back[32, 44, 0] < back[32, 20, 0] - 20, "and to the left from behind"
+    assert surface.texture.image.shape == (256, 256, 3) and surface.colors.min() > 0.1, "no white of the background"
+
+
+def test_pictures_of_unknown_kinds_are_inflated(tmp_path) -> None:
+    mask = 255 * MASKS["mug"].astype(np.uint8)
+    made = reconstruct_picture(load_model(None), np.full((SIZE, SIZE, 3), 180, np.uint8), mask)
+    assert made.kind is None and "looks like nothing that the model was trained on" in made.warning
+    assert made.silhouette_iou > 0.9 and made.azimuth_deg == 0
+    Image.fromarray(draw_around(made.surface, [0], image_size=64)[0]).save(tmp_path / "mug.png")
