@@ -27,7 +27,7 @@ from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turnta
 from learn3d.runs import checkpoint
 from learn3d.settings import split_names
 from learn3d.studio.picture_to_mesh.coloring import color_mesh
-from learn3d.studio.picture_to_mesh.cutting import Box, find_outline
+from learn3d.studio.picture_to_mesh.cutting import Box, Judge, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
@@ -128,7 +128,7 @@ def reconstruct_files(
     paths, faults = [], []
     for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
         try:
-            photo = _read(model, image, mask, box)
+            photo = _read(image, mask, box, model.judge)
         except (ValueError, OSError) as error:
             faults.append(error)
             continue
@@ -194,7 +194,7 @@ def reconstruct(
 
 
 def _read(
-    model: Model, path: Path, mask_path: Path | None = None, box: Box | None = None
+    path: Path, mask_path: Path | None = None, box: Box | None = None, judge: Judge | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path`, or found in the image."""
     colors, mask = read_photo(path, mask_path, optional=True)
@@ -205,7 +205,7 @@ def _read(
             photo = Image.fromarray(colors)
             photo.thumbnail((_SEARCHED_SIDE, _SEARCHED_SIDE))
             colors = np.asarray(photo)
-        mask, how, doubt = find_outline(colors, box, model.judge)
+        mask, how, doubt = find_outline(colors, box, judge)
         if box is None:
             wrong = "if the outline in the strip of views is wrong, give --box or --masks"
             note(f"note: {path} has no transparency, so the object was searched, {how}; {wrong}")

@@ -58,7 +58,7 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
     assert torch.allclose(made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08), "the picture's"
     unknown = model.known_codes._replace(output=model.known_codes.output + 100)
     lump = reconstruct_picture(model._replace(known_codes=unknown), *shown)
-    assert lump.warning and bodies(lump.surface) < 3, "other things get the predicted shape"
+    assert lump.warning and bodies(lump.surface) < 3, "other things are inflated"
 
 
 def test_guesses_differ_and_a_known_category_is_obeyed(model: Model) -> None:
