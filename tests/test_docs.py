@@ -27,16 +27,14 @@ from learn3d.studio.tables.tables import TABLES
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
-MIGRATING = ROOT / "docs" / "migrating.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+MIGRATING = {path.stem: path for path in (ROOT / "docs" / "migrating").glob("*.md")}
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md")), *sorted(MIGRATING.values())]
 
 
-def run(page, section=""):
-    """Executes the blocks of a page or of one of its sections, in order, in one namespace, which is returned."""
-    text, names = page.read_text(), {}
-    if section:
-        text = text.split(f"\n## {section}\n")[1].split("\n## ")[0]
-    for block in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL):
+def run(page):
+    """Executes the blocks of a page, in order, in one namespace, which is returned."""
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
         exec(block, names)
     return names
 
@@ -75,7 +73,7 @@ def test_what_it_is_for_solves_its_five_tasks(tmp_path, monkeypatch):
 
 
 def test_from_pytorch3d_draws_the_same_picture_both_ways():
-    names = run(MIGRATING, "PyTorch3D")
+    names = run(MIGRATING["pytorch3d"])
     rgb, alpha, same = names["rgb"], names["alpha"], names["same"]
     assert rgb.shape == (1, 256, 256, 3) and alpha.shape == (1, 256, 256)
     assert 0.2 < alpha.mean() < 0.8
@@ -85,13 +83,13 @@ def test_from_pytorch3d_draws_the_same_picture_both_ways():
     # Nearest to the eye, which is at z = 2.7, is the greatest z.
     assert rgb[0, 128, 128, 2] > 0.9
     names["uv"] = torch.tensor([[0.0, 0.0], [1.0, 1.0], [3 / 127, 5 / 63]])
-    exec(re.findall(r"^uv = \(.*$", MIGRATING.read_text(), flags=re.MULTILINE)[0], names)
+    exec(re.findall(r"^uv = \(.*$", MIGRATING["pytorch3d"].read_text(), flags=re.MULTILINE)[0], names)
     texels = names["uv"] * torch.tensor([128, 64]) - 0.5  # a texel centre of align_corners=True is one of ours
     torch.testing.assert_close(texels, torch.tensor([[0.0, 0.0], [127.0, 63.0], [3.0, 5.0]]), atol=1e-4, rtol=0)
 
 
 def test_from_nvdiffrast_draws_the_same_picture_three_ways():
-    names = run(MIGRATING, "nvdiffrast")
+    names = run(MIGRATING["nvdiffrast"])
     image = names["image"]
     assert image.shape == (1, 256, 256, 3) and 0.1 < (image != 1).any(-1).float().mean() < 0.9
     torch.testing.assert_close(names["same"], image, atol=0, rtol=0)
@@ -102,7 +100,7 @@ def test_from_nvdiffrast_draws_the_same_picture_three_ways():
 
 
 def test_from_neural_renderer_maps_of_forks():
-    names = run(MIGRATING, "neural_renderer")
+    names = run(MIGRATING["neural_renderer"])
     index, same, visible = names["face_index"], names["same"], names["visible"]
     assert index.shape == (2, 64, 64) and torch.equal(index, same)
     assert visible.shape == (2, 320)
@@ -112,7 +110,7 @@ def test_from_neural_renderer_maps_of_forks():
 
 
 def test_from_softras_draws_silhouettes_and_colours():
-    names = run(MIGRATING, "SoftRas")
+    names = run(MIGRATING["softras"])
     assert names["vertices"].grad.abs().sum() > 0 and 0 < names["loss"] < 0.2
     assert names["rgb"].shape == (1, 64, 64, 3) and names["covers"].shape == (1, 64, 64, 4)
 
@@ -120,8 +118,10 @@ def test_from_softras_draws_silhouettes_and_colours():
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_pages_run_and_what_they_name_exists(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    tested_elsewhere = ("README.md", "migrating.md", "contributing.md", "what-for.md")
-    if page.name not in tested_elsewhere:  # above, and in learn3d/methods/test_development.py
+    tested_elsewhere = ("README.md", "contributing.md", "what-for.md")
+    if (
+        page.name not in tested_elsewhere and page not in MIGRATING.values()
+    ):  # above, and in learn3d/methods/test_development.py
         run(page)
     text = page.read_text()
     named = re.findall(r"(?:tools|docs|csrc|nmr|learn3d|tests)/[\w./-]*\w\.(?:py|sh|md|png|cpp|ipynb)", text)
