@@ -266,7 +266,7 @@ class Report(OnDataset):
 
     Examples:
       learn3d report runs/plus runs/vanilla --output report.html
-      learn3d report runs/plus --data DATA --indices 0 31 62 --output report.html
+      learn3d report runs/plus --data DATA --objects 30 --output report.html
     """
 
     runs: Runs
@@ -277,15 +277,12 @@ class Report(OnDataset):
     """Names of the runs (default: those of their presets)."""
     objects: int = 12
     """Number of objects to show, spread from the best IoU to the worst."""
-    indices: tuple[int, ...] = ()
-    """Numbers of the images to show (default: from --objects). With V views of each object, image n * V + k is view k
-    of object n."""
 
     def run(self) -> None:
         from learn3d.studio.tables.report import write_report
 
         check_target(self.output, "--output")
-        size = write_report(self.runs, self.output, **self.pick("labels", "objects", "indices"))
+        size = write_report(self.runs, self.output, **self.pick("labels", "objects"))
         say(f"{self.output} ({size / 1e6:.1f} MB)")
 
 

@@ -75,27 +75,24 @@ def write_report(
     split: str = "test",
     which: Literal["last", "best"] = "last",
     objects: int = 12,
-    indices: Sequence[int] = (),
 ) -> int:
     """Measure runs on a split as `learn3d evaluate` does, and write the page; returns its size in bytes.
 
     objects: number of objects whose shapes are shown, from the best to the worst, each in an
     image of typical IoU.
-    indices: images to show instead (object * views + view). The other options are those of
-    `open_runs`. Raises ValueError or OSError, before anything is measured, for missing files,
+    The other options are those of `open_runs`. Raises ValueError or OSError, before anything is measured, for missing files,
     several categories or different images.
     """
-    if not 1 <= (count := len(indices) or objects) <= MOST_SHOWN:
-        raise ValueError(f"the page can show the shapes of 1 to {MOST_SHOWN} images, got {count}")
+    if not 1 <= objects <= MOST_SHOWN:
+        raise ValueError(f"the page can show the shapes of 1 to {MOST_SHOWN} images, got {objects}")
     runs = open_runs(paths, labels=labels, data=data, category=category, split=split, which=which)
     _check_same_images(runs, data)
-    runs[0].dataset.batch(torch.tensor(indices, dtype=torch.int64))  # raises for wrong indices
     logs = [read_metrics(path) if (Path(path) / METRICS).is_file() else {} for path in paths]
     results = []
     for run in runs:
         note(f"measuring {run.label} on {len(run.dataset)} images")
         results.append(evaluate(run.method, run.dataset))
-    page = _measure(runs, results, objects, indices) | {"split": split, "which": which}
+    page = _measure(runs, results, objects) | {"split": split, "which": which}
     page["data"] = plain((data or runs[0].metadata.config.data).name)
     page["browser"]["curves"] = draw_curves(logs)
     texts = {kind: Path(__file__).with_suffix(f".{kind}").read_text("utf-8") for kind in ("html", "css", "js")}
@@ -129,7 +126,6 @@ def _measure(
     runs: Sequence[TrainedModel],
     results: Sequence[Evaluation],
     objects: int,
-    indices: Sequence[int],
 ) -> dict[str, Any]:
     """The values of the template; "browser" is for the script of the page."""
     dataset = runs[0].dataset
@@ -146,10 +142,7 @@ def _measure(
     of_objects = _mean(means, axis=0)
     numbers = np.unique(ids)
     ranked = numbers[np.argsort(-np.nan_to_num(of_objects[numbers], nan=-1.0), kind="stable")]  # the best object first
-    if not indices:
-        indices = _typical_images(_mean(ious, axis=0), of_objects, ids, ranked, objects)
-    rank = ranked.tolist().index
-    shown = sorted(map(int, dict.fromkeys(indices)), key=lambda sample: rank(ids[sample]))
+    shown = _typical_images(_mean(ious, axis=0), of_objects, ids, ranked, objects)
     items = pack_shapes(runs, shown)
     for item, sample in zip(items, shown, strict=True):
         item |= {"ious": _numbers(ious[:, sample]), "means": _numbers(means[:, ids[sample]])}
@@ -198,7 +191,7 @@ def _typical_images(
     order = np.nan_to_num(np.abs(of_images - of_objects[ids]), nan=9.0).argsort(kind="stable")
     typical = dict(zip(ids[order[::-1]], order[::-1], strict=True))
     places = np.unique(np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int))
-    return [typical[number] for number in ranked[places]]
+    return [int(typical[number]) for number in ranked[places]]
 
 
 def mean_by_azimuth(azimuths_deg: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

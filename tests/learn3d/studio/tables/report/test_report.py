@@ -106,13 +106,6 @@ def test_objects_go_from_the_best_to_the_worst(page) -> None:
     assert [rows[0][1], rows[2][1]] == [item["name"] for item in items]
 
 
-def test_chosen_images_are_shown(tmp_path, runs) -> None:
-    write_report(runs[:1], tmp_path / "page.html", split="train", which="best", indices=(3, 50, 3))
-    items = Page(tmp_path / "page.html").data["items"]
-    assert sorted(item["index"] for item in items) == [3, 50]
-    assert {item["name"] for item in items} == {"0000", "0002"}
-
-
 def test_meshes_are_those_of_the_networks_seen_as_in_mesh_files(page, runs) -> None:
     item = Page(page).data["items"][0]
     method, config, _ = checkpoint.load_method(runs[1] / "last.safetensors")
@@ -160,7 +153,6 @@ def test_curves_are_those_of_the_log(page, runs, read_metrics) -> None:
         ("--output {tmp}/page.html", "give at least one run"),
         ("{run} {tmp}/no --output {tmp}/page.html", "there is no checkpoint"),
         ("{run} --category chair --output {tmp}/page.html", "is missing"),
-        ("{run} --indices 24 --output {tmp}/page.html", "indices must lie in 0 .. 23"),
         ("{run} --objects 101 --output {tmp}/page.html", "of 1 to 100 images, got 101"),
     ],
 )
