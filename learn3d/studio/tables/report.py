@@ -79,9 +79,9 @@ def write_report(
     """Measure runs on a split as `learn3d evaluate` does, and write the page; returns its size in bytes.
 
     objects: number of objects whose shapes are shown, from the best to the worst, each in an
-    image of typical IoU.
-    The other options are those of `open_runs`. Raises ValueError or OSError, before anything is measured, for missing files,
-    several categories or different images.
+    image of typical IoU. The other options are those of `open_runs`. Raises ValueError or
+    OSError, before anything is measured, for missing files, several categories or different
+    images.
     """
     if not 1 <= objects <= MOST_SHOWN:
         raise ValueError(f"the page can show the shapes of 1 to {MOST_SHOWN} images, got {objects}")
