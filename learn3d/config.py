@@ -1,29 +1,17 @@
-"""The options of a training run: a frozen dataclass with defaults from a preset, its checks and its JSON form."""
+"""The options of a training run: a frozen dataclass, its checks and its JSON form. `presets` has instances of it."""
 
 import dataclasses
 import json
-import shlex
 import typing
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, Field, SkipValidation
+from pydantic import Field, SkipValidation
 
 from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import VIEWS_OF_OBJECT, Augmentation, Sampling
-from learn3d.files import limits
-from learn3d.files.reading import read_json
 from learn3d.methods.method import MethodSettings
 from learn3d.methods.optimization import LRSchedule, TrainingSchedule
-from learn3d.presets import PRESETS, Preset, full_name
-from learn3d.settings import Count, FilePath, Items, Rare, Step, checked
-
-DEFAULT_PRESET = "plus-kato"
-
-#: Options of every command line that `command_line` makes.
-USUAL_OPTIONS = ("preset", "data", "category", "output", "iterations", "batch_size", "seed")
-#: Options whose default is the preset's.
-FROM_PRESET = tuple(field.name for field in dataclasses.fields(Preset) if field.name not in ("label", "source"))
+from learn3d.settings import Count, FilePath, Items, Step, checked
 
 T = TypeVar("T")
 _MAY_DIFFER = "a resumed run may have another value"
@@ -40,73 +28,66 @@ class TrainConfig:
     """Categories to train on together, separated by commas: names (chair), synset ids, or names of your own."""
     output: MayDiffer[FilePath]
     """Folder of this run: checkpoints, metrics, pictures. It must be new or empty without --resume or --overwrite."""
-    preset: Annotated[str, AfterValidator(full_name)] = DEFAULT_PRESET
+    preset: str
     """Method, or preset of a method for other data. It sets the defaults of the other options."""
-    settings: Rare[Annotated[MethodSettings | None, SkipValidation]] = None
-    """Settings of the method (default: from the preset)."""
-    layout: Layout | None = None
+    label: MayDiffer[str]
+    """Name of the method in tables and figures."""
+    settings: Annotated[MethodSettings, SkipValidation]
+    """Settings of the method; their type decides the method."""
+    layout: Layout
     """Arrangement of the files of the data set, see docs/data-sets.md."""
-    view_bins: Rare[str | None] = None
-    """Size of the view classes, azimuth x elevation in degrees (default: 15x20 for kar; one class for each fixed
-    camera)."""
-    views_per_object: Rare[Count | None] = None
-    """Number of training views of each object: the first ones for kar, else random ones, the same in every run
-    (default: one for kar, else all)."""
+    iterations: MayDiffer[Step]
+    """Number of training steps."""
+    batch_size: Annotated[int, Field(ge=1, le=65_536)]
+    """Images per training step."""
+    view_bins: str | None = None
+    """Size of the view classes, azimuth x elevation in degrees. None: 15x20 for kar; one class for each fixed
+    camera."""
+    views_per_object: Count | None = None
+    """Training views per object: the first ones for kar, else random ones, the same in every run. None: one for kar,
+    else all."""
     poses: MayDiffer[FilePath | None] = None
-    """Table of poses from learn3d estimate-poses, instead of the poses of the data set (default: none)."""
-    pose_updates: Rare[Annotated[int, Field(ge=0, le=16)]] = 3
+    """Table of poses from learn3d estimate-poses, instead of the poses of the data set."""
+    pose_updates: Annotated[int, Field(ge=0, le=16)] = 3
     """Number of times a run reweights the candidates of --poses by the IoU of its own shapes: after 1/2, 1/4, ... of
     all steps. 0: never."""
-    sampling: Rare[Sampling | None] = None
+    sampling: Sampling = "views"
     """How batches are drawn. views: single images. pairs: two views of each object. groups: five views of each object.
     classes: single images, every category equally often."""
-    augment: Rare[Annotated[tuple[Augmentation, ...], Items] | None] = None
+    augment: Annotated[tuple[Augmentation, ...], Items] = ()
     """Random augmentations of the training images (--augment without a name: none)."""
-    iterations: MayDiffer[Step | None] = None
-    """Number of training steps."""
-    batch_size: Annotated[int, Field(ge=1, le=65_536)] | None = None
-    """Images per training step."""
-    lr_schedule: Rare[LRSchedule | None] = None
+    lr_schedule: LRSchedule = "constant"
     """Learning-rate schedule. linear, cosine: decay to 0. step: a tenth in the last 5 % of all steps."""
-    warmup_steps: Rare[Annotated[int, Field(ge=0, le=10**9)] | None] = None
-    """Steps over which the learning rate ramps up from 0 (default: from the preset, at most a tenth of the run)."""
-    ema_decay: Rare[Annotated[float, Field(ge=0, lt=1)] | None] = None
+    warmup_steps: Annotated[int, Field(ge=0, le=10**9)] = 0
+    """Steps over which the learning rate ramps up from 0, but at most a tenth of the run."""
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Decay per step of the EMA of all weights; evaluation and reconstruction use the EMA. 0: no EMA."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights and of the order of the images."""
     device: MayDiffer[Literal["cpu", "cuda"]] = "cpu"
     """Device on which the networks run. Rendering runs on the CPU."""
-    precision: Rare[Literal["auto", "bf16", "fp32"]] = "auto"
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Arithmetic of the networks. auto: bf16 if it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
     threads: MayDiffer[Annotated[int, Field(ge=1, le=4096)] | None] = None
-    """Number of CPU threads (default: one or all, whichever is faster; measured at the start and when steps slow
-    down)."""
-    log: Rare[MayDiffer[Literal["csv", "tensorboard", "wandb"]]] = "tensorboard"
-    """Second log besides metrics.jsonl: csv (metrics.csv), tensorboard, or wandb (pip install wandb; it sends the
-    metrics to your account there)."""
-    val_split: Rare[MayDiffer[Literal["val", "test"]]] = "val"
+    """Number of CPU threads. None: one or all, whichever is faster; measured at the start and when steps slow down."""
+    log: MayDiffer[Literal["tensorboard", "wandb"]] = "tensorboard"
+    """Second log besides metrics.jsonl; wandb sends the metrics to your account there (pip install wandb)."""
+    val_split: MayDiffer[Literal["val", "test"]] = "val"
     """Split for validation during training and for choosing the best checkpoint."""
     validate_every: MayDiffer[Step] = 2000
     """Steps between validations (IoU of voxels or silhouettes, and MMD); the last step is always validated."""
-    max_val_images: Rare[MayDiffer[Count | None]] = None
-    """Number of images to validate on, evenly from all objects and views of the split (default: all)."""
-    pictures_every: Rare[MayDiffer[Step]] = 1000
+    max_val_images: MayDiffer[Count | None] = None
+    """Number of images to validate on, evenly from all objects and views of the split. None: all."""
+    pictures_every: MayDiffer[Step] = 1000
     """Steps between picture grids."""
-    checkpoint_every: Rare[MayDiffer[Step]] = 1000
+    checkpoint_every: MayDiffer[Step] = 1000
     """Steps between saves of the last checkpoint."""
-    log_every: Rare[MayDiffer[Step]] = 50
+    log_every: MayDiffer[Step] = 50
     """Steps between logged losses."""
 
     def __post_init__(self) -> None:
-        preset = PRESETS[self.preset]
-        chosen = {name: getattr(preset, name) for name in FROM_PRESET if getattr(self, name) is None}
-        for name, value in chosen.items():
-            object.__setattr__(self, name, value)
-        if "warmup_steps" in chosen:  # the preset's warm-up may be longer than a short run
-            object.__setattr__(self, "warmup_steps", min(self.warmup_steps, self.iterations // 10))
-        wanted, given = type(preset.settings).__name__, type(self.settings).__name__
-        if wanted != given:
-            raise ValueError(f"preset {self.preset!r} takes {wanted}, got {given}")
+        if not isinstance(self.settings, MethodSettings):
+            raise ValueError(f"settings must be those of a method, got {self.settings!r:.200}")
         check_options(self.layout, image_size=self.settings.image_size, view_bins=self.view_bins)
         if self.val_split == "val" and not LAYOUTS[self.layout].validation:
             raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
@@ -123,36 +104,17 @@ class TrainConfig:
                 f"with sampling {self.sampling!r} batch_size must be a multiple of {size}, got {self.batch_size}"
             )
         self.settings.check_run(iterations=self.iterations, batch_size=self.batch_size)
-        self.schedule  # noqa: B018 (raises if warmup_steps is too large)
 
     @property
     def schedule(self) -> TrainingSchedule:
         """Length, learning-rate schedule and EMA of the training."""
-        return TrainingSchedule(self.iterations, self.lr_schedule, self.warmup_steps, self.ema_decay)
+        warmup_steps = min(self.warmup_steps, self.iterations // 10)
+        return TrainingSchedule(self.iterations, self.lr_schedule, warmup_steps, self.ema_decay)
 
 
 def config_to_dict(config: TrainConfig) -> dict[str, Any]:
     """The configuration as plain JSON values; the method's settings are a dictionary under "settings"."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
-
-
-def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
-    """Build a TrainConfig from plain values. Raises a ValueError that names `source` and the wrong option."""
-    try:
-        if not isinstance(values, dict):
-            raise ValueError(f"must hold options by name ({{...}}), got {type(values).__name__}")
-        preset, settings = values.get("preset", DEFAULT_PRESET), values.get("settings")
-        if isinstance(settings, dict) and isinstance(preset, str):
-            values = values | {"settings": type(PRESETS[full_name(preset)].settings)(**settings)}
-        return TrainConfig(**values)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
-
-
-def load_config(path: Path) -> TrainConfig:
-    """Read the config.json of a run. Raises MissingFile or ValueError if it is missing or damaged."""
-    wanted = "the options of a run; to start a new run, leave out --resume"
-    return config_from_dict(read_json(path, limits.TEXT_BYTES, wanted), source=str(path))
 
 
 _MAY_DIFFER_NAMES = {
@@ -187,23 +149,5 @@ def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
 
 def all_options(config: TrainConfig) -> dict[str, Any]:
     """All options by name, with those of the method in place of `settings`."""
-    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return values | dataclasses.asdict(values.pop("settings"))
-
-
-def command_line(config: TrainConfig, **placeholders: str) -> str:
-    """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of options' values."""
-    values = all_options(config)
-    usual = all_options(TrainConfig(config.data, config.category, config.output, config.preset))
-    names = [n for n in values if n not in (*USUAL_OPTIONS, "device", "threads") and values[n] != usual[n]]
-    words = ["learn3d", "train"]
-    for name in (*USUAL_OPTIONS, *names):
-        option, value = name.replace("_", "-"), values[name]
-        if name in placeholders:
-            words += [f"--{option}", placeholders[name]]
-        elif isinstance(value, bool):
-            words.append(f"--{option}" if value else f"--no-{option}")
-        else:
-            items = value if isinstance(value, tuple) else (value,)
-            words += [f"--{option}", *(shlex.quote(str(item)) for item in items)]
-    return " ".join(words)
+    values = dataclasses.asdict(config)
+    return values | values.pop("settings")

@@ -18,6 +18,8 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
+from learn3d.terminal import unknown_name
+
 T = TypeVar("T")
 
 
@@ -48,7 +50,7 @@ def _sentence(error: Any, cls: type) -> str:
     if error["type"] == "missing":
         return f"the option {name} is missing"
     if error["type"] == "unexpected_keyword_argument":
-        return f"there is no option {name!r}; choose from {', '.join(field.name for field in fields(cls))}"
+        return unknown_name("option", name, (field.name for field in fields(cls)))
     if error["type"] == "value_error":  # a validator's own message names the given value
         message = str(error["ctx"]["error"])
         return message if name in message.split() else f"{name} {message}".strip()
@@ -79,7 +81,5 @@ Pixels = Annotated[int, Field(ge=1, le=1024)]  # side of the networks' images; 2
 #: Channels of a network's first layer; its widest layer has eight times as many. 512 take 4.1 GB; 128 in the papers.
 Channels = Annotated[int, Field(ge=1, le=512)]
 LayerChannels = Annotated[int, Field(ge=1, le=1024)]  # channels of one layer
-RARE = "shown by --help-all, not by --help"
-Rare = Annotated[T, RARE]  # an option that only --help-all shows
 FilePath = Annotated[Path, BeforeValidator(_path)]
 Items = Field(strict=False)  # Annotated[tuple[...], Items] accepts a list, as JSON has no tuples

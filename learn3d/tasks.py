@@ -36,7 +36,7 @@ class Workers:
     """Number of processes at a time on this machine."""
     cluster: str | None = None
     """Address of a Dask scheduler, such as tcp://HOST:8786. Its workers run the pieces; all machines must see the same
-    files under the same names (default: processes on this machine)."""
+    files under the same names. If not given: processes on this machine."""
 
     def __post_init__(self) -> None:
         if self.cluster is not None and self.jobs > 1:

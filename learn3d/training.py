@@ -52,7 +52,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
         method = create_method(config.settings, info, **options)
         empty_masks = train_set.check_masks()  # it may raise, like the next line, before `begin` removes an older run
-        rows = distributed.own_rows(config.batch_size, VIEWS_OF_OBJECT[config.settings.sampling or "views"])
+        rows = distributed.own_rows(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
         method.check_batch(next(batches(train_set, config, rows=rows)))
         run = Run(config, method, info, describe_images(train_set), train_set.candidates)
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)

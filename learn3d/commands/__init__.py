@@ -35,7 +35,7 @@ HELP = """usage: learn3d COMMAND [OPTIONS]
 
 {commands}
 
-Options of a command: learn3d COMMAND --help (the common ones), --help-all (all)
+Options of a command: learn3d COMMAND --help
 Tab completion in new shells:
   mkdir -p ~/.local/share/bash-completion/completions
   learn3d --completion bash > ~/.local/share/bash-completion/completions/learn3d
@@ -46,7 +46,7 @@ or, with zsh and a folder in its $fpath: learn3d --completion zsh > FOLDER/_lear
 def main(*given: str) -> int:
     """Run the command line, with the words `given` before it; returns the exit status."""
     name, *arguments = [*given, *sys.argv[1:]] or ["--help"]
-    if name in ("-h", "--help", "--help-all"):
+    if name in ("-h", "--help"):
         say(HELP.format(commands="\n".join(f"  {command:19}  {text}" for command, (*_, text) in COMMANDS.items())))
     elif name == "--version":
         say(metadata.version("nmr-learn3d"))
@@ -85,6 +85,9 @@ def print_completion(shell: str = "bash") -> None:
     for name in COMMANDS:
         with contextlib.suppress(ModuleNotFoundError):
             kind = _load(name)
-            kinds.append(Annotated[kind.flat(kind.defaults([])), tyro.conf.subcommand(name)])
+            default = kind.default([])
+            given = {} if default is None else {"default": default}
+            kinds.append(Annotated[kind, tyro.conf.subcommand(name, **given)])
+    words = ["--tyro-print-completion", shell]
     with contextlib.suppress(SystemExit):
-        tyro.cli(Union[tuple(kinds)], prog="learn3d", args=["--tyro-print-completion", shell])  # noqa: UP007
+        tyro.cli(Union[tuple(kinds)], prog="learn3d", args=words, config=(tyro.conf.OmitArgPrefixes,))  # noqa: UP007

@@ -29,11 +29,11 @@ class CheckDataset(Command):
     layout: Layout = "kato"
     """Arrangement of its files, see docs/data-sets.md."""
     category: str = ""
-    """Categories to read, by name or synset id, separated by commas (default: all)."""
+    """Categories to read, by name or synset id, separated by commas. If not given: all."""
     split: tuple[Split, ...] = ()
-    """Splits to read (default: all)."""
+    """Splits to read. If not given: all."""
     json: Path | None = None
-    """JSON file for the report (default: none)."""
+    """JSON file for the report."""
 
     def run(self) -> int:
         if self.json is not None:
@@ -66,13 +66,13 @@ class ConvertDataset(Command):
     output: Path
     """Folder for the shards. Each category and split gets a folder in it."""
     category: str = ""
-    """Categories, separated by commas (default: all)."""
+    """Categories, separated by commas. If not given: all."""
     layout: Layout = "kato"
     """Arrangement of the files of the data set, see docs/data-sets.md."""
     image_size: int = IMAGE_SIZE
     """Side of the images in pixels, for the method's encoder; larger images are scaled down."""
     views_per_object: Count | None = None
-    """Number of training images to keep of each object (default: the layout's protocol, one for kar, else all)."""
+    """Number of training images to keep of each object. If not given: the layout's protocol, one for kar, else all."""
     workers: Workers
 
     def run(self) -> int:

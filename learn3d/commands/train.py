@@ -1,14 +1,18 @@
 """Commands on runs: train a model, and measure trained ones."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+import copy
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+import tyro
 
 from learn3d.commands.command import Command, OnDataset, Runs
-from learn3d.config import DEFAULT_PRESET, FROM_PRESET, TrainConfig, load_config
+from learn3d.config import TrainConfig
 from learn3d.files.writing import check_target, write_json
-from learn3d.presets import PRESETS, SHORT_NAMES, full_name
+from learn3d.presets import DEFAULT_PRESET, PLACES, PRESETS, SHORT_NAMES, full_name, load_config
 from learn3d.runs.distributed import join_ranks, rank
 from learn3d.runs.measurement import MEASURES, class_means, evaluate_runs, format_table
 from learn3d.terminal import INTERRUPTED, align, say
@@ -30,31 +34,38 @@ class Train(Command):
     """Replace an earlier run in --output."""
 
     @classmethod
-    def about(cls, everything: bool) -> str:
+    def about(cls) -> str:
         lines = ["Methods (--preset NAME):", *(f"  {name:10}  {summary}" for name, (_, summary) in SHORT_NAMES.items())]
-        if everything:
-            lines += ["", "Presets (--preset NAME --help-all shows the settings of one):"]
-            lines += [f"  {name:23}  {preset.label}; {preset.source}" for name, preset in PRESETS.items()]
-        return "\n".join([super().about(everything), "", *lines])
+        lines += ["", "Presets (--preset NAME --help shows the settings of one):"]
+        lines += [f"  {name:23}  {preset.label}" for name, preset in PRESETS.items()]
+        return "\n".join([super().about(), "", *lines])
 
     @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> Mapping[str, Any]:
+    def default(cls, arguments: Sequence[str]) -> "Train":
         """The options of the saved run with --resume, else those of the preset."""
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--preset", nargs="?")
         parser.add_argument("--output", nargs="?", type=Path)
         parser.add_argument("--resume", action="store_true")
         given, others = parser.parse_known_args(arguments)
-        preset = full_name(given.preset) if given.preset else None
-        if not given.resume or {"-h", "--help", "--help-all"} & set(others):
-            chosen = PRESETS[preset or DEFAULT_PRESET]
-            return {name: getattr(chosen, name) for name in FROM_PRESET if name != "warmup_steps"}
+        preset = full_name(given.preset or DEFAULT_PRESET)
+        if not given.resume or {"-h", "--help"} & set(others):
+            config = copy.copy(PRESETS[preset])
+            for name in PLACES:
+                object.__setattr__(config, name, tyro.MISSING)  # tyro asks for them
+            return cls(config=config)
         if given.output is None:
             raise ValueError("--resume needs --output: the folder of the run that is to go on")
         saved = load_config(given.output / "config.json")
-        if preset not in (None, saved.preset):
+        if given.preset and preset != saved.preset:
             raise ValueError(f"{given.output} was started with the preset {saved.preset}, got {preset}")
-        return vars(saved)
+        return cls(config=saved)
+
+    @classmethod
+    def parse(cls, name: str, arguments: Sequence[str]) -> "Train":
+        command = super().parse(name, arguments)
+        preset = full_name(command.config.preset)  # it may be the short name of a method
+        return dataclasses.replace(command, config=dataclasses.replace(command.config, preset=preset))
 
     def run(self) -> int:
         """Train and print a summary. The exit status is 130 if a signal stopped the training."""
@@ -77,17 +88,17 @@ class Evaluate(OnDataset):
     runs: Runs
     """Run folders, or checkpoint files."""
     layout: str | None = None
-    """Arrangement of the files of the data set (default: from the run)."""
+    """Arrangement of the files of the data set. If not given: from the run."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
     json: Path | None = None
-    """JSON file for the results, with protocol and versions (default: none)."""
+    """JSON file for the results, with protocol and versions."""
 
     @classmethod
-    def about(cls, everything: bool) -> str:
+    def about(cls) -> str:
         columns = "Columns of the table (means over the images, then over the categories; - if there is no value):"
         measures = align([("", *measure) for measure in MEASURES.values()])
-        return f"{super().about(everything)}\n\n{columns}\n{measures}"
+        return f"{super().about()}\n\n{columns}\n{measures}"
 
     def run(self) -> None:
         if self.json is not None:

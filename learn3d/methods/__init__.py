@@ -43,11 +43,6 @@ def create_method(
     if "__dataclass_fields__" not in vars(type(settings)):
         raise ValueError(f"{type(settings).__name__} lacks the decorator @checked, so its fields are no options")
     kind = _METHODS[type(settings)]
-    if kind.needs_poses and info.pose_features == 0:
-        raise ValueError(
-            f"{kind.__name__} learns from images whose camera poses are known, but this data set has no poses; take "
-            "a data set with poses, or estimate them from its masks (learn3d estimate-poses, then --poses)"
-        )
     if device == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # TF32 convolutions would not be fp32
     torch.manual_seed(seed)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.dataset import MASK_SIZE, Batch, DatasetInfo
+from learn3d.data.dataset import MASK_SIZE, DatasetInfo
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.losses import pose_classification_loss
@@ -38,13 +38,13 @@ class MeshSettings(MethodSettings):
     encoder: EncoderName = "conv"
     """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask. conv-light: half the channels,
     and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights. conv-centred: a tenth of the
-    weights, for objects that are all scaled to one size (cameras at unknown distances). conv-relu: conv with a ReLU on
-    the code (Kato et al. 2018). resnet18: on 224-pixel RGB."""
+    weights, for objects that are all scaled to one size (cameras at unknown distances). resnet18: on 224-pixel
+    RGB."""
     generator: GeneratorName = "sphere"
     """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same; neighbours learn to move
     together first. auto: sphere-smooth if the training masks are compact, else sphere. sphere-small: sphere with half
-    the weights. bounded: the generator of Kato et al. 2018. cube-conv, cube-fc: 1352 vertices of a cube's surface, from
-    convolutions or from linear layers (Kato and Harada 2019)."""
+    the weights. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or from linear layers (Kato
+    and Harada 2019)."""
     symmetry: SymmetryOption = None
     """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
     it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
@@ -54,8 +54,8 @@ class MeshSettings(MethodSettings):
     """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers find
     no inside in a shape that exceeds their grid."""
     pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18 (default: random
-    weights). VPL then freezes its batch norms."""
+    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18. If not given: random
+    weights. VPL then freezes its batch norms."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1 in Peng et al. 2020)."""
 
@@ -79,6 +79,9 @@ class MeshSettings(MethodSettings):
         return self.generator == "auto"
 
     def for_data(self, info: DatasetInfo) -> MeshSettings:
+        super().for_data(info)
+        if self.lambda_view > 0 and info.pose_features != LookAtPoses.num_features:
+            raise ValueError("--lambda-view needs azimuths, and the poses of these data are rotations; leave it out")
         plane = info.mirror_plane_deg if self.symmetry == "auto" else self.symmetry
         sphere = "sphere-smooth" if is_compact(info) else "sphere"
         generator = sphere if self.generator == "auto" else self.generator
@@ -127,10 +130,6 @@ class MeshMethod(Method):
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:
             load_pretrained(self.encoder, self.settings.pretrained)
-
-    def check_batch(self, batch: Batch) -> None:
-        if self.settings.lambda_view > 0 and not isinstance(batch.poses, LookAtPoses):
-            raise ValueError("--lambda-view needs azimuths, and the poses of these data are rotations; leave it out")
 
     def encode(self, images: Tensor) -> Tensor:
         codes = self._apply(self.encoder, images)

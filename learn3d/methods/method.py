@@ -7,7 +7,7 @@ import contextlib
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -34,6 +34,8 @@ class MethodSettings:
     wants_solidity = False  # whether networks or losses depend on the solidity of the training data
     varies_over_run = None  # name of a setting that makes losses depend on the number of iterations
 
+    needs_poses = True  # whether every training image must have a known pose
+
     def check_run(self, *, iterations: int, batch_size: int) -> None:
         """Raise ValueError if the settings do not fit a run of this length and batch size."""
 
@@ -42,7 +44,16 @@ class MethodSettings:
         return self
 
     def for_data(self, info: DatasetInfo) -> MethodSettings:
-        """These settings, with the values that suit the training data in place of "auto"."""
+        """These settings, with the values that suit the training data in place of "auto".
+
+        Raises ValueError if the method cannot learn from such data.
+        """
+        if self.needs_poses and info.pose_features == 0:
+            raise ValueError(
+                f"{type(self).__name__.removesuffix('Settings')} learns from images whose camera poses are known, but "
+                "this data set has no poses; take a data set with poses, or estimate them from its masks (learn3d "
+                "estimate-poses, then --poses)"
+            )
         return self
 
 
@@ -82,7 +93,6 @@ class Method(abc.ABC):
     state. A run that is resumed from these, `optimizers` and `ema` is bit-identical.
     """
 
-    needs_poses: ClassVar[bool] = True  # whether every training image must have a known pose
     networks: nn.ModuleDict  # networks["encoder"] is self.encoder, and so on
     ema: EMA | None = None  # None if the run keeps no average of the weights
     image_size: int  # side of the stored images that `encode` takes

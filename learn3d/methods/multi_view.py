@@ -1,7 +1,7 @@
 """Methods that know which views show the same object, from batches [a_1 .. a_n, b_1 .. b_n, ...].
 
-Multi-view is Vanilla-AE as Kato et al. 2018 published it: the shape of each of two views must explain both. Many views:
-the shape of one image must explain other views of its object, whose depth is used if it is known.
+Multi-view is Vanilla-AE with the supervision of Kato et al. 2018: the shape of each of two views must explain both.
+Many views: the shape of one image must explain other views of its object, whose depth is used if it is known.
 """
 
 import torch
@@ -13,36 +13,22 @@ from learn3d.data.sampling import GROUP_SIZE
 from learn3d.losses import depth_losses, gaussian_prior_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.method import Losses
-from learn3d.methods.optimization import SparseGradientAdam
 from learn3d.networks.encoders import EncoderName
-from learn3d.networks.generators import GeneratorName, SymmetryOption
+from learn3d.networks.generators import SymmetryOption
 from learn3d.settings import Positive, Weight, checked
-
-CENTROID_LEARNING_RATE = 0.1  # learning rate of the centroid's layer, relative to the other layers
 
 
 @checked
 class MultiViewSettings(MeshSettings):
-    """Networks and loss weight of Kato et al. 2018, with the published code's defaults for one category."""
+    """Networks, and the weight of the smoothness loss."""
 
     sampling = "pairs"
-    encoder: EncoderName = "conv-relu"
-    generator: GeneratorName = "bounded"
 
 
 class MultiView(MeshMethod):
     """Encoder and mesh generator, trained on pairs of views."""
 
     settings: MultiViewSettings
-
-    def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        rate, layers = self.settings.learning_rate, dict(self.generator.named_parameters())
-        centroid = [layers.pop(name) for name in list(layers) if name.startswith("centroid.")]
-        trained = {"encoder": self.encoder.parameters(), "generator": layers.values()}
-        optimizers = {name: SparseGradientAdam(parameters, lr=rate) for name, parameters in trained.items()}
-        if centroid:  # the generator "bounded" has this layer
-            optimizers["centroid"] = SparseGradientAdam(centroid, lr=CENTROID_LEARNING_RATE * rate)
-        return optimizers
 
     def losses(self, batch: Batch, step: int) -> Losses:
         """Render the shapes of both views, a and b, in both views. The loss is the mean of the four IoU losses plus

@@ -103,32 +103,6 @@ def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
                 torch.hardshrink(state[name], least, out=state[name])
 
 
-class SparseGradientAdam(torch.optim.Adam):
-    """Kato et al. 2018's Adam: a weight whose gradient is exactly zero in a step keeps its value and its moments.
-
-    So the weights of a ReLU that is off for a whole batch do not move; torch's Adam would move them by their momentum.
-    As in Chainer, epsilon is added before the bias correction of the second moment: lr' m / (sqrt(v) + eps), with
-    lr' = lr sqrt(1 - beta_2^t) / (1 - beta_1^t), and all weights share the count t. The state is that of torch's Adam.
-    """
-
-    @torch.no_grad()
-    def step(self) -> None:
-        for group in self.param_groups:
-            beta1, beta2 = group["betas"]
-            for weight in (p for p in group["params"] if p.grad is not None):
-                state, grad = self.state[weight], weight.grad
-                if not state:
-                    state["step"] = torch.tensor(0.0)
-                    state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(weight), torch.zeros_like(weight)
-                state["step"] += 1
-                count, first, second = float(state["step"]), state["exp_avg"], state["exp_avg_sq"]
-                rate = group["lr"] * math.sqrt(1 - beta2**count) / (1 - beta1**count)
-                touched = grad.clone().ne_(0)
-                first.addcmul_(touched, grad - first, value=1 - beta1)
-                second.addcmul_(touched, grad * grad - second, value=1 - beta2)
-                weight.addcdiv_(touched * first, second.sqrt() + group["eps"], value=-rate)
-
-
 def frozen(network: nn.Module, *inputs: Tensor) -> Tensor:
     """Apply a network; gradients reach its inputs but not its parameters, and its buffers do not change."""
     state = {name: parameter.detach() for name, parameter in network.named_parameters()}

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
-from learn3d.data.dataset import MASK_SIZE, Batch
+from learn3d.data.dataset import MASK_SIZE, Batch, DatasetInfo
 from learn3d.data.poses import Poses
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
@@ -95,20 +95,28 @@ class VPLSettings(MeshSettings):
         if self.class_conditional and self.discriminator != "spectral-patch":
             raise ValueError(f"class_conditional needs discriminator 'spectral-patch', got {self.discriminator!r}")
 
+    def check_run(self, *, iterations: int, batch_size: int) -> None:
+        if self.lambda_discriminator > 0 and batch_size < 2:
+            raise ValueError("view prior learning needs another view for each image: batches of at least 2, got 1")
+
+    def for_data(self, info: DatasetInfo) -> "VPLSettings":
+        settings = super().for_data(info)
+        if self.class_conditional and info.num_classes < 2:
+            raise ValueError("class_conditional needs data of several categories, got one")
+        if self.lambda_discriminator > 0 and self.discriminator == "dcgan" and info.num_views < 2:
+            raise ValueError(
+                f"discriminator 'dcgan' tells views by their class and needs at least 2, got {info.num_views}"
+            )
+        return settings
+
 
 class VPL(MeshMethod):
     """Encoder, mesh generator and, unless it is the baseline, a discriminator of silhouettes and their views."""
 
     settings: VPLSettings
 
-    def check_batch(self, batch: Batch) -> None:
-        if self.settings.lambda_discriminator > 0 and len(batch) < 2:
-            raise ValueError("view prior learning needs another view for each image: batches of at least 2, got 1")
-
     def create_networks(self) -> dict[str, nn.Module]:
         settings, info = self.settings, self.info
-        if settings.class_conditional and info.num_classes < 2:
-            raise ValueError("class_conditional needs data of several categories, got one")
         if settings.encoder == "preact-resnet18":
             encoder = PreactResNet18(settings.image_size)
         elif settings.encoder == "resnet18":
@@ -129,9 +137,6 @@ class VPL(MeshMethod):
         elif settings.discriminator == "spectral-patch":
             num_classes = info.num_classes if settings.class_conditional else None
             discriminator = SpectralPatchDiscriminator(info.pose_features, channels, num_classes)
-        elif info.num_views < 2:
-            wanted = "tells views by their class and needs at least 2"
-            raise ValueError(f"discriminator 'dcgan' {wanted}, got {info.num_views}")
         else:
             discriminator = OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
         return networks | {"discriminator": discriminator}

@@ -15,7 +15,7 @@ CENTRED_SIZE = 0.8  # object size (`ViewDataset.object_sizes`) after `centre`
 
 
 class ConvEncoder(nn.Module):
-    """Image [B,4,64,64] (RGB and mask, float in [0,1]) -> shape code [B,512], unbounded (no ReLU at the end).
+    """Image [B,4,64,64] (RGB and mask, float in [0,1]) -> shape code [B,512] (no ReLU at the end).
 
     inverted: whether the data set stores colours as 1 - colour. Encoders take colours as they are stored, but for those
     that say otherwise.
@@ -34,13 +34,6 @@ class ConvEncoder(nn.Module):
         # The last ReLU follows the change of memory layout; before it, its gradient would take 9 ms of a 270 ms step.
         features = self.convolutions[:-1](images).flatten(1)
         return self.layers(self.convolutions[-1](features))
-
-
-class ReluConvEncoder(ConvEncoder):
-    """ConvEncoder with a ReLU at the end, as in Kato et al. 2018: codes have no negative entries."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        return torch.relu(super().forward(images))
 
 
 class SmallConvEncoder(ConvEncoder):
@@ -141,13 +134,12 @@ def _convolutions(*channels: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-EncoderName = Literal["conv", "conv-light", "conv-small", "conv-centred", "conv-relu", "resnet18"]
+EncoderName = Literal["conv", "conv-light", "conv-small", "conv-centred", "resnet18"]
 ENCODERS: dict[str, type[ConvEncoder] | type[ResNet18Encoder]] = {
     "conv": ConvEncoder,
     "conv-light": LightConvEncoder,
     "conv-small": SmallConvEncoder,
     "conv-centred": CentredConvEncoder,
-    "conv-relu": ReluConvEncoder,
     "resnet18": ResNet18Encoder,
 }
 

@@ -157,47 +157,6 @@ class SmallSphereGenerator(SphereGenerator):
         self.layers = linear_layers(CODE_SIZE, 1024, 1024, self.outputs)
 
 
-def deform_bounded_sphere(sphere: Tensor, bias: Tensor, centroid: Tensor) -> Tensor:
-    """Vertices of Kato et al. 2018 (published code): [V,3], [B,V,3] and [B,3] -> [B,V,3] within [-0.5, 0.5].
-
-    With b = 0.5 sphere and c = tanh(centroid), s = sign(b) sigmoid(logit(|b|) + bias) is in (-1, 1). The vertex is
-    0.5 (c + s (1 - sign(s) c)), which stays in its octant about c / 2. A vertex on a coordinate plane of the sphere
-    (b = 0) stays on it: logit(0) = -inf, and its gradient is 0.
-    """
-    base, center = 0.5 * sphere, torch.tanh(centroid)[:, None]
-    stretch = base.sign() * torch.sigmoid(torch.logit(base.abs()) + bias)
-    return 0.5 * (center + stretch * (1 - base.sign() * center))
-
-
-class BoundedGenerator(MeshGenerator):
-    """Vertices float32 [B,642,3] in [-0.5, 0.5], each in its octant about a learnt centroid.
-
-    Kato et al. 2018: layers 512-1024-2048, then a layer for the bias of every vertex and one for the centroid, which is
-    scaled by 0.1. With `symmetry` the vertices with z < 0 are mirror images of the others, and the centroid is on the
-    plane.
-    """
-
-    sphere: Tensor  # float32 [642,3]
-
-    def __init__(self, symmetry: Symmetry | None = None) -> None:
-        sphere, faces = nmr.icosphere(3)
-        super().__init__(sphere, faces, symmetry)
-        self.register_buffer("sphere", sphere.float(), persistent=False)
-        self.layers = linear_layers(CODE_SIZE, 1024, 2048).append(nn.ReLU())
-        self.bias = nn.Linear(2048, sphere.numel())
-        self.centroid = nn.Linear(2048, 3)
-
-    def forward(self, codes: Tensor) -> Tensor:
-        features = self.layers(codes)
-        bias = self.bias(features).float().reshape(len(codes), -1, 3)
-        centroid = 0.1 * self.centroid(features).float()
-        if self.mirror is None:
-            return deform_bounded_sphere(self.sphere, bias, centroid)
-        vertices = deform_bounded_sphere(self.sphere, bias, F.pad(centroid[:, :2], (0, 1)))
-        mirrored = torch.cat([vertices[..., :2], -vertices[..., 2:]], dim=2)[:, self.mirror]
-        return self.place(torch.where(self.sphere[:, 2:] < 0, mirrored, vertices))
-
-
 GRID_SIZE = 16  # vertices along an edge of the cube
 INITIAL_RADIUS = 0.5
 BOUND = 1.2  # coordinates lie between -BOUND and BOUND
@@ -312,12 +271,11 @@ class LinearCubeGenerator(CubeGenerator):
         return self.layers(codes).unflatten(1, (-1, 3))
 
 
-GeneratorName = Literal["auto", "sphere", "sphere-smooth", "sphere-small", "bounded", "cube-conv", "cube-fc"]
+GeneratorName = Literal["auto", "sphere", "sphere-smooth", "sphere-small", "cube-conv", "cube-fc"]
 GENERATORS: dict[str, type[MeshGenerator]] = {
     "sphere": SphereGenerator,
     "sphere-smooth": SmoothSphereGenerator,
     "sphere-small": SmallSphereGenerator,
-    "bounded": BoundedGenerator,
     "cube-conv": ConvCubeGenerator,
     "cube-fc": LinearCubeGenerator,
 }

@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from learn3d.config import TrainConfig, config_from_dict
+from learn3d.config import TrainConfig
 from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.device import resolve_precision
@@ -28,6 +28,7 @@ from learn3d.files import writing
 from learn3d.files.reading import DamagedFile, parse_json
 from learn3d.methods import create_method
 from learn3d.methods.method import Method
+from learn3d.presets import config_from_dict
 from learn3d.settings import Count, NonNegative, Share, checked, split_names
 
 

@@ -5,7 +5,7 @@ last.safetensors      last checkpoint, with all that --resume needs; never incom
 previous.safetensors  the checkpoint before it
 best.safetensors      networks with the best validation IoU, see `training.validate`
 metrics.jsonl         losses and metrics
-tensorboard/, metrics.csv or wandb.txt (id of the run at Weights & Biases), by --log
+tensorboard/ or wandb.txt (id of the run at Weights & Biases), by --log
 pictures/             picture grids of validation images
 .lock                 lock of the process that works here; .<name>.partial: a file being written
 """
@@ -22,12 +22,12 @@ import filelock
 
 from learn3d.runs.distributed import rank
 
-CONFIG, METRICS, METRICS_CSV, WANDB_ID = "config.json", "metrics.jsonl", "metrics.csv", "wandb.txt"
+CONFIG, METRICS, WANDB_ID = "config.json", "metrics.jsonl", "wandb.txt"
 LAST, PREVIOUS, BEST = "last.safetensors", "previous.safetensors", "best.safetensors"
 PICTURES, TENSORBOARD, LOCK = "pictures", "tensorboard", ".lock"
 #: The files of a run in the order of their removal; config.json is last, as it marks a run.
 WRITTEN = (LAST, PREVIOUS, BEST, METRICS, f"{PICTURES}/{'[0-9]' * 6}*.png", f"{TENSORBOARD}/events.out.tfevents.*")
-WRITTEN += (METRICS_CSV, WANDB_ID, CONFIG)
+WRITTEN += (WANDB_ID, CONFIG)
 
 
 @contextlib.contextmanager

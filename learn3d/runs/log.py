@@ -1,8 +1,7 @@
-"""The log of a run: progress on the terminal, metrics.jsonl, and CSV, TensorBoard or Weights & Biases."""
+"""The log of a run: progress on the terminal, metrics.jsonl, and TensorBoard or Weights & Biases."""
 
 import contextlib
 import datetime
-import functools
 import importlib.util
 import json
 import os
@@ -22,7 +21,7 @@ from learn3d.config import TrainConfig, config_to_dict
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
 from learn3d.runs.distributed import rank
-from learn3d.runs.folder import METRICS, METRICS_CSV, TENSORBOARD, WANDB_ID
+from learn3d.runs.folder import METRICS, TENSORBOARD, WANDB_ID
 from learn3d.terminal import is_watched, note
 
 SECONDS_BETWEEN_LINES = 30.0
@@ -109,30 +108,16 @@ def open_log(config: TrainConfig, *, start: int) -> contextlib.AbstractContextMa
 def check_log(config: TrainConfig) -> None:
     """Raise a ValueError if the option log needs a package that is not installed."""
     if config.log == "wandb" and importlib.util.find_spec("wandb") is None:
-        raise ValueError("log 'wandb' needs the package wandb: pip install wandb, or choose csv or tensorboard")
+        raise ValueError("log 'wandb' needs the package wandb: pip install wandb, or choose tensorboard")
 
 
 def _open_writer(config: TrainConfig, start: int) -> Any:
     """The second log: TensorBoard's SummaryWriter, or an object with its methods."""
-    if config.log == "csv":
-        write = functools.partial(_write_csv, config.output)
-        return types.SimpleNamespace(**_SILENT | {"flush": write, "close": write})
     if config.log == "wandb":
         return _open_wandb(config)
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(config.output / TENSORBOARD), purge_step=start + 1)
-
-
-def _write_csv(folder: Path) -> None:
-    """Write metrics.csv: a row for each number in metrics.jsonl, with the columns step, name, value."""
-    rows = ["step,name,value\n"]
-    for _, record in read_records((folder / METRICS).read_bytes()):
-        step, split = record.pop("step"), record.pop("split")
-        rows += [
-            f"{step},{split}/{name},{value}\n" for name, value in record.items() if isinstance(value, (int, float))
-        ]
-    writing.write_bytes(folder / METRICS_CSV, "".join(rows).encode(), sync=True)
 
 
 def _open_wandb(config: TrainConfig) -> types.SimpleNamespace:
@@ -146,7 +131,7 @@ def _open_wandb(config: TrainConfig) -> types.SimpleNamespace:
     try:
         run = wandb.init(project="learn3d", name=config.output.name, **options)
     except wandb.Error as error:
-        advice = "call `wandb login`, or choose csv or tensorboard"
+        advice = "call `wandb login`, or choose tensorboard"
         raise ValueError(f"log 'wandb' cannot begin a run ({error}); {advice}") from None
     return types.SimpleNamespace(
         add_scalar=lambda name, value, step: run.log({name: value}, step=step),

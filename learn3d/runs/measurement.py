@@ -7,13 +7,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 import torch
 from pydantic import BaseModel, Field
 
-from learn3d.config import command_line
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import Layout, require_folder
 from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, NO_MMD, SURFACE_POINTS, Evaluation, evaluate
 from learn3d.files import limits
 from learn3d.files.reading import read_bytes
-from learn3d.presets import PRESETS
+from learn3d.presets import command_line
 from learn3d.runs import checkpoint
 from learn3d.runs.folder import METRICS
 from learn3d.runs.log import read_records
@@ -128,7 +127,7 @@ def evaluate_runs(
     results = []
     for file in files:
         method, config, metadata = checkpoint.load_method(file, device=device)
-        label = PRESETS[config.preset].label
+        label = config.label
         for name in split_names(category or config.category):
             note(f"{file}: {label} ({config.preset}) on {name}, {split}")
             dataset = checkpoint.load_data(config, split, data=data, category=name, layout=layout)

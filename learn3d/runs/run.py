@@ -7,14 +7,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from learn3d.config import TrainConfig, check_resume, config_to_dict, load_config
+from learn3d.config import TrainConfig, check_resume, config_to_dict
 from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.poses import PoseCandidates
 from learn3d.files import writing
 from learn3d.files.reading import DamagedFile
 from learn3d.methods.mesh_method import is_compact
 from learn3d.methods.method import Method
-from learn3d.presets import PRESETS
+from learn3d.presets import load_config
 from learn3d.runs import checkpoint, distributed
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress, versions
@@ -86,7 +86,7 @@ class Run:
         """Method, data and device of a run that begins or continues; mirror plane and generator if masks decide."""
         config, info = self.config, self.info
         verb = f"resuming at step {progress.step}" if progress.step else "training"
-        name = f"{PRESETS[config.preset].label} ({config.preset})"
+        name = f"{config.label} ({config.preset})"
         data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
         where = f"{config.device}, {config.precision}, {threads}{distributed.describe()}"
         text = f"{verb}: {name} on {config.category}, {data}; {where}; output {config.output}"

@@ -1,8 +1,8 @@
 """Commands of the studio: data sets, poses, tables, meshes of pictures, figures and pages."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -58,7 +58,7 @@ class FetchDebianModels(Command):
     output: Path
     """Folder to write; it must not exist."""
     packages_dir: Path | None = None
-    """Folder for the .deb files; missing ones are downloaded into it (default: a temporary folder)."""
+    """Folder for the .deb files; missing ones are downloaded into it. If not given: a temporary folder."""
 
     def run(self) -> None:
         say(fetch_debian_models(self.output, self.packages_dir).summary())
@@ -89,7 +89,7 @@ class EstimatePoses(Command):
     compare: bool = False
     """Compare with the known azimuths, and turn the table into their frame, so that voxel IoU can be measured."""
     views_per_object: Count | None = None
-    """Number of training images of each object (default: the layout's protocol, one for kar, else all)."""
+    """Number of training images of each object. If not given: the layout's protocol, one for kar, else all."""
 
     def run(self) -> None:
         check_target(self.output, "--output")
@@ -130,8 +130,8 @@ class Experiment(Request, Command):
     """Show the tables and their methods, and exit."""
 
     @classmethod
-    def defaults(cls, arguments: Sequence[str]) -> Mapping[str, Any]:
-        return {"table": next(iter(TABLES)), "data": Path(), "output": Path()} if "--list" in arguments else {}
+    def default(cls, arguments: Sequence[str]) -> "Experiment | None":
+        return cls(table=next(iter(TABLES)), data=Path(), output=Path()) if "--list" in arguments else None
 
     def run(self) -> int:
         if self.list:
@@ -156,24 +156,24 @@ class Reconstruct(OnDataset):
     guesses: Count = 1
     """Largest number of different shapes for each image file, the best first; a model without templates makes one."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
-    """Run folder (or checkpoint file) of the trained model (default: the small model of the package)."""
+    """Run folder (or checkpoint file) of the trained model. If not given: the small model of the package."""
     images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
-    """Images of any size (default: images of --data). In those without transparency, --masks or --box the object is
+    """Images of any size. If not given: images of --data. In those without transparency, --masks or --box the object is
     searched: it is what differs from a plain background, or else is cut out of the middle (needs the extra photos)."""
     masks: tuple[Path, ...] = ()
-    """Mask images (white = object), one for each image (default: the transparency of the images)."""
+    """Mask images (white = object), one for each image. If not given: the transparency of the images."""
     box: tuple[int, int, int, int] | None = None
     """Box around the object in a single photograph: X Y WIDTH HEIGHT in pixels, from the upper left. The object is cut
     out of it (needs the extra photos)."""
     crop: bool = True
     """Centre and scale the object in each image as in the data set. --no-crop: images are framed like that already."""
     data: Path | None = None
-    """Data set from which images are taken (default: image files are given)."""
+    """Data set from which images are taken. If not given: image files are given."""
     indices: tuple[int, ...] = (0,)
     """Images of the data set: object * V + view, if each object has V views (Kato's: 24, Kar's: 20)."""
     refine: bool | None = None
     """Fit the predicted shapes to the masks. The cameras are those of the data set; for image files cameras and colours
-    are estimated (default: yes for image files, no for --data)."""
+    are estimated. If not given: yes for image files, no for --data."""
     format: Literal["glb", "obj", "ply"] = "glb"
     """Format of the mesh files. All have colours: glb in a texture image where there is one, obj and ply at the
     vertices."""
@@ -210,8 +210,8 @@ class Export(Command):
     which: Which = "last"
     """Checkpoint of a run: the last one, or the one with the best validation IoU."""
     others: Path | None = None
-    """Folder of PNG files with transparency that show other things, so that `reconstruct` warns of such pictures
-    (default: it warns of pictures that are far from all training images)."""
+    """Folder of PNG files with transparency that show other things, so that `reconstruct` warns of such pictures. If
+    not given: it warns of pictures that are far from all training images."""
 
     def run(self) -> None:
         check_target(self.output, "--output")
@@ -240,11 +240,11 @@ class Figures(OnDataset):
     output: Path
     """File to write; its ending is replaced by those of the figure's formats."""
     labels: tuple[str, ...] = ()
-    """Names of the runs (default: those of their presets)."""
+    """Names of the runs. If not given: those of their presets."""
     images: int | None = None
-    """Number of images in a grid (default: 6) or an interpolation (default: 3)."""
+    """Number of images. If not given: 6 in a grid, 3 in an interpolation."""
     indices: tuple[int, ...] = ()
-    """Samples of the data set in a grid or an interpolation (default: --images of different objects and views)."""
+    """Samples of the data set in a grid or an interpolation. If not given: --images of different objects and views."""
     truth: bool = False
     """Show the ground-truth voxels in a grid as well."""
 
@@ -274,7 +274,7 @@ class Report(OnDataset):
     output: Path
     """File to write, .html."""
     labels: tuple[str, ...] = ()
-    """Names of the runs (default: those of their presets)."""
+    """Names of the runs. If not given: those of their presets."""
     objects: int = 12
     """Number of objects to show, spread from the best IoU to the worst."""
 
@@ -295,7 +295,7 @@ class Demo(Command):
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(name="run")] = ()
-    """Run folders (or checkpoint files) of trained models (default: the small model of the package)."""
+    """Run folders (or checkpoint files) of trained models. If not given: the small model of the package."""
     port: int = 7860
     """Port of the page's address, http://HOST:PORT."""
     host: str = "127.0.0.1"

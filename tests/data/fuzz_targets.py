@@ -21,10 +21,11 @@ from runs import metadata
 from shapenet_files import write_dvr
 
 import nmr.neural_renderer as nr
-from learn3d.config import TrainConfig, config_from_dict, config_to_dict, load_config
+from learn3d.config import config_to_dict
 from learn3d.data.framing import read_photo
 from learn3d.data.readers import READERS
 from learn3d.files import formats, sandbox
+from learn3d.presets import config_from_dict, configure, load_config
 from learn3d.runs import checkpoint, log
 from learn3d.studio.make_data import meshes
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
@@ -153,7 +154,7 @@ def weights_target(tmp: Path) -> Target:
 
 
 def config_target(tmp: Path) -> Target:
-    config = TrainConfig(data=Path("d"), category="chair", output=Path("o"), preset="peng2020-kar", view_bins="15x20")
+    config = configure(data=Path("d"), category="chair", output=Path("o"), preset="peng2020-kar", view_bins="15x20")
     (tmp / "config.json").write_text(json.dumps(config_to_dict(config)))
 
     def read(folder: Path) -> None:

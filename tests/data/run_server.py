@@ -57,7 +57,7 @@ def serve() -> None:
     import torch.utils.tensorboard  # noqa: F401
 
     from learn3d import training
-    from learn3d.config import config_from_dict
+    from learn3d.presets import config_from_dict
     from learn3d.runs.checkpoint import versions
 
     versions()  # once for all runs, so that a commit made during the tests does not tell them apart
@@ -87,7 +87,7 @@ def _fork(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def _run(request: dict[str, Any], writing: int) -> None:
-    from learn3d.config import config_from_dict
+    from learn3d.presets import config_from_dict
     from learn3d.training import train
 
     status = 70

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from learn3d.config import TrainConfig
 from learn3d.data.dataset import DatasetInfo
+from learn3d.presets import configure
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress
@@ -35,7 +35,7 @@ def check_same(folder: Path, other: Path) -> None:
 
 def metadata(step: int = 3, **changes: Any) -> Metadata:
     """The metadata of a checkpoint."""
-    config = TrainConfig(data="data", category="chair", output="run")
+    config = configure(data="data", category="chair", output="run")
     about = Metadata(config, DatasetInfo(24, inverted=False), Progress(step=step), "72 images", {"torch": "2"})
     return dataclasses.replace(about, **changes)
 

@@ -17,7 +17,7 @@ import time
 import tiny_networks
 
 from learn3d import training
-from learn3d.config import config_from_dict
+from learn3d.presets import config_from_dict
 from learn3d.runs import log
 
 

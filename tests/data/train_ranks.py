@@ -17,9 +17,9 @@ import tiny_networks
 import torch
 
 from learn3d import training
-from learn3d.config import config_from_dict
 from learn3d.methods import mesh_method, prgan
 from learn3d.networks.encoders import ENCODERS
+from learn3d.presets import config_from_dict
 from learn3d.runs import checkpoint
 from learn3d.runs.distributed import join_ranks, rank
 from learn3d.terminal import without_traceback
@@ -56,5 +56,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    ENCODERS["conv-relu"] = ENCODERS["conv-light"] = tiny_networks.TinyEncoder
+    ENCODERS["conv-light"] = tiny_networks.TinyEncoder
     sys.exit(main())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import sys
@@ -22,7 +21,7 @@ from learn3d.data.readers import kato
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.networks.encoders import ENCODERS
 from learn3d.networks.generators import GENERATORS
-from learn3d.presets import PRESETS
+from learn3d.presets import PRESETS, configure, full_name
 from learn3d.tasks import Workers
 from learn3d.training import train
 
@@ -78,13 +77,10 @@ def tiny_config(tiny_folder: Path) -> Callable[..., TrainConfig]:
     def make(output: Path, **options: object) -> TrainConfig:
         defaults = {"iterations": 4, "batch_size": 4, "precision": "fp32", "log_every": 1, "max_val_images": 4}
         options = {"preset": "peng2020-kato"} | options
-        preset = PRESETS.get(options["preset"], PRESETS["peng2020-kato"]).settings
-        names = {field.name for field in dataclasses.fields(preset)} & set(options)
-        settings = {name: options.pop(name) for name in names}
+        preset = PRESETS[full_name(options["preset"])].settings
         if isinstance(preset, PoseInvariantSettings) and preset.encoder == "conv":
-            settings = {"encoder": "conv-small", "generator": "sphere-small"} | settings
-        options["settings"] = dataclasses.replace(preset, **settings)
-        return TrainConfig(**({"data": tiny_folder, "category": "airplane", "output": output} | defaults | options))
+            options = {"encoder": "conv-small", "generator": "sphere-small"} | options
+        return configure(**({"data": tiny_folder, "category": "airplane", "output": output} | defaults | options))
 
     return make
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from learn3d.config import config_from_dict, config_to_dict, differences, load_config
+from learn3d.config import config_to_dict, differences
 from learn3d.files import limits
+from learn3d.presets import config_from_dict, load_config
 
 BASE = {"data": "d", "category": "chair", "output": "o"}
 
@@ -17,7 +18,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no options": ([], r"must hold options by name \(\{\.\.\.\}\), got list"),
     "data": (BASE | {"data": 5}, "data must be the path"),
     "category": (BASE | {"category": 3}, "category must be a valid string, got 3"),
-    "preset": (BASE | {"preset": {}}, "preset must be"),
+    "preset": (BASE | {"preset": {}}, "there is no preset"),
     "no such preset": (BASE | {"preset": "kato"}, "there is no preset 'kato'; did you mean 'plus-kato'?"),
     "layout": (BASE | {"layout": "shapenet"}, "layout must be 'kato'"),
     "flip": (BASE | {"augment": ["channels", "flip"]}, "but 'plus-kato' learns with the class of the original"),
@@ -42,7 +43,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "seed": (BASE | {"seed": 2**64}, "seed must be less than"),
     "iterations": (BASE | {"iterations": "abc"}, "iterations must be a valid integer, got 'abc'"),
     "pairs": (BASE | {"sampling": "pairs", "batch_size": 3}, "batch_size must be a multiple of 2, got 3"),
-    "views": (BASE | {"preset": "kato2018-kato", "sampling": "views"}, "needs sampling 'pairs', got 'views'; leave"),
+    "views": (BASE | {"preset": "multi-view-kato", "sampling": "views"}, "needs sampling 'pairs', got 'views'; leave"),
     "unknown": (BASE | {"latent": 1}, "there is no option 'latent'"),
     "channels": (
         BASE | {"preset": "gadelha2017-kato", "settings": {"generator_channels": [10**6, 1, 1, 1]}},
@@ -79,7 +80,7 @@ def test_files_that_are_no_json_or_too_large(tmp_path, monkeypatch):
         load_config(path)
     for text in ("[" * 100_000, '{"seed": NaN}', "{", "\xff"):
         path.write_text(text, encoding="latin-1")
-        with pytest.raises(ValueError, match=r"config\.json: cannot be read \(|seed must be"):
+        with pytest.raises(ValueError, match=r"config\.json: cannot be read \(|seed must be|is missing"):
             load_config(path)
     path.write_text(json.dumps(BASE))
     assert config_to_dict(load_config(path)) == config_to_dict(config_from_dict(BASE))

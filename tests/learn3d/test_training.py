@@ -226,7 +226,7 @@ def test_empty_masks_are_said_and_nothing_but_empty_ones_refused(
     assert {path.name for path in run_folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "kato2018-kato"])
+@pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "multi-view-kato"])
 @pytest.mark.parametrize(("plane", "fixed"), [(37.5, True), (None, False)])
 def test_symmetry_auto_is_the_plane_that_the_data_have(preset: str, plane: float | None, fixed: bool) -> None:
     settings = dataclasses.replace(PRESETS[preset].settings, symmetry="auto", generator="sphere-small")

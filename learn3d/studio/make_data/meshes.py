@@ -16,7 +16,7 @@ from learn3d.data import conventions
 from learn3d.data.categories import SPLITS, synset_of
 from learn3d.files import npz
 from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
-from learn3d.settings import Count, FilePath, Rare, Weight, checked
+from learn3d.settings import Count, FilePath, Weight, checked
 from learn3d.studio.make_data.writers import WRITERS, WrittenLayout
 from learn3d.studio.shapes import CATEGORIES, numbered_shape
 from learn3d.tasks import ONE_WORKER, Workers
@@ -39,24 +39,25 @@ class DatasetConfig:
     layout: WrittenLayout = "kato"
     """Published data set whose file layout and viewpoints are used, see docs/data-sets.md."""
     views: Count | None = None
-    """Views of each object (default: 20 for kar, 8 for pascal3d, 12 for photos and around; kato always has 24)."""
+    """Views of each object. If not given: 20 for kar, 8 for pascal3d, 12 for photos and around; kato always has 24."""
     source: FilePath | None = None
-    """Folder of meshes, searched recursively, or a mesh pack .npz (default: shapes from --procedural)."""
+    """Folder of meshes, searched recursively, or a mesh pack .npz. If not given: shapes from --procedural."""
     procedural: Amount = 0
     """Number of shapes from the procedural generator, instead of meshes from files or together with them."""
     test: Weight | None = None
-    """Share (below 1, at least 4 meshes) or number of the meshes for the test split (default: 0.2; pascal3d has no test
-    split)."""
+    """Share (below 1, at least 4 meshes) or number of the meshes for the test split. If not given: 0.2; pascal3d has no
+    test split."""
     val: Weight | None = None
-    """Share or number of the meshes for the validation split, 0 for none (default: 0.1, for pascal3d 0.2)."""
+    """Share or number of the meshes for the validation split, 0 for none. If not given: 0.1, for pascal3d 0.2."""
     augment: Amount = 0
     """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75 .. 1.25. With --source,
     shapes of --procedural get none."""
     up: Axis = "y"
     """Axis of the mesh files that points up."""
     front: Axis | None = None
-    """Axis of the mesh files that faces the camera of view 0 (default: x, or y if x is up; z for procedural shapes)."""
-    seed: Rare[Amount] = 0
+    """Axis of the mesh files that faces the camera of view 0. If not given: x, or y if x is up; z for procedural
+    shapes."""
+    seed: Amount = 0
     """Seed of the splits, scales, colours, views and procedural shapes."""
     overwrite: bool = False
     """Replace files of this category that are already in the folder."""

@@ -39,7 +39,7 @@ from learn3d.data.pose_table import MAX_CANDIDATES
 from learn3d.methods.pose_updates import SIZE, TEMPERATURE
 from learn3d.networks.encoders import CODE_SIZE
 from learn3d.networks.generators import GENERATORS
-from learn3d.settings import Rare, checked
+from learn3d.settings import checked
 from learn3d.terminal import is_watched
 
 MAX_FITTED = 6000  # images that shapes are fitted to and that can be neighbours
@@ -68,7 +68,7 @@ class PoseOptions:
     """Number of independent estimates that are averaged: more are more reliable and take longer."""
     prior: Literal["uniform", "free"] = "uniform"
     """Prior over azimuths. uniform: all azimuths are about equally frequent in the data. free: no assumption."""
-    steps: Rare[Annotated[int, Field(ge=1, le=100_000)]] = 300
+    steps: Annotated[int, Field(ge=1, le=100_000)] = 300
     """Optimisation steps of each mean shape and of each of the three stages of the prototypes."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial shapes and of the order of the images."""

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from learn3d.config import TrainConfig, command_line
+from learn3d.config import TrainConfig
 from learn3d.data.categories import SYNSETS
 from learn3d.files import limits
 from learn3d.files.reading import read_json
+from learn3d.presets import command_line
 from learn3d.runs.measurement import HEADERS, Result, format_measures
 from learn3d.studio.tables.plan import Request, name_run, select_rows, variant_of
 from learn3d.studio.tables.tables import MEAN, TABLES, Row, Table

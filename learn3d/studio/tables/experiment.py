@@ -7,12 +7,13 @@ from pathlib import Path
 
 import torch
 
-from learn3d.config import TrainConfig, differences, load_config
+from learn3d.config import TrainConfig, differences
 from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import wrap_deg
 from learn3d.device import resolve_precision
 from learn3d.files import limits, writing
 from learn3d.files.reading import read_bytes
+from learn3d.presets import load_config
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.measurement import Result, evaluate_runs, read_curve

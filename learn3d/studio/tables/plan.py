@@ -1,16 +1,15 @@
 """Plans the training runs of a table: their names, folders and options."""
 
-import dataclasses
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from learn3d.config import USUAL_OPTIONS, TrainConfig, all_options
+from learn3d.config import TrainConfig, all_options
 from learn3d.data.layouts import LAYOUTS, Layout
-from learn3d.presets import PRESETS
-from learn3d.settings import Rare, split_names
+from learn3d.presets import PRESETS, USUAL_OPTIONS, configure
+from learn3d.settings import split_names
 from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS, Row
 from learn3d.tasks import ONE_WORKER, Workers
 from learn3d.terminal import unknown_name
@@ -30,25 +29,25 @@ class Request:
     output: Path
     """Folder of runs and reports; all tables can share one."""
     category: str = ""
-    """Categories, separated by commas, each trained by itself (default: the table's)."""
+    """Categories, separated by commas, each trained by itself. If not given: the table's."""
     methods: tuple[str, ...] = ()
-    """Methods of the table: labels of rows, or names of variants (default: all)."""
+    """Methods of the table: labels of rows, or names of variants. If not given: all."""
     iterations: int | None = None
-    """Training steps; methods with a quarter of the batch, such as Plus, take four times as many (default: the
-    preset's)."""
+    """Training steps; methods with a quarter of the batch, such as Plus, take four times as many. If not given: the
+    preset's."""
     batch_size: int | None = None
-    """Images per step; Plus and others take a quarter of it (default: the preset's)."""
+    """Images per step; Plus and others take a quarter of it. If not given: the preset's."""
     seeds: int | None = None
-    """Number of seeds, 0 .. seeds - 1 (default: the table's)."""
-    layout: Rare[Layout | None] = None
-    """Layout of the data set (default: the table's)."""
-    device: Rare[Literal["cpu", "cuda"]] = "cpu"
+    """Number of seeds, 0 .. seeds - 1. If not given: the table's."""
+    layout: Layout | None = None
+    """Layout of the data set. If not given: the table's."""
+    device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
-    threads: Rare[int | None] = None
-    """CPU threads of each run (default: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with --cluster)."""
+    threads: int | None = None
+    """CPU threads of each run. If not given: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with --cluster."""
     set: tuple[str, ...] = ()
-    """Settings and training options to change: NAME=VALUE for all methods that have them, METHOD:NAME=VALUE for one
-    (default: none)."""
+    """Settings and training options to change: NAME=VALUE for all methods that have them, METHOD:NAME=VALUE for one. If
+    not given: none."""
     workers: Workers = ONE_WORKER
     report_only: bool = False
     """Train nothing: report the runs that are complete."""
@@ -116,16 +115,13 @@ def _configure(
     batch_size = request.batch_size or length_of.batch_size
     if batch_size % divisor:
         raise ValueError(f"{name} divides batches by {divisor}: batch_size must be a multiple, got {batch_size}")
-    if "warmup_steps" in changes:  # as for presets
-        changes["warmup_steps"] = min(changes["warmup_steps"], iterations // 10)
-    settings = {field.name: changes.pop(field.name) for field in fields(preset.settings) if field.name in changes}
-    return TrainConfig(
+    return configure(
+        variant.preset,
         data=request.data,
         category=category,
         output=request.output / "runs" / category / f"{name}-seed{seed}",
         poses=request.output / "poses" / f"{category}-seed{seed}.npz" if variant.estimates_poses else None,
-        preset=variant.preset,
-        settings=dataclasses.replace(preset.settings.for_iterations(iterations), **settings),
+        settings=preset.settings.for_iterations(iterations),
         layout=layout,
         iterations=iterations,
         batch_size=batch_size // divisor * variant.batch_factor,
@@ -138,7 +134,7 @@ def _configure(
 
 def _parse_changes(variants: Sequence[str], texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The changes NAME=VALUE and VARIANT:NAME=VALUE, by variant."""
-    known = {name: all_options(TrainConfig(Path(), "-", Path(), VARIANTS[name].preset)) for name in variants}
+    known = {name: all_options(PRESETS[VARIANTS[name].preset]) for name in variants}
     changes: dict[str, dict[str, Any]] = {variant: {} for variant in variants}
     for text in texts:
         target, separator, value = text.partition("=")

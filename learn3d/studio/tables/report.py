@@ -13,7 +13,6 @@ from markupsafe import Markup
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-from learn3d.config import command_line
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.poses import LookAtPoses
 from learn3d.evaluation import Evaluation, evaluate
@@ -21,7 +20,7 @@ from learn3d.files import limits, writing
 from learn3d.files.reading import read_bytes
 from learn3d.pictures.sheets import natural_colors
 from learn3d.pictures.surfaces import Surface, azimuths_deg, eyes, grid_surface
-from learn3d.presets import PRESETS
+from learn3d.presets import command_line
 from learn3d.runs.folder import METRICS
 from learn3d.runs.log import read_records
 from learn3d.runs.measurement import MEASURES
@@ -176,7 +175,7 @@ def _describe(run: TrainedModel, result: Evaluation, resampled: np.ndarray, metr
     config = run.metadata.config
     return {
         "about": run.metadata,
-        "method": PRESETS[config.preset].label,
+        "method": config.label,
         "mmd": result.means.get("mmd"),
         "iou": result.means.get(metric),
         "interval": percentile_interval(resampled),

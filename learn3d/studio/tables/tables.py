@@ -90,7 +90,7 @@ VARIANTS: dict[str, Variant] = {
     "proposed-shared": Variant(_PROPOSED, _SHARED, **_SMALL),
     "vanilla-shared": Variant(_VANILLA, _SHARED, **_SMALL),
     "single-views": Variant(_VANILLA, _SUPERVISION, **_SMALL),
-    "pairs": Variant("kato2018-kato", _SUPERVISION, **_SMALL),
+    "pairs": Variant("multi-view-kato", _SUPERVISION, **_SMALL),
     "five-views": Variant("many-views-kato", _SUPERVISION, batch_factor=GROUP_SIZE, **_SMALL),  # encodes one of five
     "plus-without-symmetry": Variant("plus-kato", {"symmetry": None}, **_SMALL),
     "plus-without-novel-views": Variant("plus-kato", {"lambda_novel_view": 0.0}, **_SMALL),

@@ -9,7 +9,6 @@ from typing import Literal
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.methods.method import Method
-from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.runs.checkpoint import Metadata
 from learn3d.terminal import note
@@ -74,6 +73,6 @@ def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Seq
             raise ValueError(f"there are {len(paths)} runs but {len(labels)} labels; give one label per run, or none")
         return list(labels)
     several = len({config.category for config in configs}) > 1
-    names = [f"{c.category}: " * several + PRESETS[c.preset].label for c in configs]
+    names = [f"{c.category}: " * several + c.label for c in configs]
     folders = [f"{p.parent.name}/{p.stem}" if p.is_file() else p.name for p in map(Path.resolve, map(Path, paths))]
     return [folder if names.count(name) > 1 else name for name, folder in zip(names, folders, strict=True)]

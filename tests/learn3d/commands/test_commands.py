@@ -16,7 +16,7 @@ import pytest
 from learn3d import commands
 from learn3d.commands import train as train_command
 from learn3d.commands.train import Train
-from learn3d.config import load_config
+from learn3d.presets import load_config
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.measurement import MEASURES
 from learn3d.runs.run import Summary
@@ -45,8 +45,8 @@ def test_options_reach_the_configuration(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("options", "steps"), [("", 100), ("--iterations 60", 6), ("--warmup-steps 9", 9)])
-def test_the_warm_up_of_a_preset_is_a_tenth_of_a_short_run(options: str, steps: int) -> None:
-    assert read(f"--data d --category chair --output o --preset plus {options}").config.warmup_steps == steps
+def test_the_warm_up_is_at_most_a_tenth_of_a_run(options: str, steps: int) -> None:
+    assert read(f"--data d --category chair --output o --preset plus {options}").config.schedule.warmup_steps == steps
 
 
 @pytest.mark.parametrize("form", ["--output {}", "--output={}"])
@@ -72,7 +72,7 @@ def test_tab_completes_commands_options_and_values_in_bash(command, tmp_path) ->
     ask += "$(complete -p learn3d | sed 's/.*-F //; s/ .*//')"
     for words, wanted in {
         ("rec",): "reconstruct",
-        ("train", "--log", ""): "csv tensorboard wandb",
+        ("train", "--log", ""): "tensorboard wandb",
         ("evaluate", "--cat"): "--category",
     }.items():
         bash = ["bash", "-c", f"{ask}; echo ${{COMPREPLY[*]}}", "learn3d", *words]
@@ -97,34 +97,42 @@ def test_a_mistyped_name_leads_to_the_right_one(words: str, near: str, command) 
     assert status == 2 or f"did you mean {near}" in said
 
 
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--batch-size 0", "batch_size must be greater than or equal to 1, got 0"),
+        ("--learning-rate -1", "learning_rate must be greater than 0, got -1.0"),
+        ("--batch-size 3", "batch_size must lie in 2 .. 2, got 3"),
+    ],
+)
+def test_a_refused_value_is_named(option: str, said: str, command) -> None:
+    words = f"train --data x --category chair --output y --preset plus --bank-size 2 {option}"
+    status, _, text = command(*words.split())
+    assert status == 2 and said in " ".join(text.replace("│", " ").split())
+
+
 @pytest.mark.parametrize("words", PAGES, ids=" ".join)
 def test_help_is_complete_and_fits(words: tuple[str, ...], command, monkeypatch) -> None:
-    """Every option has a text, filled to the width; its default is a value that one can type, or explained."""
+    """Every option has a text, and the page fits into the width."""
     monkeypatch.setenv("COLUMNS", "80")
-    (status, brief, _), (other_status, whole, _) = (command(*words, option) for option in ("--help", "--help-all"))
-    assert (status, other_status) == (0, 0)
-    assert f"usage: learn3d {words[0]}" in brief
-    assert len(brief.splitlines()) <= 60
-    for page in (brief, whole):
-        table = page[page.index(" options ") :]
-        assert max(map(len, table.splitlines())) <= 80
-        text = " ".join(re.sub("[│╰─╯]", " ", table).split())
-        bad = ("None:", "{None}|INT", "MISSING", "(default: )", "(default: False)")
-        assert not [word for word in bad if word in text]
-    options = re.split(r"\n[│ ] (?=--)", re.sub("[│╰─╯]", " ", whole))[1:]
+    status, page, _ = command(*words, "--help")
+    assert status == 0
+    assert f"usage: learn3d {words[0]}" in page
+    assert max(map(len, page[page.index(" options ") :].splitlines())) <= 80
+    assert "MISSING" not in page
+    options = re.split(r"\n[│ ] (?=--\w)", re.sub("[│╰─╯]", " ", page))[1:]
     assert len(options) >= 2
     for option in options:
         name, _, text = " ".join(option.split()).partition(" ")
-        assert len(text) > 20 and text[-1] in ".)", name
+        assert len(text) > 20 and re.search(r"[.)]( [\w.]+ options.*)?$", text), name
 
 
-def test_help_all_has_every_option_and_preset(command) -> None:
-    brief, whole = (command("train", option, "--preset", "vpl")[1] for option in ("--help", "--help-all"))
+def test_help_has_every_preset_and_the_options_of_the_chosen_one(command) -> None:
+    page = command("train", "--help", "--preset", "vpl")[1]
     for option in ("--lambda-discriminator", "--augment", "--encoder", "--pictures-every"):
-        assert option in whole and option not in brief
-    assert "  kato2019-pascal " in whole and "  prgan " in brief and "--help-all" in brief
-    assert "Images per training step" in brief and "Images per training step" in whole
-    assert "--anti-aliasing, --no-anti-aliasing" in whole and "(default: 0)" in brief
+        assert option in page
+    assert "  kato2019-pascal " in page and "  prgan " in page
+    assert "Images per training step" in page and "(default: peng2020-kato-vpl)" in page
 
 
 def test_the_help_of_evaluate_explains_every_column(command) -> None:
@@ -142,12 +150,7 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
         ("train --data {tmp}/no --category chair --output {tmp}/run", "data set with --data"),
         ("train --output {run} --resume --preset vanilla", "with the preset peng2020-kato, got peng2020-kato-vanilla"),
         ("train --output {run} --resume --overwrite", "give one of them"),
-        (
-            "train --data x --category chair --output {tmp}/run --batch-size 0",
-            "must be greater than or equal to 1, got 0",
-        ),
         ("train --data {data} --category lamp --output {tmp}/run", "03636649_train_images.npz: is missing"),
-        ("make-dataset --output {tmp}/x --category chair", "give --source (a folder"),
         ("check-dataset {tmp}/no", "there is no such folder"),
         ("evaluate", "give at least one run"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),

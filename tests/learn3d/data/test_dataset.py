@@ -224,7 +224,7 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
         concatenate([unknown, tiny_set])
 
 
-@pytest.mark.parametrize("preset", ["peng2020-kato", "kato2018-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
+@pytest.mark.parametrize("preset", ["peng2020-kato", "multi-view-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
 def test_methods_that_need_poses_say_so(preset: str) -> None:
     with pytest.raises(ValueError, match="has no poses"):
         create_method(

@@ -16,13 +16,12 @@ from reader_checks import problems
 from scipy.spatial.transform import Rotation
 
 import nmr
-from learn3d.config import TrainConfig
 from learn3d.data.dataset import concatenate
 from learn3d.data.layouts import check_folder
 from learn3d.data.readers import pascal3d
 from learn3d.data.sampling import augment
 from learn3d.networks.resnet import ResNet18Encoder
-from learn3d.presets import PRESETS
+from learn3d.presets import PRESETS, configure
 from learn3d.runs.checkpoint import load_method
 from learn3d.training import train
 
@@ -289,7 +288,7 @@ def test_a_trained_model_does_without_the_pretrained_weights(folder: Path, tmp_p
     torch.save(ResNet18Encoder().state_dict(), weights)
     settings = dataclasses.replace(PRESETS["peng2020-pascal"].settings, pretrained=weights)
     options = {"preset": "peng2020-pascal", "settings": settings, "iterations": 1, "batch_size": 2, "precision": "fp32"}
-    config = TrainConfig(data=folder, category="aeroplane", output=tmp_path / "run", **options)
+    config = configure(data=folder, category="aeroplane", output=tmp_path / "run", **options)
     assert train(config).finished
     weights.unlink()
     assert train(dataclasses.replace(config, iterations=2), resume=True).progress.step == 2

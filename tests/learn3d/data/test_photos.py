@@ -14,7 +14,6 @@ import pytest
 import torch
 from PIL import Image
 
-from learn3d.config import TrainConfig
 from learn3d.data.layouts import check_folder, load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import photos
@@ -22,6 +21,7 @@ from learn3d.data.readers.photos import split_objects
 from learn3d.data.view_bins import choose_bins, view_classes
 from learn3d.evaluation import evaluate
 from learn3d.methods.pose_invariant import PoseInvariantSettings
+from learn3d.presets import configure
 from learn3d.runs import checkpoint
 from learn3d.studio.commands import EstimatePoses
 from learn3d.training import train
@@ -40,7 +40,7 @@ def test_the_best_networks_are_those_with_the_best_silhouettes(made: Path, tmp_p
     settings = PoseInvariantSettings(encoder="conv-small", generator="sphere-small", learning_rate=0.01)
     about = {"data": made, "category": "chair", "layout": "photos", "settings": settings, "output": tmp_path / "run"}
     about["preset"] = "peng2020-kato"
-    summary = train(TrainConfig(**about, iterations=3, batch_size=4, precision="fp32", validate_every=1))
+    summary = train(configure(**about, iterations=3, batch_size=4, precision="fp32", validate_every=1))
     lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     measured = {line["step"]: line["silhouette_iou"] for line in lines if line["split"] == "val"}
     assert summary.progress.best_step == max(measured, key=measured.get)
@@ -213,7 +213,7 @@ def test_photographs_without_poses_learn_from_an_estimate(chairs: Path, tmp_path
     assert table.with_suffix(".png").is_file()
     settings = PoseInvariantSettings(encoder="conv-small", generator="sphere-small")
     about = {"data": chairs.parent, "category": "chair", "layout": "photos", "preset": "peng2020-kato"}
-    config = TrainConfig(**about, settings=settings, output=tmp_path / "run", iterations=1, batch_size=4, poses=table)
+    config = configure(**about, settings=settings, output=tmp_path / "run", iterations=1, batch_size=4, poses=table)
     assert train(config).finished
     for path in (chairs / "images").iterdir():
         path.unlink()

@@ -21,6 +21,7 @@ from learn3d.data.sampling import batches
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.files.reading import DamagedFile
 from learn3d.methods.plus import Plus
+from learn3d.presets import configure
 from learn3d.runs import checkpoint, measurement
 from learn3d.training import train
 
@@ -82,7 +83,7 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
         assert np.array_equal(view_ids, drawn.azimuth_deg.long() % 24)
         second.append((drawn.azimuth_deg % 2).mean())
     assert abs(np.mean(second) - 0.25) < 0.02
-    options = TrainConfig(data=Path("."), category="x", output=Path("."), batch_size=8, iterations=2, augment=())
+    options = configure(data=Path("."), category="x", output=Path("."), batch_size=8, iterations=2, augment=())
     assert all((b.poses.azimuth_deg % 2).sum() < 8 for b in batches(dataset, options))
 
 

@@ -14,9 +14,9 @@ import pytest
 from fuzz_targets import ERRORS, FILES, SETTINGS, TARGETS, Target, layout_target
 from reader_checks import at_most
 
-from learn3d.config import TrainConfig
 from learn3d.data.layouts import check_folder
 from learn3d.data.readers import READERS
+from learn3d.presets import configure
 from learn3d.training import train
 
 DAMAGED = {  # what is cut short, and a preset of the layout
@@ -41,7 +41,7 @@ def test_a_damaged_file_ends_training_with_its_name_and_what_to_do(tmp_path: Pat
     for path in folder.glob(pattern):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     where = {"data": folder, "category": "chair", "output": tmp_path / "run"}
-    config = TrainConfig(**where, preset=preset, layout=layout, iterations=1, batch_size=2, val_split="test")
+    config = configure(**where, preset=preset, layout=layout, iterations=1, batch_size=2, val_split="test")
     with pytest.raises(ValueError) as error:
         train(config)
     named, text = Path(str(error.value).split(": ", 1)[0]), str(error.value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 import re
@@ -10,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from learn3d import methods, presets
-from learn3d.config import TrainConfig
 from learn3d.evaluation import evaluate
+from learn3d.presets import configure
 from learn3d.runs import checkpoint
 from learn3d.training import load_data, train
 
@@ -27,13 +28,13 @@ def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, m
     monkeypatch.setitem(methods._METHODS, page.MirrorSettings, page.Mirror)
     names = vars(presets) | vars(page)
     for name, preset in eval("{" + preset_text + "}", names).items():
-        monkeypatch.setitem(presets.PRESETS, name, preset)
+        monkeypatch.setitem(presets.PRESETS, name, dataclasses.replace(preset, preset=name))
 
     settings = page.MirrorSettings(encoder="conv-small", generator="sphere-small", learning_rate=1e-3)
     where = {"data": tiny_folder, "category": "airplane", "output": tmp_path / "run"}
     options = {"preset": "mirror-kato", "settings": settings, "batch_size": 4, "max_val_images": 4, "log_every": 1}
-    train(TrainConfig(**where, **options, iterations=2))
-    summary = train(TrainConfig(**where, **options, iterations=4), resume=True)
+    train(configure(**where, **options, iterations=2))
+    summary = train(configure(**where, **options, iterations=4), resume=True)
     assert summary.finished
     method, config, _ = checkpoint.load_method(tmp_path / "run" / "last.safetensors")
     assert type(method) is page.Mirror

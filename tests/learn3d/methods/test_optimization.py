@@ -28,7 +28,7 @@ TINY = {"encoder": "conv-small", "generator": "sphere-small"}
 TINY_RUNS = {
     "proposed": TINY,
     "plus": TINY | {"preset": "plus-kato", "bank_size": 8},
-    "multi-view": TINY | {"preset": "kato2018-kato"},
+    "multi-view": TINY | {"preset": "multi-view-kato"},
     "many-views": TINY | {"preset": "many-views-kato", "batch_size": 10},
     "vpl": {"preset": "peng2020-kato-vpl", "generator": "sphere-small", "discriminator_channels": 2},
     "prgan": {"preset": "gadelha2017-kato", "encoder_from_step": 3}

@@ -81,9 +81,9 @@ def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
         take_step(method, batch, step)
     found = method.view_probabilities(batch.images).argmax(1)
     assert torch.equal(found, ((batch.poses.azimuth_deg + 180) % 360 / 15).long())
-    rotations = dataclasses.replace(batch, poses=None)
+    rotations = DatasetInfo(24, inverted=False, pose_features=9)
     with pytest.raises(ValueError, match="--lambda-view needs azimuths"):
-        method.check_batch(rotations)
+        dataclasses.replace(SMALL, lambda_view=1.0).for_data(rotations)
 
 
 def test_the_weight_of_the_smoothness_falls_over_the_run(batch) -> None:

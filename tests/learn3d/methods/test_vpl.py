@@ -234,9 +234,9 @@ def test_data_that_do_not_fit_the_settings_are_refused() -> None:
         create(SHAPENET_CLASS, num_classes=1)
     with pytest.raises(ValueError, match="tells views by their class and needs at least 2, got 1"):
         create(VPLSettings(), num_views=1)
-    batch, settings = make_batch(64, 1), replace(SHAPENET, image_size=64)
+    settings = replace(SHAPENET, image_size=64)
     with pytest.raises(ValueError, match="batches of at least 2, got 1"):
-        create(settings).check_batch(batch)
-    baseline = create(replace(settings, lambda_discriminator=0.0))
-    baseline.check_batch(batch)
-    assert "projection" in take_step(baseline, batch, 1)
+        settings.check_run(iterations=1, batch_size=1)
+    baseline = replace(settings, lambda_discriminator=0.0)
+    baseline.check_run(iterations=1, batch_size=1)
+    assert "projection" in take_step(create(baseline), make_batch(64, 1), 1)

@@ -24,7 +24,7 @@ RUNS = {  # for each: its preset, options, and the bound of relative differences
     "proposed": ("peng2020-kato", SMALL, 1e-5),
     "long": ("peng2020-kato", SMALL | {"iterations": 200, "validate_every": 100, "checkpoint_every": 100}, 1e-5),
     "plus": ("plus-kato", SMALL | {"symmetry": "x", "bank_size": 16, "lambda_view": 0.1}, 1e-5),
-    "pairs": ("kato2018-kato", SMALL, 1e-5),
+    "pairs": ("multi-view-kato", SMALL, 1e-5),
     "groups": ("many-views-kato", SMALL | {"symmetry": "x", "batch_size": 20}, 1e-5),
     "vpl": ("peng2020-kato-vpl", {"generator": "sphere-small", "discriminator_channels": 2}, 1e-4),
     "vpl-kar": (

@@ -21,7 +21,7 @@ from runs import check_same
 import learn3d
 from learn3d import training
 from learn3d.config import TrainConfig
-from learn3d.presets import PRESETS
+from learn3d.presets import PRESETS, configure
 from learn3d.runs import checkpoint
 from learn3d.training import train
 
@@ -55,7 +55,7 @@ def uninterrupted(server, tiny_folder, tmp_path_factory) -> tuple[TrainConfig, f
     where = {"data": folder, "category": "airplane", "preset": "peng2020-kato"}
     for seed in range(40):
         output = folder / f"seed{seed}"
-        config = TrainConfig(**where, output=output, settings=settings, iterations=10, seed=seed, **fixed, **often)
+        config = configure(**where, output=output, settings=settings, iterations=10, seed=seed, **fixed, **often)
         started = time.monotonic()
         answer = server(config)
         assert answer["status"] == 0, output.with_suffix(".log").read_text()

@@ -47,7 +47,7 @@ def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch
 
 
 def test_other_methods_are_refused(tiny_config, run_folder, tmp_path) -> None:
-    train(tiny_config(run_folder, preset="kato2018-kato", encoder="conv-small", iterations=1))
+    train(tiny_config(run_folder, preset="multi-view-kato", encoder="conv-small", iterations=1))
     with pytest.raises(ValueError, match="proposed, vanilla, plus and many-views"):
         export(run_folder, tmp_path / "small.safetensors")
 

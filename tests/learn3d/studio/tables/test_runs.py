@@ -17,10 +17,10 @@ import pytest
 import stub_work
 
 from learn3d.commands.train import Train
-from learn3d.config import command_line, config_to_dict
+from learn3d.config import config_to_dict
 from learn3d.device import resolve_precision
 from learn3d.files.writing import write_json
-from learn3d.presets import PRESETS
+from learn3d.presets import PRESETS, command_line
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.run import Summary
 from learn3d.studio.poses.estimate import PoseOptions
@@ -58,7 +58,7 @@ def test_smaller_batches_show_as_many_images(tmp_path) -> None:
     def sizes(**asked: int) -> set[tuple[str, int, int, int]]:
         request = Request("plus", tmp_path, tmp_path, "chair", ("proposed", "proposed-shared", "plus"), **asked)
         runs = plan_runs(dataclasses.replace(request, seeds=1))
-        return {(variant_of(r), r.iterations, r.batch_size, r.warmup_steps) for r in runs}
+        return {(variant_of(r), r.iterations, r.batch_size, r.schedule.warmup_steps) for r in runs}
 
     small = {("proposed-shared", 80_000, 32, 100), ("plus", 80_000, 32, 100)}
     assert sizes() == {("proposed", 20_000, 128, 0)} | small
