@@ -132,7 +132,7 @@ bool uses_position(const Lit<T>& args) {
 
 // What a pixel shows: its point, normal and the direction towards the eye.
 template <class T>
-struct Spot {
+struct SurfacePoint {
   Vec3<T> point, normal, eye;
 };
 
@@ -149,58 +149,58 @@ struct Highlight {
   T cosine, x, value;
   double log2_x = 0;
 
-  Highlight(const Spot<T>& spot, const Vec3<T>& l, T shininess) : cosine(spot.normal.dot(l)), value(0) {
-    reflected = 2 * cosine * spot.normal - l;
-    x = reflected.dot(spot.eye);
+  Highlight(const SurfacePoint<T>& surface, const Vec3<T>& l, T shininess) : cosine(surface.normal.dot(l)), value(0) {
+    reflected = 2 * cosine * surface.normal - l;
+    x = reflected.dot(surface.eye);
     if (!(x > 0)) return;
     log2_x = log2_of(static_cast<double>(x));
     value = static_cast<T>(exp2_of(shininess * log2_x));
   }
   // Adds the gradients of the normal, of l and of the direction towards the eye.
-  void backward(const Spot<T>& spot, const Vec3<T>& l, T shininess, T grad, Spot<T>& grads, Vec3<T>& grad_l,
+  void backward(const SurfacePoint<T>& surface, const Vec3<T>& l, T shininess, T grad, SurfacePoint<T>& grads, Vec3<T>& grad_l,
                 T& grad_shininess) const {
     if (!(x > 0)) return;
     grad_shininess += static_cast<T>(grad * value * log2_x * 0.69314718055994531);
     const T grad_x = grad * shininess * (value / x);
-    const Vec3<T> grad_reflected = grad_x * spot.eye;
+    const Vec3<T> grad_reflected = grad_x * surface.eye;
     grads.eye += grad_x * reflected;
-    const T grad_cosine = 2 * spot.normal.dot(grad_reflected);
+    const T grad_cosine = 2 * surface.normal.dot(grad_reflected);
     grads.normal += 2 * cosine * grad_reflected + grad_cosine * l;
-    grad_l += grad_cosine * spot.normal - grad_reflected;
+    grad_l += grad_cosine * surface.normal - grad_reflected;
   }
 };
 
 template <class T>
-PixelLight<T> light_at(const Lamps<T>& lamps, const Spot<T>& spot, bool highlights) {
+PixelLight<T> light_at(const Lamps<T>& lamps, const SurfacePoint<T>& surface, bool highlights) {
   PixelLight<T> light{lamps.ambient * lamps.ambient_color, Vec3<T>::Zero()};
   for (const Lamp<T>& lamp : lamps.lamps) {
-    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - spot.point) : lamp.place;
-    if (!(spot.normal.dot(towards) > 0)) continue;
+    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - surface.point) : lamp.place;
+    if (!(surface.normal.dot(towards) > 0)) continue;
     const Vec3<T> color = lamp.intensity * lamp.color;
     if (!lamp.point && !highlights) {
-      light.diffuse += spot.normal.dot(towards) * color;
+      light.diffuse += surface.normal.dot(towards) * color;
       continue;
     }
     const Unit<T> l(towards);
     const T strength = lamp.point ? 1 / (1 + lamp.falloff * towards.squaredNorm()) : l.length;
-    light.diffuse += (lamp.point ? strength * spot.normal.dot(l.unit) : spot.normal.dot(towards)) * color;
+    light.diffuse += (lamp.point ? strength * surface.normal.dot(l.unit) : surface.normal.dot(towards)) * color;
     if (highlights)
-      light.highlight += lamps.specular * strength * Highlight<T>(spot, l.unit, lamps.shininess).value * color;
+      light.highlight += lamps.specular * strength * Highlight<T>(surface, l.unit, lamps.shininess).value * color;
   }
   return light;
 }
 
-// Adds the gradients of the lamps and of the spot (its normal, point and direction towards the eye).
+// Adds the gradients of the lamps and of the surface (its normal, point and direction towards the eye).
 template <class T>
-void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight<T>& grad, Lamps<T>& grad_lamps,
-                    Spot<T>& grad_spot) {
+void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface, const PixelLight<T>& grad, Lamps<T>& grad_lamps,
+                    SurfacePoint<T>& grad_surface) {
   grad_lamps.ambient += grad.diffuse.dot(lamps.ambient_color);
   grad_lamps.ambient_color += lamps.ambient * grad.diffuse;
   for (size_t n = 0; n < lamps.lamps.size(); ++n) {
     const Lamp<T>& lamp = lamps.lamps[n];
     Lamp<T>& grad_lamp = grad_lamps.lamps[n];
-    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - spot.point) : lamp.place;
-    if (!(spot.normal.dot(towards) > 0)) continue;
+    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - surface.point) : lamp.place;
+    if (!(surface.normal.dot(towards) > 0)) continue;
     const Vec3<T> color = lamp.intensity * lamp.color;
     Vec3<T> grad_color = Vec3<T>::Zero(), grad_towards = Vec3<T>::Zero(), grad_l = Vec3<T>::Zero();
     T grad_strength = 0;
@@ -208,23 +208,23 @@ void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight
     const T square = towards.squaredNorm(), strength = lamp.point ? 1 / (1 + lamp.falloff * square) : l.length;
     const T colored = grad.diffuse.dot(color);
     if (lamp.point) {
-      const T cosine = spot.normal.dot(l.unit);
+      const T cosine = surface.normal.dot(l.unit);
       grad_color += strength * cosine * grad.diffuse;
       grad_strength += colored * cosine;
-      grad_spot.normal += colored * strength * l.unit;
-      grad_l += colored * strength * spot.normal;
+      grad_surface.normal += colored * strength * l.unit;
+      grad_l += colored * strength * surface.normal;
     } else {
-      grad_color += spot.normal.dot(towards) * grad.diffuse;
-      grad_spot.normal += colored * towards;
-      grad_towards += colored * spot.normal;
+      grad_color += surface.normal.dot(towards) * grad.diffuse;
+      grad_surface.normal += colored * towards;
+      grad_towards += colored * surface.normal;
     }
     if (lamps.highlights) {
-      const Highlight<T> h(spot, l.unit, lamps.shininess);
+      const Highlight<T> h(surface, l.unit, lamps.shininess);
       const T shine = grad.highlight.dot(color);
       grad_color += lamps.specular * strength * h.value * grad.highlight;
       grad_lamps.specular += shine * strength * h.value;
       grad_strength += shine * lamps.specular * h.value;
-      h.backward(spot, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_spot, grad_l,
+      h.backward(surface, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_surface, grad_l,
                  grad_lamps.shininess);
     }
     grad_lamp.intensity += grad_color.dot(lamp.color);
@@ -234,7 +234,7 @@ void light_backward(const Lamps<T>& lamps, const Spot<T>& spot, const PixelLight
       const T grad_square = -grad_strength * strength * strength;
       grad_lamp.falloff += grad_square * square;
       grad_towards += 2 * grad_square * lamp.falloff * towards;
-      grad_spot.point -= grad_towards;
+      grad_surface.point -= grad_towards;
     } else {
       grad_towards += grad_strength * l.unit;
     }
@@ -273,7 +273,7 @@ struct Pixel {
   Vec3<T> mean;
   T length;  // length of the mean normal, at least 1e-5; smooth only
   Unit<T> to_eye{Vec3<T>::Zero()};
-  Spot<T> spot;
+  SurfacePoint<T> surface;
 };
 
 template <class T>
@@ -291,13 +291,13 @@ NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id
   } else {
     p.mean = load3(view.normals + 3 * p.face);
   }
-  p.spot.normal = p.sign * (p.mean / p.length);
-  p.spot.point.setZero();
-  p.spot.eye.setZero();
+  p.surface.normal = p.sign * (p.mean / p.length);
+  p.surface.point.setZero();
+  p.surface.eye.setZero();
   if (position) {
-    for (int k = 0; k < 3; ++k) p.spot.point += weights[k] * load3(view.vertices + 3 * p.corners[k]);
-    p.to_eye = Unit<T>(load3(view.viewer) - view.viewer[3] * p.spot.point);
-    p.spot.eye = p.to_eye.unit;
+    for (int k = 0; k < 3; ++k) p.surface.point += weights[k] * load3(view.vertices + 3 * p.corners[k]);
+    p.to_eye = Unit<T>(load3(view.viewer) - view.viewer[3] * p.surface.point);
+    p.surface.eye = p.to_eye.unit;
   }
   return p;
 }
@@ -319,19 +319,19 @@ template <class T>
 NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, const Pixel<T>& p,
                                const T* weights, const PixelLight<T>& grad, bool position, Lamps<T>& grad_lamps,
                                T* sums, T* grad_weights) {
-  Spot<T> grad_spot{Vec3<T>::Zero(), Vec3<T>::Zero(), Vec3<T>::Zero()};
+  SurfacePoint<T> grad_surface{Vec3<T>::Zero(), Vec3<T>::Zero(), Vec3<T>::Zero()};
   if (args.parameters)
-    light_backward(lamps, p.spot, grad, grad_lamps, grad_spot);
+    light_backward(lamps, p.surface, grad, grad_lamps, grad_surface);
   else
-    grad_spot.normal = grad.diffuse;
-  Vec3<T> grad_mean = p.sign * grad_spot.normal;
+    grad_surface.normal = grad.diffuse;
+  Vec3<T> grad_mean = p.sign * grad_surface.normal;
   if (args.smooth && p.length > T(kShortest)) {
     const Vec3<T> unit = p.mean / p.length;
     grad_mean = (grad_mean - unit * unit.dot(grad_mean)) / p.length;
   } else if (args.smooth) {
     grad_mean /= p.length;
   }
-  if (position) grad_spot.point -= view.viewer[3] * p.to_eye.backward(grad_spot.eye);
+  if (position) grad_surface.point -= view.viewer[3] * p.to_eye.backward(grad_surface.eye);
   if (!args.smooth) add3(sums, grad_mean);
   for (int k = 0; weights && k < 3; ++k) {
     T by_weight = 0;
@@ -340,8 +340,8 @@ NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const La
       by_weight += load3(view.normals + 3 * p.corners[k]).dot(grad_mean);
     }
     if (position) {
-      add3<T>(sums + 9 + 3 * k, weights[k] * grad_spot.point);
-      by_weight += load3(view.vertices + 3 * p.corners[k]).dot(grad_spot.point);
+      add3<T>(sums + 9 + 3 * k, weights[k] * grad_surface.point);
+      by_weight += load3(view.vertices + 3 * p.corners[k]).dot(grad_surface.point);
     }
     if (grad_weights) grad_weights[k] = by_weight;
   }
@@ -353,7 +353,7 @@ void light_faces(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps,
   T* face = reserve(sums.faces, 3 * sums.visible.count);
   for (int64_t n = 1; n < sums.visible.count; ++n) {
     const Pixel<T> p = pixel_of<T>(args, view, sums.visible.ids[n], nullptr, false);
-    const Vec3<T> light = args.parameters ? light_at(lamps, p.spot, false).diffuse : p.spot.normal;
+    const Vec3<T> light = args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
     for (int k = 0; k < 3; ++k) face[3 * n + k] = light[k];
   }
 }
@@ -424,7 +424,7 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
     const T* color = kColors ? args.colors + kColors * n : nullptr;
     const Pixel<T> p = pixel_of(args, view, id, args.at.weights + 3 * n, position);
     const PixelLight<T> light =
-        args.parameters ? light_at(lamps, p.spot, lamps.highlights) : PixelLight<T>{p.spot.normal, Vec3<T>::Zero()};
+        args.parameters ? light_at(lamps, p.surface, lamps.highlights) : PixelLight<T>{p.surface.normal, Vec3<T>::Zero()};
     for (int k = 0; k < 3; ++k)
       lit[k] = (kColors ? color[kColors == 3 ? k : 0] * light.diffuse[k] : light.diffuse[k]) + light.highlight[k];
   }
@@ -461,7 +461,7 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
     PixelLight<T> grads{load3(grad), load3(grad)};
     for (int k = 0; kColors && k < 3; ++k) grads.diffuse[k] *= color[kColors == 3 ? k : 0];
     if (grad_color) {
-      const Vec3<T> light = args.parameters ? light_at(lamps, p.spot, false).diffuse : p.spot.normal;
+      const Vec3<T> light = args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
       for (int k = 0; k < 3; ++k) grad_color[kColors == 3 ? k : 0] += light[k] * grad[k];
     }
     pixel_backward(args, view, lamps, p, weights, grads, position, sums.lamps, sum, grad_weights);

@@ -63,17 +63,17 @@ inline int cpu_level() {
 // Keeps loops on one thread while cores are oversubscribed. A loop ends when its last thread has ended, and a thread
 // without a core may need many times as long as the whole loop. A caller that waited for such a thread
 // therefore works alone for 50 times as long as it waited, so that no more than a fiftieth of the time is lost.
-class Company {
+class OversubscriptionGuard {
  public:
-  static Company& shared() {
-    static Company company;
+  static OversubscriptionGuard& shared() {
+    static OversubscriptionGuard guard;
 #if !defined(_WIN32)
     // fork copies OpenMP's list of threads, but not the threads: a loop in the child would wait for
     // them. If the parent has never wanted several threads, the child may start its own.
-    static const int registered = pthread_atfork(nullptr, nullptr, [] { company.alone_until_ = kForEver; });
+    static const int registered = pthread_atfork(nullptr, nullptr, [] { guard.alone_until_ = kForEver; });
     static_cast<void>(registered);
 #endif
-    return company;
+    return guard;
   }
 
   static int64_t now() {  // nanoseconds
@@ -89,11 +89,11 @@ class Company {
     return now();
   }
 
-  bool wanted() const { return now() >= alone_until_.load(std::memory_order_relaxed); }
+  bool allows_threads() const { return now() >= alone_until_.load(std::memory_order_relaxed); }
 
   // finished: when the caller ran out of iterations. worked: the longest time that another thread spent on a core;
   // stopped: the longest time that another thread spent without one.
-  void judge(int64_t finished, int64_t worked, int64_t stopped) {
+  void record_wait(int64_t finished, int64_t worked, int64_t stopped) {
     const int64_t time = now(), waited = time - finished;
     if (waited < kPatience || (waited < worked + kPatience && stopped < waited / 2)) return;
     alone_until_.store(time + 50 * waited, std::memory_order_relaxed);
@@ -112,7 +112,7 @@ template <class Body>
 void parallel_for(int64_t count, int num_threads, const Body& body) {
   const int threads = static_cast<int>(count < num_threads ? count : num_threads);
   const ScratchUse caller;
-  if (threads <= 1 || !Company::shared().wanted()) {
+  if (threads <= 1 || !OversubscriptionGuard::shared().allows_threads()) {
     for (int64_t i = 0; i < count; ++i) body(i);
     return;
   }
@@ -124,7 +124,8 @@ void parallel_for(int64_t count, int num_threads, const Body& body) {
   {
     ThreadScratch& scratch = ThreadScratch::mine();
     const ScratchUse use;
-    const int64_t before = scratch.grown(), start = Company::now(), start_on_core = Company::on_core();
+    const int64_t before = scratch.grown(), start = OversubscriptionGuard::now(),
+                  start_on_core = OversubscriptionGuard::on_core();
 #pragma omp for schedule(dynamic, 1) nowait
     for (int64_t i = 0; i < count; ++i) {
       try {
@@ -134,7 +135,7 @@ void parallel_for(int64_t count, int num_threads, const Body& body) {
         if (!failure) failure = std::current_exception();
       }
     }
-    const int64_t end = Company::now(), with_core = Company::on_core() - start_on_core;
+    const int64_t end = OversubscriptionGuard::now(), with_core = OversubscriptionGuard::on_core() - start_on_core;
 #pragma omp critical(nmr_thread)
     if (&scratch == &mine) {
       finished = end;
@@ -144,7 +145,7 @@ void parallel_for(int64_t count, int num_threads, const Body& body) {
       stopped = std::max(stopped, end - start - with_core);
     }
   }
-  Company::shared().judge(finished, worked, stopped);
+  OversubscriptionGuard::shared().record_wait(finished, worked, stopped);
   mine.count(grown);
   if (failure) std::rethrow_exception(failure);
 }

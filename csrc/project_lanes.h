@@ -14,7 +14,7 @@ NMR_INLINE bool is_finite(T value) {
 // / z^2 overflows), `size` is not finite and all else is undefined. (One number, because compilers do not vectorize
 // loops over `&&`.)
 template <class T>
-struct Sight {
+struct ProjectedVertex {
   T inverse_z;
   T px, py;    // before the distortion
   T cx, cy;    // the nearest point within the reach of the distortion: (px, py) itself, or share times that
@@ -28,8 +28,8 @@ struct Sight {
 // x, y, z are relative to the origin. Images use divisions, which round as the published ones. Derivatives (kExact
 // false) use one reciprocal instead, which saves time.
 template <class T, bool kPerspective, int kDistortion, bool kExact>
-NMR_INLINE Sight<T> sight_of(const Lens<T>& c, T x, T y, T z) {
-  Sight<T> s;
+NMR_INLINE ProjectedVertex<T> project_vertex(const Lens<T>& c, T x, T y, T z) {
+  ProjectedVertex<T> s;
   const T ux = c.a[0] * x + c.a[1] * y + c.a[2] * z + c.a[3];
   const T uy = c.a[4] * x + c.a[5] * y + c.a[6] * z + c.a[7];
   s.z = c.a[8] * x + c.a[9] * y + c.a[10] * z + c.a[11];
@@ -70,7 +70,7 @@ template <class T, bool kPerspective, int kDistortion>
 NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T* __restrict points) {
   const T infinity = std::numeric_limits<T>::infinity();
   for (int l = 0; l < kGroup; ++l) {
-    const Sight<T> s = sight_of<T, kPerspective, kDistortion, true>(
+    const ProjectedVertex<T> s = project_vertex<T, kPerspective, kDistortion, true>(
         c, vertices[3 * l] - c.o[0], vertices[3 * l + 1] - c.o[1], vertices[3 * l + 2] - c.o[2]);
     points[3 * l] = is_finite(s.size) ? s.x : infinity;
     points[3 * l + 1] = is_finite(s.size) ? s.y : infinity;
@@ -87,7 +87,7 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
   for (int l = 0; l < kGroup; ++l) {
     T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1], z = vertices[3 * l + 2] - c.o[2];
     T gx = grad_points[3 * l], gy = grad_points[3 * l + 1], gz = grad_points[3 * l + 2];
-    Sight<T> s = sight_of<T, kPerspective, kDistortion, false>(c, x, y, z);
+    ProjectedVertex<T> s = project_vertex<T, kPerspective, kDistortion, false>(c, x, y, z);
     T reach = larger(std::abs(s.qx), std::abs(s.qy)) + c.largest_k * s.slope;
     if (kDistortion) {
       const T r2 = 1 + s.px * s.px + s.py * s.py;

@@ -233,7 +233,7 @@ NMR_INLINE int64_t wrapped(int64_t n, int64_t size, Wrap wrap) {
 
 // The four texels around a place on one level: upper left, upper right, lower left, lower right.
 template <class T>
-struct Taps {
+struct BilinearTaps {
   int64_t row[2];     // first texel of the upper and the lower row
   int64_t column[2];
   T right, down;      // position between the columns and the rows, in [0, 1)
@@ -243,12 +243,12 @@ struct Taps {
 };
 
 template <class T>
-NMR_INLINE Taps<T> taps_of(const Grid& grid, const Place<T>& place, Wrap wrap) {
+NMR_INLINE BilinearTaps<T> taps_of(const Grid& grid, const Place<T>& place, Wrap wrap) {
   const T x = place.u * static_cast<T>(grid.width) - T(0.5), y = (1 - place.v) * static_cast<T>(grid.height) - T(0.5);
   int64_t column = static_cast<int64_t>(x), row = static_cast<int64_t>(y);
   column -= static_cast<T>(column) > x;  // floor
   row -= static_cast<T>(row) > y;
-  Taps<T> taps;
+  BilinearTaps<T> taps;
   taps.right = x - static_cast<T>(column);
   taps.down = y - static_cast<T>(row);
   for (int k = 0; k < 2; ++k) {
@@ -260,14 +260,14 @@ NMR_INLINE Taps<T> taps_of(const Grid& grid, const Place<T>& place, Wrap wrap) {
 
 // One or two levels that are blended: share of each.
 template <class T>
-struct Blend {
+struct MipBlend {
   int count;
   Grid grid[2];
   T share[2];
 };
 
 template <class T>
-NMR_INLINE Blend<T> blend_of(const SampleUV<T>& args, int64_t b, int64_t n) {
+NMR_INLINE MipBlend<T> blend_of(const SampleUV<T>& args, int64_t b, int64_t n) {
   if (!args.level) return {1, {grid_of(args.grids, args.images, args.levels, b, 0), {}}, {T(1), T(0)}};
   const T level = args.level[n];
   const int64_t low = std::max(std::min(static_cast<int64_t>(level), args.levels - 1), int64_t(0));
@@ -279,7 +279,7 @@ NMR_INLINE Blend<T> blend_of(const SampleUV<T>& args, int64_t b, int64_t n) {
 
 // color (+)= share * sum over the taps of weight texel
 template <int64_t kChannels, bool kAdd, class T>
-NMR_INLINE void add_taps(const Taps<T>& taps, const T* texels, T share, int64_t C, T* color) {
+NMR_INLINE void add_taps(const BilinearTaps<T>& taps, const T* texels, T share, int64_t C, T* color) {
   const T *a = texels + taps.texel(0) * C, *b = texels + taps.texel(1) * C;
   const T *c = texels + taps.texel(2) * C, *d = texels + taps.texel(3) * C;
   const T wa = taps.weight(0), wb = taps.weight(1), wc = taps.weight(2), wd = taps.weight(3);
@@ -291,7 +291,7 @@ NMR_INLINE void add_taps(const Taps<T>& taps, const T* texels, T share, int64_t 
 
 // Adds the gradient of a color to the texels whose row begins in [first, last).
 template <int64_t kChannels, class T>
-NMR_INLINE void add_texel_gradients(const Taps<T>& taps, T share, const T* grad, int64_t C, int64_t first, int64_t last,
+NMR_INLINE void add_texel_gradients(const BilinearTaps<T>& taps, T share, const T* grad, int64_t C, int64_t first, int64_t last,
                                     T* grad_texels) {
   for (int k = 0; k < 4; ++k) {
     const int64_t row = taps.row[k >> 1];
@@ -304,7 +304,7 @@ NMR_INLINE void add_texel_gradients(const Taps<T>& taps, T share, const T* grad,
 
 // Adds dL/du and dL/dv of one level.
 template <int64_t kChannels, class T>
-NMR_INLINE void add_place_gradient(const Taps<T>& taps, const Grid& grid, const T* texels, T share, const T* grad,
+NMR_INLINE void add_place_gradient(const BilinearTaps<T>& taps, const Grid& grid, const T* texels, T share, const T* grad,
                                    int64_t C, T& grad_u, T& grad_v) {
   const T *a = texels + taps.texel(0) * C, *b = texels + taps.texel(1) * C;
   const T *c = texels + taps.texel(2) * C, *d = texels + taps.texel(3) * C;
@@ -346,10 +346,10 @@ void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>&
     const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
     const T *weights = at.weights + 3 * n, *grad = args.grad_colors + n * C;
     const Place<T> place = place_of(uv, corners, weights);
-    const Blend<T> blend = blend_of(args, b, n);
+    const MipBlend<T> blend = blend_of(args, b, n);
     T grad_u = 0, grad_v = 0;
     for (int l = 0; l < blend.count; ++l) {
-      const Taps<T> taps = taps_of(blend.grid[l], place, args.wrap);
+      const BilinearTaps<T> taps = taps_of(blend.grid[l], place, args.wrap);
       if (direct) add_texel_gradients<kChannels>(taps, blend.share[l], grad, C, 0, args.num_texels, args.grad_texels);
       if (rows)
         for (int k = 0; k < 2; ++k) rows[n * per_pixel + 2 * l + k] = static_cast<int32_t>(taps.row[k]);
@@ -389,7 +389,7 @@ void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first,
       const int64_t id = at.face_index[n];
       const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
       const Place<T> place = place_of(at.attributes + 2 * image.first_row, corners, at.weights + 3 * n);
-      const Blend<T> blend = blend_of(args, b, n);
+      const MipBlend<T> blend = blend_of(args, b, n);
       for (int l = 0; l < blend.count; ++l)
         add_texel_gradients<kChannels>(taps_of(blend.grid[l], place, args.wrap), blend.share[l],
                                        args.grad_colors + n * C, C, first, last, args.grad_texels);
@@ -417,7 +417,7 @@ void sample_uv_forward(const SampleUV<T>& args) {
           continue;
         }
         const Place<T> place = place_of(uv, image.corners + 3 * (id < F ? id : id - F), at.weights + 3 * n);
-        const Blend<T> blend = blend_of(args, b, n);
+        const MipBlend<T> blend = blend_of(args, b, n);
         add_taps<kChannels, false>(taps_of(blend.grid[0], place, args.wrap), args.texels, blend.share[0], C, color);
         if (blend.count == 2)
           add_taps<kChannels, true>(taps_of(blend.grid[1], place, args.wrap), args.texels, blend.share[1], C, color);

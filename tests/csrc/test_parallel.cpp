@@ -47,10 +47,10 @@ TEST(parallel_for_exceptions_reach_the_caller) {
 TEST(a_caller_that_waited_in_vain_works_alone_for_a_while) {
   const int64_t ms = 1000000;
   const auto wants = [&](int64_t waited, int64_t worked, int64_t stopped) {
-    Company company;
-    CHECK(company.wanted());
-    company.judge(Company::now() - waited, worked, stopped);
-    return company.wanted();
+    OversubscriptionGuard guard;
+    CHECK(guard.allows_threads());
+    guard.record_wait(OversubscriptionGuard::now() - waited, worked, stopped);
+    return guard.allows_threads();
   };
   CHECK(!wants(20 * ms, 0, 0));                // the other thread had no core to begin on
   CHECK(!wants(20 * ms, 30 * ms, 15 * ms));    // it lost its core
