@@ -1,5 +1,6 @@
-// Work on a face index map in blocks of raster rows, with sums that do not depend on the number of threads: the blocks
-// depend only on the sizes, each block has its own sum, and the sums are added in the order of the blocks.
+// Work on a face index map in blocks of raster rows, with sums that do not depend on the number of
+// threads: the blocks depend only on the sizes, each block has its own sum, and the sums are added
+// in the order of the blocks.
 #pragma once
 
 #include <algorithm>
@@ -13,14 +14,15 @@
 
 namespace nmr {
 
-// The rows of one image, in blocks. Each has an even number of rows, so that every 2x2 mean is within one block.
+// The rows of one image, in blocks. Each has an even number of rows, so that every 2x2 mean is
+// within one block.
 struct RowBlocks {
   Size raster;
-  int64_t rows;         // per block
+  int64_t rows;  // per block
   int64_t count;
 
-  // A block has at least 2^14 pixels, and at least half as many pixels as there are faces, because it reads every
-  // face's mark.
+  // A block has at least 2^14 pixels, and at least half as many pixels as there are faces, because
+  // it reads every face's mark.
   RowBlocks(Size raster, int64_t num_faces) : raster(raster) {
     const int64_t pixels = std::max<int64_t>(int64_t(1) << 14, num_faces / 2);
     rows = (pixels + raster.width - 1) / raster.width;
@@ -30,14 +32,17 @@ struct RowBlocks {
   int64_t first(int64_t block) const { return block * rows; }
   int64_t last(int64_t block) const { return std::min(first(block) + rows, raster.height); }
   // Largest number of faces (originals and copies) that can own a pixel of one block.
-  int64_t most_visible(int64_t num_faces) const { return std::min(2 * num_faces, rows * raster.width); }
+  int64_t most_visible(int64_t num_faces) const {
+    return std::min(2 * num_faces, rows * raster.width);
+  }
 };
 
 // The faces that own a pixel, numbered from 1 in ascending order; the background is number 0.
 struct VisibleFaces {
-  std::vector<uint8_t> seen;   // [2 F + 1 + 8] by face index + 1
-  std::vector<int32_t> slots;  // [2 F + 1 + 8] number of face index id at [id + 1]; defined only for visible faces
-  std::vector<int32_t> ids;    // [count] face indices; ids[0] = -1
+  std::vector<uint8_t> seen;  // [2 F + 1 + 8] by face index + 1
+  std::vector<int32_t>
+      slots;  // [2 F + 1 + 8] number of face index id at [id + 1]; defined only for visible faces
+  std::vector<int32_t> ids;  // [count] face indices; ids[0] = -1
   int64_t count;
 
   void reserve_for(int64_t num_faces, int64_t most_visible) {
@@ -72,12 +77,13 @@ struct VisibleFaces {
   }
 };
 
-// Calls produce(b, block, result) for every block of every image, on several threads, and then consume(b, result) for
-// each block. Blocks that add to the same output are consumed one after the other, in ascending order of (b, block).
-// Each image has its own output, unless the images share one. block_count(b) is the number of blocks of image b.
+// Calls produce(b, block, result) for every block of every image, on several threads, and then
+// consume(b, result) for each block. Blocks that add to the same output are consumed one after the
+// other, in ascending order of (b, block). Each image has its own output, unless the images share
+// one. block_count(b) is the number of blocks of image b.
 template <class Result, class BlockCount, class Produce, class Consume>
-void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count, const Produce& produce,
-                const Consume& consume) {
+void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count,
+                const Produce& produce, const Consume& consume) {
   const ScratchUse use;
   if (!shared && batch >= num_threads) {
     parallel_for(batch, num_threads, [&](int64_t b) {
@@ -91,7 +97,8 @@ void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& b
   }
   // All threads produce a group of blocks, which are then consumed in order.
   std::vector<Result>& results = thread_scratch<std::vector<Result>>();
-  std::vector<std::pair<int64_t, int64_t>>& tasks = thread_scratch<std::vector<std::pair<int64_t, int64_t>>>();
+  std::vector<std::pair<int64_t, int64_t>>& tasks =
+      thread_scratch<std::vector<std::pair<int64_t, int64_t>>>();
   tasks.clear();
   const auto flush = [&] {
     if (results.size() < tasks.size()) results.resize(tasks.size());
@@ -126,8 +133,8 @@ struct FaceGradients {
 
 // Adds these gradients to the vertices of one image (faces [F, 3]).
 template <class T>
-void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* faces, int64_t num_faces,
-                            T* grad_vertices) {
+void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* faces,
+                            int64_t num_faces, T* grad_vertices) {
   const T* value = gradients.values.data();
   for (int64_t n = 0; n < gradients.count; ++n) {
     const bool reversed = gradients.ids[n] >= num_faces;

@@ -1,4 +1,5 @@
-// World space to renderer space, forward and backward. (The published renderer uses a chain of tensor operations.)
+// World space to renderer space, forward and backward. (The published renderer uses a chain of
+// tensor operations.)
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -11,33 +12,47 @@
 namespace nmr {
 namespace {
 
-constexpr int kGroup = 16;  // vertices processed together, and partial sums per gradient; the same on every processor
+constexpr int kGroup =
+    16;  // vertices processed together, and partial sums per gradient; the same on every processor
 constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
-constexpr int kSums = 12 + 6 + 8;        // sums over vertices per camera: gradients of [A | t], K, distortion
-constexpr int kTotals = kSums + 3 + 1;   // plus the gradients of origin and extent, which follow from the sums
+constexpr int kSums =
+    12 + 6 + 8;  // sums over vertices per camera: gradients of [A | t], K, distortion
+constexpr int kTotals =
+    kSums + 3 + 1;  // plus the gradients of origin and extent, which follow from the sums
 
-// Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small enough that sums
-// cannot overflow.
-template <class T> constexpr T kLimit = T(1e200);
-template <> constexpr float kLimit<float> = 1e30f;
+// Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small
+// enough that sums cannot overflow.
+template <class T>
+constexpr T kLimit = T(1e200);
+template <>
+constexpr float kLimit<float> = 1e30f;
 
 // The camera of one image.
 template <class T>
 struct Lens {
   T a[12], k[6], d[kMostCoefficients], o[3], extent, inverse_extent;
-  T reach2;                           // largest r^2 at which the distortion is that of a lens
-  T largest_a, largest_k, largest_d;  // largest |a|, |k / extent|, |d|; the first and the last at least 1
-  bool usable;                        // all of it is finite, and extent is not 0
+  T reach2;  // largest r^2 at which the distortion is that of a lens
+  T largest_a, largest_k,
+      largest_d;  // largest |a|, |k / extent|, |d|; the first and the last at least 1
+  bool usable;    // all of it is finite, and extent is not 0
 
   Lens(const Project<T>& args, int64_t b)
-      : d{}, o{}, extent(1), reach2(std::numeric_limits<T>::infinity()), largest_a(1), largest_k(0), largest_d(1), usable(true) {
+      : d{},
+        o{},
+        extent(1),
+        reach2(std::numeric_limits<T>::infinity()),
+        largest_a(1),
+        largest_k(0),
+        largest_d(1),
+        usable(true) {
     const T* camera = args.camera + (args.camera_each ? kCamera * b : 0);
     std::copy_n(camera, 12, a);
     std::copy_n(camera + kIntrinsics, 6, k);
     std::copy_n(camera + kOrigin, 3, o);
     extent = camera[kExtent];
     if (args.distortion)
-      std::copy_n(args.distortion + (args.distortion_each ? args.coefficients * b : 0), args.coefficients, d);
+      std::copy_n(args.distortion + (args.distortion_each ? args.coefficients * b : 0),
+                  args.coefficients, d);
     inverse_extent = 1 / extent;
     for (T value : a) largest_a = std::max(largest_a, std::abs(value));
     for (T value : k) largest_k = std::max(largest_k, std::abs(value * inverse_extent));
@@ -49,7 +64,9 @@ struct Lens {
     usable = usable && std::isfinite(extent) && std::isfinite(inverse_extent);
     if (!args.distortion || !args.perspective || !usable) return;
     const int64_t n = args.coefficients;
-    reach2 = static_cast<T>(n == 4 ? square_reach<4>(d) : n == 5 ? square_reach<5>(d) : square_reach<8>(d));
+    reach2 = static_cast<T>(n == 4   ? square_reach<4>(d)
+                            : n == 5 ? square_reach<5>(d)
+                                     : square_reach<8>(d));
   }
 };
 
@@ -90,7 +107,8 @@ const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch)
 template <class T>
 void write(const double* sum, int count, T* grad, int64_t place) {
   const double largest = std::numeric_limits<T>::max();
-  for (int k = 0; k < count && grad; ++k) grad[place + k] = static_cast<T>(std::clamp(sum[k], -largest, largest));
+  for (int k = 0; k < count && grad; ++k)
+    grad[place + k] = static_cast<T>(std::clamp(sum[k], -largest, largest));
 }
 
 template <class T>
@@ -121,7 +139,8 @@ void project_backward(const Project<T>& args) {
   if (args.batch == 0 && args.grad_vertices)
     std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
 
-  // If all images share the vertices, each chunk of vertices belongs to one task, which visits the images in order.
+  // If all images share the vertices, each chunk of vertices belongs to one task, which visits the
+  // images in order.
   const bool shared = !args.starts && args.vertex_batch == 1 && args.batch > 1;
   const int64_t images = shared ? args.batch : 1, tasks = num_runs / images;
   parallel_for(tasks, args.num_threads, [&](int64_t task) {
@@ -143,10 +162,13 @@ void project_backward(const Project<T>& args) {
       for (int k = 0; k < kTotals; ++k) sum[k] += totals[r * kTotals + k];
     for (int k = 0; k < kTotals; ++k) of_all[k] += sum[k];
     if (args.camera_each) write_camera(sum, args.grad_camera, b);
-    if (args.distortion_each) write(sum + 18, static_cast<int>(args.coefficients), args.grad_distortion, args.coefficients * b);
+    if (args.distortion_each)
+      write(sum + 18, static_cast<int>(args.coefficients), args.grad_distortion,
+            args.coefficients * b);
   }
   if (!args.camera_each) write_camera(of_all, args.grad_camera, 0);
-  if (!args.distortion_each) write(of_all + 18, static_cast<int>(args.coefficients), args.grad_distortion, 0);
+  if (!args.distortion_each)
+    write(of_all + 18, static_cast<int>(args.coefficients), args.grad_distortion, 0);
 }
 
 template void project_forward(const Project<float>&);

@@ -1,10 +1,12 @@
-// Near-plane clipping: which faces are drawn in place of those that cross the plane z = near. Only the topology is
-// decided here; nmr/_clip.py, which knows the camera, computes the new vertices.
+// Near-plane clipping: which faces are drawn in place of those that cross the plane z = near. Only
+// the topology is decided here; nmr/_clip.py, which knows the camera, computes the new vertices.
 //
-// A face with one corner in front becomes one triangle, a face with two becomes two triangles. The new vertices lie on
-// the two edges that cross the plane. Faces wholly in front stay as they are, faces wholly behind are left out. A mesh
-// stays as it is if no face is cut and none could be drawn wrongly (`any_around_eye`). Each cut face has new vertices of its own. Neighbours name the ends of their common edge in the same order, so their new
-// vertices have the same bits and leave no gap.
+// A face with one corner in front becomes one triangle, a face with two becomes two triangles. The
+// new vertices lie on the two edges that cross the plane. Faces wholly in front stay as they are,
+// faces wholly behind are left out. A mesh stays as it is if no face is cut and none could be drawn
+// wrongly (`any_around_eye`). Each cut face has new vertices of its own. Neighbours name the ends
+// of their common edge in the same order, so their new vertices have the same bits and leave no
+// gap.
 #include <algorithm>
 
 #include "geometry.h"
@@ -51,15 +53,16 @@ NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face, T near) {
   return ordered ? sides : Sides{};
 }
 
-// Whether some face lies wholly behind the near plane, and crosses or touches the plane of the eye. Its interpolated
-// depths are meaningless, and could pass the test against `near`.
+// Whether some face lies wholly behind the near plane, and crosses or touches the plane of the eye.
+// Its interpolated depths are meaningless, and could pass the test against `near`.
 template <class T>
 bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
   const T* vertices = mesh.image_vertices(b);
   for (int64_t f = 0; f < mesh.face_count(b); ++f) {
     const int64_t* face = mesh.image_faces(b) + 3 * f;
     if (sides_of(vertices, face, near).count != 3) continue;
-    const T z0 = vertices[3 * face[0] + 2], z1 = vertices[3 * face[1] + 2], z2 = vertices[3 * face[2] + 2];
+    const T z0 = vertices[3 * face[0] + 2], z1 = vertices[3 * face[1] + 2],
+            z2 = vertices[3 * face[2] + 2];
     if (min3(z0, z1, z2) <= 0 && max3(z0, z1, z2) >= 0) return true;
   }
   return false;
@@ -97,7 +100,8 @@ void clip_faces(const ClipFaces<T>& args) {
     const int64_t first_vertex = args.starts[2 * b], last_vertex = args.starts[2 * b + 2];
     const int64_t first_face = args.starts[2 * b + 1], last_face = args.starts[2 * b + 3];
     int64_t p = first_vertex, n = first_face;
-    // The new vertex on the edge between corners i and j of a face: its number among the new vertices of the mesh.
+    // The new vertex on the edge between corners i and j of a face: its number among the new
+    // vertices of the mesh.
     const auto cut_edge = [&](const int64_t* face, int i, int j) {
       if (face[i] > face[j]) std::swap(i, j);
       int64_t* end = args.ends + 4 * p;

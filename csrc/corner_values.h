@@ -1,5 +1,5 @@
-// Shared by the stages that read values at the corners of faces: loops over pixels, the rows of an image's values, and
-// sums per corner.
+// Shared by the stages that read values at the corners of faces: loops over pixels, the rows of an
+// image's values, and sums per corner.
 #pragma once
 
 #include <algorithm>
@@ -24,19 +24,23 @@ void for_rows(int64_t batch, int64_t height, int num_threads, const Body& body) 
   });
 }
 
-// Whether loops over 1, 3 and 4 channels are compiled for these numbers. Not for double, which gains nothing from it.
+// Whether loops over 1, 3 and 4 channels are compiled for these numbers. Not for double, which
+// gains nothing from it.
 template <class T>
 constexpr bool kOwnChannels = std::is_same_v<T, float>;
 
-// Calls body(c) with c the number of channels as a compile-time constant if it is 1, 3 or 4 and T has such copies, and
-// with c = 0 otherwise.
+// Calls body(c) with c the number of channels as a compile-time constant if it is 1, 3 or 4 and T
+// has such copies, and with c = 0 otherwise.
 template <class T, class Body>
 void with_channels(int64_t channels, const Body& body) {
   if constexpr (kOwnChannels<T>) {
     switch (channels) {
-      case 1: return body(std::integral_constant<int64_t, 1>());
-      case 3: return body(std::integral_constant<int64_t, 3>());
-      case 4: return body(std::integral_constant<int64_t, 4>());
+      case 1:
+        return body(std::integral_constant<int64_t, 1>());
+      case 3:
+        return body(std::integral_constant<int64_t, 3>());
+      case 4:
+        return body(std::integral_constant<int64_t, 4>());
     }
   }
   body(std::integral_constant<int64_t, 0>());
@@ -69,8 +73,8 @@ struct CornerSums {
 
 // Adds these sums to the rows of attributes at the corners.
 template <class T>
-void scatter_corner_sums(const CornerSums<T>& sums, const ImageAttributes<T>& image, int64_t channels,
-                         T* grad_attributes) {
+void scatter_corner_sums(const CornerSums<T>& sums, const ImageAttributes<T>& image,
+                         int64_t channels, T* grad_attributes) {
   const int64_t C = channels, F = image.num_faces;
   const T* value = sums.values.data() + 3 * C;  // skips the background's
   for (int64_t n = 1; n < sums.visible.count; ++n) {

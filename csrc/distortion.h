@@ -1,11 +1,13 @@
 // OpenCV's lens distortion: p -> q, both at depth 1.
 //
-//   5 or 8 coefficients:  q = m p + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y),  r = |p|,
+//   5 or 8 coefficients:  q = m p + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y),  r
+//   = |p|,
 //                         m = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
 //   4, a fisheye:         q = m p,  m = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) / r,  a = atan(r)
 //
-// These formulas are those of a lens up to the radius at which q turns back. Beyond it (`reach`) the image goes on
-// straight, q(c) + p - c with c the nearest p within, so that nothing is folded into the image.
+// These formulas are those of a lens up to the radius at which q turns back. Beyond it (`reach`)
+// the image goes on straight, q(c) + p - c with c the nearest p within, so that nothing is folded
+// into the image.
 #pragma once
 
 #include <cmath>
@@ -18,7 +20,8 @@ namespace nmr {
 
 constexpr int kFisheye = 4, kRational = 8, kMostCoefficients = 8;
 
-// atan(r) for r >= 0, by operations that round alike on every processor: the angle is halved three times, then a series.
+// atan(r) for r >= 0, by operations that round alike on every processor: the angle is halved three
+// times, then a series.
 template <class T>
 NMR_INLINE T arc_tangent(T r) {
   constexpr int kTerms = sizeof(T) == sizeof(double) ? 11 : 6;
@@ -48,7 +51,8 @@ NMR_INLINE Radial<T> radial_of(const T* d, T r2) {
     s.per_r = centre ? T(1) : a / r;
     const T a2 = s.angle2;
     s.m = s.per_r * (1 + a2 * (d[0] + a2 * (d[1] + a2 * (d[2] + a2 * d[3]))));
-    const T turn = 1 + a2 * (3 * d[0] + a2 * (5 * d[1] + a2 * (7 * d[2] + a2 * (9 * d[3]))));  // d (m r) / d a
+    const T turn =
+        1 + a2 * (3 * d[0] + a2 * (5 * d[1] + a2 * (7 * d[2] + a2 * (9 * d[3]))));  // d (m r) / d a
     s.slope = centre ? d[0] - T(1) / 3 : (turn / (1 + r2) - s.m) / (2 * r2);
     return s;
   }
@@ -71,7 +75,8 @@ double square_reach(const T* coefficients) {
   // Whether a bound from below of the derivative of |q| by r is positive, and no pole is near.
   const auto outwards = [&](double r) {
     const Radial<double> s = radial_of<kCoefficients>(d, r * r);
-    if (!(s.m > 0) || (kCoefficients == kRational && !(s.inverse > 0 && s.inverse < 1e3))) return false;
+    if (!(s.m > 0) || (kCoefficients == kRational && !(s.inverse > 0 && s.inverse < 1e3)))
+      return false;
     return s.m + 2 * s.slope * r * r > tangential * r;
   };
   double inside = 0;

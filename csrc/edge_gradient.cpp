@@ -1,21 +1,24 @@
-// NMR's gradient (Kato et al. 2018) of a silhouette, or of an image with any number of channels. For every edge of a
-// visible face and every line of pixels (a column or a row) that crosses it, let c be the crossing, `inner` the pixel
-// just inside and `outer` the pixel just outside:
-//   outside: if the face owns `inner`, each pixel m from `outer` to the border would become I(inner) if the edge moved
+// NMR's gradient (Kato et al. 2018) of a silhouette, or of an image with any number of channels.
+// For every edge of a visible face and every line of pixels (a column or a row) that crosses it,
+// let c be the crossing, `inner` the pixel just inside and `outer` the pixel just outside:
+//   outside: if the face owns `inner`, each pixel m from `outer` to the border would become
+//   I(inner) if the edge moved
 //            out to it;
 //   inside:  each pixel m of the face would become I(outer) if the edge moved in past it.
-// If this lowers the loss, D = sum over channels of (I(m) - I(inner or outer)) g(m) > 0, then m pulls both ends of the
-// edge with D / (distance they must travel). A silhouette is an image with I = 1 on faces and 0 on the background.
-// Columns move y, rows move x. If a gradient of an image is not finite, those of all its visible faces are NaN.
+// If this lowers the loss, D = sum over channels of (I(m) - I(inner or outer)) g(m) > 0, then m
+// pulls both ends of the edge with D / (distance they must travel). A silhouette is an image with I
+// = 1 on faces and 0 on the background. Columns move y, rows move x. If a gradient of an image is
+// not finite, those of all its visible faces are NaN.
 //
-// Only faces that own a pixel of a line have a part in it. So the work goes by runs: the longest stretches of pixels
-// of a line with one face. Runs come in the order of the line, and eight of them share its list of pulling pixels.
-// Columns are the rows of the transposed face index map.
+// Only faces that own a pixel of a line have a part in it. So the work goes by runs: the longest
+// stretches of pixels of a line with one face. Runs come in the order of the line, and eight of
+// them share its list of pulling pixels. Columns are the rows of the transposed face index map.
 //
 // With s the coordinate across the lines and t along them, edge P-Q crosses line n of M pixels at
 //   c = (Qt - Pt) / (Qs - Ps) (n - Ps) + Pt.
-// If P moves by 1 (in [-1, 1] coordinates), c moves by r = (Qs - n) / (Qs - Ps) M / 2 pixels; so P must travel
-// |m - c| / |r| to reach m. `eps` is added to that, and D / (|m - c| / |r| + eps) = D |r| / (|m - c| + eps |r|).
+// If P moves by 1 (in [-1, 1] coordinates), c moves by r = (Qs - n) / (Qs - Ps) M / 2 pixels; so P
+// must travel |m - c| / |r| to reach m. `eps` is added to that, and D / (|m - c| / |r| + eps) = D
+// |r| / (|m - c| + eps |r|).
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -35,14 +38,16 @@ namespace {
 constexpr int64_t kCoverage = -1;  // in place of a number of channels: a silhouette
 constexpr int64_t kGroup = 16;     // lines that are read together: columns of one cache line
 constexpr int64_t kPad = 8;        // values behind the pixels of a line that vectors may touch
-constexpr int64_t kEntry = 16;     // numbers per face: x of its corners in pixels, y, gradients of x, of y; four of each
+constexpr int64_t kEntry =
+    16;  // numbers per face: x of its corners in pixels, y, gradients of x, of y; four of each
 
 // Pixels first, ..., last - 1 of a line.
 struct PixelRange {
   int64_t first, last;
 };
 
-// The columns and the rows (from the top) that contain the vertices, and so all that is drawn; within the raster.
+// The columns and the rows (from the top) that contain the vertices, and so all that is drawn;
+// within the raster.
 struct Reach {
   PixelRange columns, rows;
 };
@@ -56,7 +61,8 @@ Reach reach_of(const T* vertices, int64_t count, Size raster) {
       high[k] = std::max(high[k], vertices[3 * v + k]);
     }
   const auto pixels = [](T from, T to, int64_t size) {  // one more on both sides
-    const T n = static_cast<T>(size), first = to_pixel(std::max(from, T(-2)), n), last = to_pixel(std::min(to, T(2)), n);
+    const T n = static_cast<T>(size), first = to_pixel(std::max(from, T(-2)), n),
+            last = to_pixel(std::min(to, T(2)), n);
     return PixelRange{std::clamp<int64_t>(static_cast<int64_t>(first) - 1, 0, size),
                       std::clamp<int64_t>(static_cast<int64_t>(last) + 3, 0, size)};
   };
@@ -76,7 +82,7 @@ struct EdgeImage {
   const T* grad;              // [h, w, C]
   int64_t channels;           // C; 1 of a silhouette
   const T* pixels;            // [H, W, C], or nullptr: a silhouette
-  const T* background;        // [C] the colour of pixels without a face, or nullptr: that in `pixels`
+  const T* background;  // [C] the colour of pixels without a face, or nullptr: that in `pixels`
   Reach reach;
 };
 
@@ -86,8 +92,8 @@ struct LineRange {
   bool columns;
 };
 
-// First and last pixels of runs; their face indices, then the numbers of these faces in EdgeSums. Each line's runs are
-// filled up to a multiple of eight by runs of the background.
+// First and last pixels of runs; their face indices, then the numbers of these faces in EdgeSums.
+// Each line's runs are filled up to a multiple of eight by runs of the background.
 struct RunList {
   int32_t *first, *last, *face;
 };
@@ -101,10 +107,10 @@ struct LineGroup {
   const int32_t* face_index;  // [count, face_stride]
   int64_t face_stride;
   RunList runs;
-  int64_t* runs_end;      // [count] the end of each line's
-  int32_t* transposed;    // [count, stride] memory for columns
-  T *colors, *grads;      // [count, C, stride]; with anti-aliasing, two lines share their gradients
-  T* half_grads;          // with anti-aliasing: [count / 2, C, stride] gradients of the image
+  int64_t* runs_end;    // [count] the end of each line's
+  int32_t* transposed;  // [count, stride] memory for columns
+  T *colors, *grads;    // [count, C, stride]; with anti-aliasing, two lines share their gradients
+  T* half_grads;        // with anti-aliasing: [count / 2, C, stride] gradients of the image
 };
 
 // One line.
@@ -148,8 +154,8 @@ struct EdgeScratch {
   // Memory for lines of up to `longest` pixels.
   LineGroup<T> reserve_group(const EdgeImage<T>& image, int64_t longest) {
     const int64_t C = image.channels, stride = (longest + 7) / 8 * 8 + kPad, size = kGroup * stride;
-    list = {reserve(position, stride + kPad) + kPad, reserve(weight, stride), reserve(pixel, stride),
-            reserve(near_colors, 8 * C)};
+    list = {reserve(position, stride + kPad) + kPad, reserve(weight, stride),
+            reserve(pixel, stride), reserve(near_colors, 8 * C)};
     return {{},
             0,
             stride,
@@ -176,8 +182,8 @@ namespace {
 
 // Numbers the faces of `count` runs, and writes the corners of new ones.
 template <class T>
-void number_faces(const EdgeImage<T>& image, const RunList& runs, int64_t count, EdgeScratch<T>& scratch,
-                  EdgeSums<T>& sums) {
+void number_faces(const EdgeImage<T>& image, const RunList& runs, int64_t count,
+                  EdgeScratch<T>& scratch, EdgeSums<T>& sums) {
   int32_t *numbers = scratch.numbers.data() + 1, *ids = sums.ids.data(), *face_of_run = runs.face;
   int32_t found = static_cast<int32_t>(sums.count);
   for (int64_t r = 0; r < count; ++r) {
@@ -216,14 +222,16 @@ struct EdgeBands {
   LineRange band(int64_t task, bool in_columns, const PixelRange& reached) const {
     const int64_t width = in_columns ? columns : rows.rows;
     const int64_t first = std::max(task * width, reached.first / 2 * 2);
-    const int64_t last = std::min(reached.last + reached.last % 2, in_columns ? rows.raster.width : rows.raster.height);
+    const int64_t last = std::min(reached.last + reached.last % 2,
+                                  in_columns ? rows.raster.width : rows.raster.height);
     return {first, std::min((task + 1) * width, last) - first, in_columns};
   }
 };
 
 // The sums of one task. If a gradient of the image is not finite, they are NaN.
 template <class T>
-void sum_bands(const EdgeImage<T>& image, const EdgeBands& bands, int64_t task, bool finite, EdgeSums<T>& sums) {
+void sum_bands(const EdgeImage<T>& image, const EdgeBands& bands, int64_t task, bool finite,
+               EdgeSums<T>& sums) {
   const Size raster = image.raster;
   const int64_t entries = 2 * image.num_faces + 1;
   const int64_t most =
@@ -232,7 +240,8 @@ void sum_bands(const EdgeImage<T>& image, const EdgeBands& bands, int64_t task, 
   LineGroup<T> group = scratch.reserve_group(image, std::max(raster.width, raster.height));
   std::fill_n(reserve(scratch.numbers, entries), entries, -1);
   reserve(sums.ids, most + 1);  // one may be written behind the last
-  std::fill_n(reserve(sums.entries, most * kEntry), kEntry, T(0));  // of the background: a point, which no line crosses
+  std::fill_n(reserve(sums.entries, most * kEntry), kEntry,
+              T(0));  // of the background: a point, which no line crosses
   scratch.numbers[0] = 0;
   sums.count = 1;
   for (const bool columns : {false, true}) {
@@ -258,12 +267,14 @@ void sum_bands(const EdgeImage<T>& image, const EdgeBands& bands, int64_t task, 
         });
     }
   }
-  if (!finite) std::fill_n(sums.entries.data(), sums.count * kEntry, std::numeric_limits<T>::quiet_NaN());
+  if (!finite)
+    std::fill_n(sums.entries.data(), sums.count * kEntry, std::numeric_limits<T>::quiet_NaN());
 }
 
 // Gradients of all images; image_of(b) describes one.
 template <class T, class ImageOf>
-void sum_edges(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads, const ImageOf& image_of) {
+void sum_edges(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads,
+               const ImageOf& image_of) {
   std::vector<char> finite(mesh.batch);
   std::vector<Reach> reach(mesh.batch);
   parallel_for(mesh.batch, num_threads, [&](int64_t b) {
@@ -320,11 +331,12 @@ auto edge_image(const Args& args, int64_t b) {
 
 template <class T>
 void silhouette_backward(const SilhouetteBackward<T>& args) {
-  sum_edges(args.mesh, raster_of(args.image, args.anti_aliasing), args.grad_vertices, args.num_threads, [&](int64_t b) {
-    EdgeImage<T> image = edge_image(args, b);
-    image.grad = args.grad_alpha + b * args.image.pixels();
-    return image;
-  });
+  sum_edges(args.mesh, raster_of(args.image, args.anti_aliasing), args.grad_vertices,
+            args.num_threads, [&](int64_t b) {
+              EdgeImage<T> image = edge_image(args, b);
+              image.grad = args.grad_alpha + b * args.image.pixels();
+              return image;
+            });
 }
 
 template <class T>
@@ -335,7 +347,9 @@ void edges_backward(const EdgesBackward<T>& args) {
     image.channels = args.channels;
     image.grad = args.grad_resolved + b * args.image.pixels() * args.channels;
     image.pixels = args.pixels + b * raster.pixels() * args.channels;
-    image.background = args.background ? args.background + (args.background_batch == 1 ? 0 : b * args.channels) : nullptr;
+    image.background = args.background
+                           ? args.background + (args.background_batch == 1 ? 0 : b * args.channels)
+                           : nullptr;
     return image;
   });
 }

@@ -1,11 +1,14 @@
-// The inner loops of the rasterizer; included by levels.h for every instruction set. See rasterize.cpp.
+// The inner loops of the rasterizer; included by levels.h for every instruction set. See
+// rasterize.cpp.
 
-static_assert(kLanes == kTogether, "a vector holds the faces of a block and a row of a block of pixels");
+static_assert(kLanes == kTogether,
+              "a vector holds the faces of a block and a row of a block of pixels");
 
 // --- set-up
 
-// The first and the last of `size` pixels along one axis whose centres lie in [lo, hi]: a face covers no centre
-// outside its bounding box. (The published kernels test every pixel, and draw wrong pixels for very thin faces.)
+// The first and the last of `size` pixels along one axis whose centres lie in [lo, hi]: a face
+// covers no centre outside its bounding box. (The published kernels test every pixel, and draw
+// wrong pixels for very thin faces.)
 template <class T>
 NMR_INLINE void pixel_range(Lanes<T> lo, Lanes<T> hi, T size, Lanes32& first, Lanes32& last) {
   const Lanes<T> length = splat(size), below = splat(T(-2)), above = splat(size + 1);
@@ -13,44 +16,50 @@ NMR_INLINE void pixel_range(Lanes<T> lo, Lanes<T> hi, T size, Lanes32& first, La
   const Lanes32 f = truncate(select(from > below, select(from < above, from, above), below));
   const Lanes32 l = truncate(select(to > below, select(to < above, to, above), below));
   const Lanes32 one = splat(int32_t(1)), n = splat(static_cast<int32_t>(size));
-  // The error of pixel_coordinates is much less than one pixel: compare the two centres around it. A mask is -1 where
-  // it is set.
+  // The error of pixel_coordinates is much less than one pixel: compare the two centres around it.
+  // A mask is -1 where it is set.
   const Lanes32 from_left = f + f + one - n, to_left = l + l + one - n, two = splat(int32_t(2));
-  const Lanes32 a =
-      f - narrow_mask(to_values<T>(from_left) / length < lo) - narrow_mask(to_values<T>(from_left + two) / length < lo);
+  const Lanes32 a = f - narrow_mask(to_values<T>(from_left) / length < lo) -
+                    narrow_mask(to_values<T>(from_left + two) / length < lo);
   const Lanes32 b = l - one - narrow_mask(to_values<T>(to_left) / length <= hi) -
                     narrow_mask(to_values<T>(to_left + two) / length <= hi);
   first = max_of(a, splat(int32_t(0)));
   last = min_of(b, n - one);
 }
 
-// Bounds of q = 1 / depth, or -depth without perspective: level + slope_x i + slope_y j +- margin at any pixel (i, j) inside a face, and `nearest`,
-// the largest q.
+// Bounds of q = 1 / depth, or -depth without perspective: level + slope_x i + slope_y j +- margin
+// at any pixel (i, j) inside a face, and `nearest`, the largest q.
 template <class T>
 struct DepthBound {
   Lanes<T> slope_x, slope_y, level, margin, nearest;
 };
 
-// For faces with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of width x height pixels.
+// For faces with corners (x, y, z), whose depths lie in [lo, hi], lo > 0, on a raster of width x
+// height pixels.
 //
-// The published weights come from the inverse of a matrix, clamped and normalised: q' = sum w_k / z_k. Let u be the
-// unit roundoff, D twice the area in pixels and M the largest pixel coordinate (half the longer side at least). To
-// first order, the errors are:
-// - of the determinant 12 u M L, with L <= 2 M the longest side, the same for all three weights; of each weight
+// The published weights come from the inverse of a matrix, clamped and normalised: q' = sum w_k /
+// z_k. Let u be the unit roundoff, D twice the area in pixels and M the largest pixel coordinate
+// (half the longer side at least). To first order, the errors are:
+// - of the determinant 12 u M L, with L <= 2 M the longest side, the same for all three weights; of
+// each weight
 //   32 u M^2 / D more;
 // - a pixel that passes the edge test may be outside by 48 u M^2 / D in terms of weights;
-// - so each weight before normalisation is off by at most E = 110 u M^2 / D, and all weights together after it by
+// - so each weight before normalisation is off by at most E = 110 u M^2 / D, and all weights
+// together after it by
 //   7.1 E (if E is small);
-// - q' is off by half of that times the range of q at the corners, and by 8 u q for its own rounding;
-// - the plane below adds 80 u M^2 / D times the range and 8 u q, because its coefficients are computed in double and
+// - q' is off by half of that times the range of q at the corners, and by 8 u q for its own
+// rounding;
+// - the plane below adds 80 u M^2 / D times the range and 8 u q, because its coefficients are
+// computed in double and
 //   rounded.
 // Without perspective q is -z, and the same holds with the largest |q| of the face for q.
-// The margin is larger than the sum: 640 u M^2 / D times the range, and 32 u q. If the bounds of two faces are
-// disjoint, their depths differ even after rounding. If E could be large, and for double, the bounds are those of the
-// corners: q' is a weighted mean of their q.
+// The margin is larger than the sum: 640 u M^2 / D times the range, and 32 u q. If the bounds of
+// two faces are disjoint, their depths differ even after rounding. If E could be large, and for
+// double, the bounds are those of the corners: q' is a weighted mean of their q.
 template <class T>
-NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)[3], const Lanes<T> (&z)[3],
-                                     Lanes<T> lo, Lanes<T> hi, T width, T height, bool perspective) {
+NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)[3],
+                                     const Lanes<T> (&z)[3], Lanes<T> lo, Lanes<T> hi, T width,
+                                     T height, bool perspective) {
   constexpr T eps = std::numeric_limits<T>::epsilon();
   const Lanes<T> zero = splat(T(0)), most = perspective ? splat(T(1)) / lo : zero - lo;
   const Lanes<T> least = perspective ? splat(T(1)) / hi : zero - hi, range = most - least;
@@ -59,18 +68,19 @@ NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)
   if constexpr (sizeof(T) < sizeof(double)) {
     using Wide = Lanes<double>;
     Wide X[3], Y[3], q[3];
-    Lanes<T> M =
-        splat((width > height ? width : height) / 2);  // even small pixel coordinates come from sums of this size
+    Lanes<T> M = splat((width > height ? width : height) /
+                       2);  // even small pixel coordinates come from sums of this size
     for (int k = 0; k < 3; ++k) {
-      const Lanes<T> px = pixel_coordinates<T>(x[k], splat(width)), py = pixel_coordinates<T>(y[k], splat(height));
+      const Lanes<T> px = pixel_coordinates<T>(x[k], splat(width)),
+                     py = pixel_coordinates<T>(y[k], splat(height));
       M = max_of(M, max_of(absolute<T>(px), absolute<T>(py)));
       X[k] = convert_lanes<Wide>(px);
       Y[k] = convert_lanes<Wide>(py);
       const Wide depth = convert_lanes<Wide>(z[k]);
       q[k] = perspective ? splat(1.0) / depth : splat(0.0) - depth;
     }
-    const Wide x1 = X[1] - X[0], x2 = X[2] - X[0], y1 = Y[1] - Y[0], y2 = Y[2] - Y[0], q1 = q[1] - q[0],
-               q2 = q[2] - q[0];
+    const Wide x1 = X[1] - X[0], x2 = X[2] - X[0], y1 = Y[1] - Y[0], y2 = Y[2] - Y[0],
+               q1 = q[1] - q[0], q2 = q[2] - q[0];
     const Wide D = x1 * y2 - x2 * y1, M2 = convert_lanes<Wide>(M) * convert_lanes<Wide>(M),
                unit = splat(double(eps)) * M2;
     const auto is_wide = absolute<double>(D) > splat(2048.0) * unit;
@@ -80,7 +90,8 @@ NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)
     const LaneMask<T> wide = share > zero;
     bound.slope_x = convert_lanes<Lanes<T>>(slope_x);
     bound.slope_y = convert_lanes<Lanes<T>>(slope_y);
-    bound.level = select(wide, convert_lanes<Lanes<T>>(q[0] - slope_x * X[0] - slope_y * Y[0]), bound.level);
+    bound.level =
+        select(wide, convert_lanes<Lanes<T>>(q[0] - slope_x * X[0] - slope_y * Y[0]), bound.level);
     bound.margin = select(wide, share * range + rounding, bound.margin);
   }
   return bound;
@@ -91,14 +102,18 @@ template <class T>
 void set_up_faces(const Image<T>& image, int64_t chunk) {
   FaceTable<T>& table = *image.table;
   const int64_t first = chunk * kChunk, last = std::min(first + kChunk, image.num_faces);
-  const T width = static_cast<T>(image.settings.raster.width), height = static_cast<T>(image.settings.raster.height);
+  const T width = static_cast<T>(image.settings.raster.width),
+          height = static_cast<T>(image.settings.raster.height);
   const T longer = width > height ? width : height, shorter = width > height ? height : width;
   const T near = image.settings.near, far = image.settings.far;
   const T* vertices = image.vertices;
-  const Lanes<T> infinity = splat(std::numeric_limits<T>::infinity()), zero = splat(T(0)), one = splat(T(1));
-  const T moderate = std::sqrt(std::numeric_limits<T>::max()) / 4;  // products of two pixel coordinates stay finite
+  const Lanes<T> infinity = splat(std::numeric_limits<T>::infinity()), zero = splat(T(0)),
+                 one = splat(T(1));
+  const T moderate = std::sqrt(std::numeric_limits<T>::max()) /
+                     4;  // products of two pixel coordinates stay finite
   const T eps = std::numeric_limits<T>::epsilon(), resolution = 288 * eps * (longer / shorter);
-  const T smallest = std::sqrt(std::numeric_limits<T>::min()) / eps;  // 1 / depth and its slopes stay ordinary numbers
+  const T smallest = std::sqrt(std::numeric_limits<T>::min()) /
+                     eps;  // 1 / depth and its slopes stay ordinary numbers
   const LaneMask<T> some_bounds = splat(near) >= zero;
   int64_t num_front = 0, num_back = 0;
   Lanes<T> front_sum = zero, back_sum = zero;
@@ -124,7 +139,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
       store_lanes(block.x[k], x[k]);
       store_lanes(block.y[k], y[k]);
     }
-    // Both orders are tested: for very thin faces, rounding can make both or neither counter-clockwise.
+    // Both orders are tested: for very thin faces, rounding can make both or neither
+    // counter-clockwise.
     const LaneMask<T> not_ccw = (y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0]);
     const LaneMask<T> not_cw = (y[0] - y[2]) * (x[1] - x[2]) < (y[1] - y[2]) * (x[0] - x[2]);
     Lanes<T> largest = one;
@@ -135,12 +151,14 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
       largest = max_of(max_of(ax, ay), largest);
     }
     const Lanes<T> lo = min_of(min_of(z[0], z[1]), z[2]), hi = max_of(max_of(z[0], z[1]), z[2]);
-    // No bounds for faces so thin that all three weights could round to 0, or close to the limits of T or of depth.
+    // No bounds for faces so thin that all three weights could round to 0, or close to the limits
+    // of T or of depth.
     const Lanes<T> det = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]);
-    const LaneMask<T> bounded = usable & some_bounds & (absolute<T>(det) >= splat(resolution) * largest * largest) &
-                                (largest * splat(longer) < splat(moderate)) & (lo * splat(1 - 16 * eps) > splat(near)) &
-                                (hi * splat(1 + 16 * eps) < splat(far)) & (lo > splat(smallest)) &
-                                (hi < splat(1 / smallest));
+    const LaneMask<T> bounded =
+        usable & some_bounds & (absolute<T>(det) >= splat(resolution) * largest * largest) &
+        (largest * splat(longer) < splat(moderate)) & (lo * splat(1 - 16 * eps) > splat(near)) &
+        (hi * splat(1 + 16 * eps) < splat(far)) & (lo > splat(smallest)) &
+        (hi < splat(1 / smallest));
     // For faces without bounds, those of an ordinary triangle are computed and not used.
     const Lanes<T> ordinary_x[3] = {zero, one, zero}, ordinary_y[3] = {zero, zero, one};
     Lanes<T> bx[3], by[3], bz[3];
@@ -150,8 +168,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
       bz[k] = select(bounded, z[k], one);
     }
     const DepthBound<T> bound =
-        bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width, height,
-                       image.settings.perspective);
+        bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width,
+                       height, image.settings.perspective);
     const Lanes<T> nearest = select(bounded, bound.nearest, infinity);
     store_lanes(block.slope_x, bound.slope_x);
     store_lanes(block.slope_y, bound.slope_y);
@@ -159,8 +177,10 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
     store_lanes(block.margin, select(bounded, bound.margin, infinity));
     store_lanes(block.nearest, nearest);
     Lanes32 i0, i1, j0, j1;
-    pixel_range<T>(min_of(min_of(x[0], x[1]), x[2]), max_of(max_of(x[0], x[1]), x[2]), width, i0, i1);
-    pixel_range<T>(min_of(min_of(y[0], y[1]), y[2]), max_of(max_of(y[0], y[1]), y[2]), height, j0, j1);
+    pixel_range<T>(min_of(min_of(x[0], x[1]), x[2]), max_of(max_of(x[0], x[1]), x[2]), width, i0,
+                   i1);
+    pixel_range<T>(min_of(min_of(y[0], y[1]), y[2]), max_of(max_of(y[0], y[1]), y[2]), height, j0,
+                   j1);
     store_lanes(block.column_first, i0);
     store_lanes(block.column_last, i1);
     store_lanes(block.row_first, j0);
@@ -170,7 +190,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
     row_first = min_of(row_first, j0);
     row_last = max_of(row_last, j1);
 
-    const uint32_t drawn = lane_bits(narrow_mask(usable) & (i0 <= i1) & (j0 <= j1)) & (0xffu >> (kLanes - lanes));
+    const uint32_t drawn =
+        lane_bits(narrow_mask(usable) & (i0 <= i1) & (j0 <= j1)) & (0xffu >> (kLanes - lanes));
     const uint32_t front_bits = drawn & ~lane_bits(not_ccw);
     const uint32_t back_bits = image.settings.fill_back ? drawn & ~lane_bits(not_cw) : 0;
     const Lanes32 numbers = lane_numbers() + splat(static_cast<int32_t>(f));
@@ -197,7 +218,8 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
 
 // Depths at eight pixels of a row, as published.
 template <class T>
-NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row, bool perspective) {
+NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row,
+                                 bool perspective) {
   const auto& m = plane.weights.m;
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));
   Lanes<T> w[3];
@@ -208,26 +230,32 @@ NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T r
   }
   const Lanes<T> sum = w[0] + w[1] + w[2];
   if (!perspective)
-    return w[0] / sum * splat(plane.z[0]) + w[1] / sum * splat(plane.z[1]) + w[2] / sum * splat(plane.z[2]);
-  return one / (w[0] / sum / splat(plane.z[0]) + w[1] / sum / splat(plane.z[1]) + w[2] / sum / splat(plane.z[2]));
+    return w[0] / sum * splat(plane.z[0]) + w[1] / sum * splat(plane.z[1]) +
+           w[2] / sum * splat(plane.z[2]);
+  return one / (w[0] / sum / splat(plane.z[0]) + w[1] / sum / splat(plane.z[1]) +
+                w[2] / sum / splat(plane.z[2]));
 }
 
 constexpr int32_t kBits[kLanes] = {1, 2, 4, 8, 16, 32, 64, 128};
 
-// Which of the contested pixels among (i .. i + 7, j) face `id` wins: it is nearer there, by exact depth, than the face
-// stored so far. Of equally near faces the one with the smaller index wins, in whichever order they are filled.
+// Which of the contested pixels among (i .. i + 7, j) face `id` wins: it is nearer there, by exact
+// depth, than the face stored so far. Of equally near faces the one with the smaller index wins, in
+// whichever order they are filled.
 template <class T>
-LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, int64_t i, int64_t j,
-                    const int32_t* face_index_at) {
+LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, int64_t i,
+                    int64_t j, const int32_t* face_index_at) {
   const Lanes<T> column = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i)));
   const T row = static_cast<T>(j);
   const bool perspective = image.settings.perspective;
   const Lanes<T> z = exact_depths(face_plane(image, id), column, row, perspective);
-  const Lanes32 bit = load_lanes<Lanes32>(kBits), among = splat(static_cast<int32_t>(contested_bits)) & bit;
-  const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) & (z > splat(image.settings.near)) &
+  const Lanes32 bit = load_lanes<Lanes32>(kBits),
+                among = splat(static_cast<int32_t>(contested_bits)) & bit;
+  const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) &
+                                (z > splat(image.settings.near)) &
                                 (z < splat(image.settings.far));  // false for NaN
   const Lanes32 face_index = load_lanes<Lanes32>(face_index_at);
-  LaneMask<T> wins = contested & widen_mask<T>(face_index < splat(int32_t(0))), open = without(contested, wins);
+  LaneMask<T> wins = contested & widen_mask<T>(face_index < splat(int32_t(0))),
+              open = without(contested, wins);
   for (uint32_t bits = lane_bits(open); bits; bits = lane_bits(open)) {
     const int32_t rival = face_index_at[lowest_bit(bits)];
     const LaneMask<T> here = open & widen_mask<T>(face_index == splat(rival));
@@ -265,8 +293,8 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
     store_lanes(row_terms[0], (yp - splat(y0)) * splat(x1 - x0));
     store_lanes(row_terms[1], (yp - splat(y1)) * splat(x2 - x1));
     store_lanes(row_terms[2], (yp - splat(y2)) * splat(x0 - x2));
-    store_lanes(row_terms[3],
-                to_values<T>(lane_numbers() + splat(static_cast<int32_t>(top))) * splat(block.slope_y[n]));
+    store_lanes(row_terms[3], to_values<T>(lane_numbers() + splat(static_cast<int32_t>(top))) *
+                                  splat(block.slope_y[n]));
     const int64_t rows = std::min(kLanes, j_last - top + 1);
     for (int64_t i = i_first; i <= i_last; i += kLanes) {
       const Lanes<T> xp = load_lanes<Lanes<T>>(band.columns + i);
@@ -280,11 +308,14 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
       uint8_t contested[kLanes];
       uint32_t any_contested = 0;
       for (int64_t r = 0; r < rows; ++r, most += stride, least += stride, face_index += stride) {
-        const LaneMask<T> outside =
-            (splat(row_terms[0][r]) < c0) | (splat(row_terms[1][r]) < c1) | (splat(row_terms[2][r]) < c2);
-        const Lanes<T> q = q_column + splat(row_terms[3][r]), q_most = q + margin, q_least = q - margin;
-        const Lanes<T> pixel_most = load_lanes<Lanes<T>>(most), pixel_least = load_lanes<Lanes<T>>(least);
-        const LaneMask<T> unsettled = without(q_most >= pixel_least, outside | off_box), clear = q_least > pixel_most;
+        const LaneMask<T> outside = (splat(row_terms[0][r]) < c0) | (splat(row_terms[1][r]) < c1) |
+                                    (splat(row_terms[2][r]) < c2);
+        const Lanes<T> q = q_column + splat(row_terms[3][r]), q_most = q + margin,
+                       q_least = q - margin;
+        const Lanes<T> pixel_most = load_lanes<Lanes<T>>(most),
+                       pixel_least = load_lanes<Lanes<T>>(least);
+        const LaneMask<T> unsettled = without(q_most >= pixel_least, outside | off_box),
+                          clear = q_least > pixel_most;
         const LaneMask<T> wins = unsettled & clear;
         const uint32_t bits = lane_bits(without(unsettled, clear));
         contested[r] = static_cast<uint8_t>(bits);
@@ -297,18 +328,22 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
       for (int64_t r = 0; r < rows; ++r) {
         if (!contested[r]) continue;
         const int64_t at = start + r * stride;
-        const LaneMask<T> wins = contest<T>(image, id, contested[r], i, top + r, band.face_index + at);
+        const LaneMask<T> wins =
+            contest<T>(image, id, contested[r], i, top + r, band.face_index + at);
         const Lanes<T> q = q_column + splat(row_terms[3][r]);
         store_lanes(band.most + at, choose(wins, q + margin, load_lanes<Lanes<T>>(band.most + at)));
-        store_lanes(band.least + at, choose(wins, q - margin, load_lanes<Lanes<T>>(band.least + at)));
-        store_lanes(band.face_index + at, choose(narrow_mask(wins), ids, load_lanes<Lanes32>(band.face_index + at)));
+        store_lanes(band.least + at,
+                    choose(wins, q - margin, load_lanes<Lanes<T>>(band.least + at)));
+        store_lanes(band.face_index + at,
+                    choose(narrow_mask(wins), ids, load_lanes<Lanes32>(band.face_index + at)));
       }
     }
   }
 }
 
-// The part of a band that faces can reach, in whole blocks of pixels. Columns and rows count from the band's first; the
-// last ones are excluded. The rest of the band stays background, and its memory is not touched.
+// The part of a band that faces can reach, in whole blocks of pixels. Columns and rows count from
+// the band's first; the last ones are excluded. The rest of the band stays background, and its
+// memory is not touched.
 struct Window {
   int64_t column_first, column_last, row_first, row_last;
 };
@@ -318,20 +353,22 @@ Window find_window(const FaceTable<T>& table, int64_t chunks, const Band<T>& ban
   PixelBox box{std::numeric_limits<int32_t>::max(), -1, std::numeric_limits<int32_t>::max(), -1};
   for (int64_t c = 0; c < chunks; ++c) {
     const PixelBox& part = table.boxes[c];
-    box = {std::min(box.column_first, part.column_first), std::max(box.column_last, part.column_last),
-           std::min(box.row_first, part.row_first), std::max(box.row_last, part.row_last)};
+    box = {std::min(box.column_first, part.column_first),
+           std::max(box.column_last, part.column_last), std::min(box.row_first, part.row_first),
+           std::max(box.row_last, part.row_last)};
   }
   const int64_t rows = band.row_last - band.row_first + 1;
   const int64_t first = std::max<int64_t>(box.row_first - band.row_first, 0);
   const int64_t last = std::min<int64_t>(box.row_last - band.row_first, rows - 1);
   if (first > last || box.column_first > box.column_last) return {0, 0, 0, 0};
-  return {box.column_first / kLanes * kLanes, (box.column_last / kLanes + 1) * kLanes, first / kLanes * kLanes,
-          std::min((last / kLanes + 1) * kLanes, rows)};
+  return {box.column_first / kLanes * kLanes, (box.column_last / kLanes + 1) * kLanes,
+          first / kLanes * kLanes, std::min((last / kLanes + 1) * kLanes, rows)};
 }
 
 // The least q in each block of pixels of the window.
 template <class T>
-NMR_INLINE void bound_blocks(const Band<T>& band, const Window& window, int64_t blocks, T* block_least) {
+NMR_INLINE void bound_blocks(const Band<T>& band, const Window& window, int64_t blocks,
+                             T* block_least) {
   for (int64_t j = window.row_first; j < window.row_last; j += kLanes)
     for (int64_t n = window.column_first / kLanes; n < window.column_last / kLanes; ++n) {
       const T* row = band.least + j * band.stride + n * kLanes;
@@ -351,7 +388,8 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
   constexpr uint32_t kSide = kLanes;  // unsigned, so that divisions are shifts
   const FaceBlock<T>& block = table.blocks[f / kLanes];
   const int64_t lane = f % kLanes;
-  const int32_t band_first = static_cast<int32_t>(band.row_first), band_last = static_cast<int32_t>(band.row_last);
+  const int32_t band_first = static_cast<int32_t>(band.row_first),
+                band_last = static_cast<int32_t>(band.row_last);
   const int32_t j_first = std::max(block.row_first[lane], band_first) - band_first;
   const int32_t j_last = std::min(block.row_last[lane], band_last) - band_first;
   if (j_first > j_last) return true;  // outside the band
@@ -360,9 +398,11 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
                  last = static_cast<uint32_t>(j_last) / kSide;
   const T nearest = block.nearest[lane];
   const uint32_t first = static_cast<uint32_t>(j_first) / kSide;
-  if (last - first <= 1 && n_last - n_first <= 1) {  // most faces; the processor could not foresee when a loop ends
+  if (last - first <= 1 &&
+      n_last - n_first <= 1) {  // most faces; the processor could not foresee when a loop ends
     const T *low = block_least + first * blocks, *high = block_least + last * blocks;
-    return nearest < std::min(std::min(low[n_first], low[n_last]), std::min(high[n_first], high[n_last]));
+    return nearest <
+           std::min(std::min(low[n_first], low[n_last]), std::min(high[n_first], high[n_last]));
   }
   for (uint32_t j = first; j <= last; ++j) {
     const T* least = block_least + j * blocks;
@@ -372,12 +412,15 @@ NMR_INLINE bool is_hidden(const FaceTable<T>& table, int32_t f, const Band<T>& b
   return true;
 }
 
-// Fills all faces into one band of rows, and copies the reached pixels to the image's face index map.
+// Fills all faces into one band of rows, and copies the reached pixels to the image's face index
+// map.
 template <class T>
-void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* block_least, int32_t* face_index) {
+void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* block_least,
+               int32_t* face_index) {
   const Band<T> band = args;  // a copy that no store of pixels can change
   const FaceTable<T>& table = *image.table;
-  const int64_t rows = band.row_last - band.row_first + 1, H = band.raster.height, W = band.raster.width;
+  const int64_t rows = band.row_last - band.row_first + 1, H = band.raster.height,
+                W = band.raster.width;
   const int64_t chunks = (image.num_faces + kChunk - 1) / kChunk;
   const Window window = find_window(table, chunks, band);
   const Lanes<T> nothing = splat(-std::numeric_limits<T>::infinity());
@@ -398,12 +441,14 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
     num_front += table.num_front[c];
     num_back += table.num_back[c];
   }
-  const bool back_first = back_sum * static_cast<T>(num_front) > front_sum * static_cast<T>(num_back);
+  const bool back_first =
+      back_sum * static_cast<T>(num_front) > front_sum * static_cast<T>(num_back);
   for (int pass = 0; pass < 2; ++pass) {
     const bool reversed = (pass == 0) == back_first;
     if (pass == 1) bound_blocks(band, window, blocks, block_least);
     for (int64_t c = 0; c < chunks; ++c) {
-      if (table.boxes[c].row_last < band.row_first || table.boxes[c].row_first > band.row_last) continue;
+      if (table.boxes[c].row_last < band.row_first || table.boxes[c].row_first > band.row_last)
+        continue;
       const int32_t* list = (reversed ? table.back : table.front).data() + c * kChunk;
       const int32_t count = (reversed ? table.num_back : table.num_front)[c];
       for (int32_t n = 0; n < count; ++n)
@@ -419,7 +464,8 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
       continue;
     }
     std::fill_n(row, first, -1);
-    std::memcpy(row + first, band.face_index + j * band.stride + first, (last - first) * sizeof(int32_t));
+    std::memcpy(row + first, band.face_index + j * band.stride + first,
+                (last - first) * sizeof(int32_t));
     std::fill_n(row + last, W - last, -1);
   }
 }

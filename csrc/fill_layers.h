@@ -15,7 +15,8 @@ NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) 
   const Triangle<T> t = load_triangle(band.vertices, band.faces + 3 * f, reversed);
   const T *x = t.x, *y = t.y, *z = t.z;
   if ((y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0])) return;
-  // As in the rasterizer, of the face's own order: rounding may find only one of the two orders flat.
+  // As in the rasterizer, of the face's own order: rounding may find only one of the two orders
+  // flat.
   if (!is_drawable(load_triangle(band.vertices, band.faces + 3 * f, false))) return;
   const T left = std::min({x[0], x[1], x[2]}), right = std::max({x[0], x[1], x[2]});
   const T bottom = std::min({y[0], y[1], y[2]}), top = std::max({y[0], y[1], y[2]});
@@ -41,7 +42,8 @@ NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) 
                              ((yp - y[1]) * (x[2] - x[1]) < (xp - x[1]) * (y[2] - y[1])) |
                              ((yp - y[2]) * (x[0] - x[2]) < (xp - x[2]) * (y[0] - y[2]));
         T w[3];
-        for (int k = 0; k < 3; ++k) w[k] = clamp_weight(column * m.m[k][0] + m.m[k][1] * row + m.m[k][2]);
+        for (int k = 0; k < 3; ++k)
+          w[k] = clamp_weight(column * m.m[k][0] + m.m[k][1] * row + m.m[k][2]);
         const T sum = w[0] + w[1] + w[2];
         depth[n] = perspective ? 1 / (w[0] / sum / z[0] + w[1] / sum / z[1] + w[2] / sum / z[2])
                                : w[0] / sum * z[0] + w[1] / sum * z[1] + w[2] / sum * z[2];
@@ -53,7 +55,8 @@ NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) 
       for (int64_t n = 0; n < lanes; ++n) {
         T* depths = band.depth + ((j - band.first) * raster.width + i + n) * K;
         if (!covered[n] || !(depth[n] < depths[K - 1])) continue;
-        int32_t* face_indices = band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
+        int32_t* face_indices =
+            band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
         insert_sorted(depth[n], id, K, depths, face_indices);
       }
     }
@@ -65,5 +68,6 @@ template <class T>
 void fill_layers(const LayerBand<T>& band) {
   for (int reversed = 0; reversed <= band.settings.fill_back; ++reversed)
     for (int64_t f = 0; f < band.num_faces; ++f)
-      band.settings.perspective ? insert_face<true>(band, f, reversed) : insert_face<false>(band, f, reversed);
+      band.settings.perspective ? insert_face<true>(band, f, reversed)
+                                : insert_face<false>(band, f, reversed);
 }

@@ -1,9 +1,10 @@
-// The inner loops of fragments and depth images; included by levels.h for every instruction set. See fragments.cpp.
+// The inner loops of fragments and depth images; included by levels.h for every instruction set.
+// See fragments.cpp.
 
 // --- the faces of a block
 
-// Numbers the block's visible faces and fills in the table. Entry 0, of the background, has weights (1, 0, 0) and
-// depth 1.
+// Numbers the block's visible faces and fills in the table. Entry 0, of the background, has weights
+// (1, 0, 0) and depth 1.
 template <class T>
 NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& scratch) {
   const int64_t W = block.raster.width, F = block.num_faces;
@@ -12,7 +13,8 @@ NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& 
   const int64_t count = scratch.visible.count - 1;
   T* table = scratch.table.data();
   for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
-  const Lanes<T> width = splat(static_cast<T>(W)), height = splat(static_cast<T>(block.raster.height));
+  const Lanes<T> width = splat(static_cast<T>(W)),
+                 height = splat(static_cast<T>(block.raster.height));
   for (int64_t start = 0; start < count; start += kLanes) {
     const int64_t last = count - 1;
     T corner[3][3][kLanes];  // x, y, z of the corners
@@ -22,7 +24,8 @@ NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& 
       const bool reversed = id >= F;
       const int64_t* face = block.faces + 3 * (reversed ? id - F : id);
       for (int k = 0; k < 3; ++k)
-        for (int c = 0; c < 3; ++c) corner[c][k][n] = block.vertices[3 * face[reversed ? 2 - k : k] + c];
+        for (int c = 0; c < 3; ++c)
+          corner[c][k][n] = block.vertices[3 * face[reversed ? 2 - k : k] + c];
     }
     Lanes<T> X[3], Y[3];
     for (int k = 0; k < 3; ++k) {
@@ -43,7 +46,8 @@ NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& 
       column[quad][3] = splat(quad < 3 ? T(0) : T(1));
       T rows[kLanes][4];
       store_quads<T>(column[quad], rows);
-      for (int64_t n = 0; n < kLanes; ++n) std::copy_n(rows[n], 4, table + (start + 1 + n) * kEntry + 4 * quad);
+      for (int64_t n = 0; n < kLanes; ++n)
+        std::copy_n(rows[n], 4, table + (start + 1 + n) * kEntry + 4 * quad);
     }
   }
 }
@@ -58,9 +62,11 @@ struct FragmentPixels {
   int64_t slot[kLanes];
 };
 
-// Weights and depths of the pixels [i, i + 8) with these face indices, in the row of pixel coordinate y.
+// Weights and depths of the pixels [i, i + 8) with these face indices, in the row of pixel
+// coordinate y.
 template <class T>
-NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32 ids, int64_t i, Lanes<T> y) {
+NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32 ids, int64_t i,
+                                      Lanes<T> y) {
   FragmentPixels<T> p;
   const LaneArray<int32_t, Lanes32> slots(gather_values(scratch.visible.slots.data() + 1, ids));
   const T* entry[kLanes];
@@ -73,8 +79,8 @@ NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32
     load_quads<T>(entry, column[quad]);
     for (int64_t n = 0; n < kLanes; ++n) entry[n] += 4;
   }
-  const Lanes<T> x = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i))), zero = splat(T(0)),
-                 one = splat(T(1));
+  const Lanes<T> x = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i))),
+                 zero = splat(T(0)), one = splat(T(1));
   Lanes<T> raw[3];
   for (int k = 0; k < 3; ++k)  // clamp_weight of geometry.h
     raw[k] = min_of(max_of(column[0][k] * x + column[1][k] * y + column[2][k], zero), one);
@@ -89,8 +95,8 @@ NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32
   return p;
 }
 
-// Calls visit(i, ids, y) for every eight pixels [i, i + 8) of row j (from the top) with a covered one among them,
-// and background(i) for the others.
+// Calls visit(i, ids, y) for every eight pixels [i, i + 8) of row j (from the top) with a covered
+// one among them, and background(i) for the others.
 template <class T, class Visit, class Background>
 NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visit& visit,
                             const Background& background) {
@@ -107,8 +113,8 @@ NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visi
 
 // Depths of row j; out has room for eight more.
 template <class T>
-NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far, const FragmentScratch<T>& scratch,
-                          T* out) {
+NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far,
+                          const FragmentScratch<T>& scratch, T* out) {
   for_covered(
       block, j,
       [&](int64_t i, Lanes32 ids, Lanes<T> y) {
@@ -160,10 +166,12 @@ void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& b
         [&](int64_t i, Lanes32 ids, Lanes<T> y) {
           const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
           const LaneMask<T> drawn = widen_mask<T>(ids >= splat(int32_t(0)));
-          const LaneMask<T> reversed = widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
+          const LaneMask<T> reversed =
+              widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
           Lanes<T> at[3];
           for (int k = 0; k < 3; ++k)
-            at[k] = choose(drawn, scratch.perspective ? p.w[k] * p.z / p.corner_z[k] : p.w[k], zero);
+            at[k] =
+                choose(drawn, scratch.perspective ? p.w[k] * p.z / p.corner_z[k] : p.w[k], zero);
           T value[3][kLanes], z[kLanes];
           store_lanes(z, choose(drawn, p.z, far));
           store_lanes(value[0], choose(reversed, at[2], at[0]));
@@ -184,14 +192,15 @@ void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& b
 
 // --- backward
 
-// Values close to an overflow count as 0: a corner in the plane of the eye gets no gradient, and does not change
-// others.
+// Values close to an overflow count as 0: a corner in the plane of the eye gets no gradient, and
+// does not change others.
 template <class T>
 NMR_INLINE Lanes<T> moderate_or_zero(Lanes<T> value) {
   return keep(absolute<T>(value) < splat(std::sqrt(std::numeric_limits<T>::max())), value);
 }
 
-// A depth whose square is a factor of a gradient: 0 beyond the depth up to which sums of squares cannot overflow.
+// A depth whose square is a factor of a gradient: 0 beyond the depth up to which sums of squares
+// cannot overflow.
 template <class T>
 NMR_INLINE Lanes<T> depth_or_zero(Lanes<T> z) {
   return keep(absolute<T>(z) < splat(sizeof(T) == sizeof(double) ? T(1e100) : T(1e15)), z);
@@ -199,7 +208,8 @@ NMR_INLINE Lanes<T> depth_or_zero(Lanes<T> z) {
 
 // Adds four numbers per pixel to those of its face, of which there are `stride` per face.
 template <class T>
-NMR_INLINE void add_to_faces(const Lanes<T> (&column)[4], const FragmentPixels<T>& p, int64_t stride, T* sums) {
+NMR_INLINE void add_to_faces(const Lanes<T> (&column)[4], const FragmentPixels<T>& p,
+                             int64_t stride, T* sums) {
   T* at[kLanes];
   for (int64_t n = 0; n < kLanes; ++n) at[n] = sums + stride * p.slot[n];
   add_quads<T>(column, at);
@@ -207,7 +217,8 @@ NMR_INLINE void add_to_faces(const Lanes<T> (&column)[4], const FragmentPixels<T
 
 // Columns of the numbers of the faces [slot, slot + 8) in an array with `stride` numbers per face.
 template <class T>
-NMR_INLINE void load_face_quads(const T* values, int64_t slot, int64_t stride, Lanes<T> (&column)[4]) {
+NMR_INLINE void load_face_quads(const T* values, int64_t slot, int64_t stride,
+                                Lanes<T> (&column)[4]) {
   const T* row[kLanes];
   for (int64_t n = 0; n < kLanes; ++n) row[n] = values + (slot + n) * stride;
   load_quads<T>(row, column);
@@ -215,7 +226,8 @@ NMR_INLINE void load_face_quads(const T* values, int64_t slot, int64_t stride, L
 
 // Writes the gradients of the faces [slot, slot + 8): grad[3 k + c] of coordinate c of corner k.
 template <class T>
-NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot, FaceGradients<T>& result) {
+NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot,
+                                     FaceGradients<T>& result) {
   T value[9][kLanes];
   for (int c = 0; c < 9; ++c) store_lanes(value[c], grad[c]);
   T* out = result.values.data() + 9 * (slot - 1);
@@ -224,8 +236,9 @@ NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot, Fa
     for (int c = 0; c < 9; ++c) out[c] = value[c][n];
 }
 
-// With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k = S_k sum_m M_m0 /
-// z_m. Without perspective c = g:  grad z_k = S_k,  grad X_k = -S_k sum_m M_m0 z_m.
+// With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k
+// = S_k sum_m M_m0 / z_m. Without perspective c = g:  grad z_k = S_k,  grad X_k = -S_k sum_m M_m0
+// z_m.
 template <class T>
 void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b,
                           FragmentScratch<T>& scratch, FaceGradients<T>& result) {
@@ -237,7 +250,8 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
   std::fill_n(sums, 4 * (scratch.visible.count + kLanes), T(0));
   std::fill_n(grad + W, kLanes, T(0));
   for (int64_t j = block.first; j < block.last; ++j) {
-    const T* upstream = args.grad_depth + b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
+    const T* upstream =
+        args.grad_depth + b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
     if (!args.anti_aliasing) {
       std::copy_n(upstream, w, grad);
     } else if (j % 2 == 0) {  // blocks begin with an even row
@@ -263,22 +277,25 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
     load_face_quads<T>(table + 4, slot, kEntry, my);
     load_face_quads<T>(table + 12, slot, kEntry, z);
     const auto slope = [&](const Lanes<T>(&m)[4]) {
-      return moderate_or_zero<T>(scratch.perspective ? m[0] / z[0] + m[1] / z[1] + m[2] / z[2]
-                                                     : zero - (m[0] * z[0] + m[1] * z[1] + m[2] * z[2]));
+      return moderate_or_zero<T>(scratch.perspective
+                                     ? m[0] / z[0] + m[1] / z[1] + m[2] / z[2]
+                                     : zero - (m[0] * z[0] + m[1] * z[1] + m[2] * z[2]));
     };
     const Lanes<T> slope_x = slope(mx) * half_width, slope_y = slope(my) * half_height;
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = sum[k] * slope_x;
       out[3 * k + 1] = sum[k] * slope_y;
-      out[3 * k + 2] = scratch.perspective ? sum[k] * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k];
+      out[3 * k + 2] =
+          scratch.perspective ? sum[k] * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k];
     }
     store_face_gradients<T>(out, slot, result);
   }
 }
 
-// With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m / z_m), so that
-// grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over pixels of h_m w_k. Without
-// perspective h_m = u_m + g z_m:  grad z_m = sum over pixels of g w_m,  grad X_k = -sum_m H_mk M_m0.
+// With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m /
+// z_m), so that grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over
+// pixels of h_m w_k. Without perspective h_m = u_m + g z_m:  grad z_m = sum over pixels of g w_m,
+// grad X_k = -sum_m H_mk M_m0.
 template <class T>
 void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b,
                               FragmentScratch<T>& scratch, FaceGradients<T>& result) {
@@ -311,8 +328,10 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
             T grad[3][kLanes] = {};
             for (int64_t n = 0; n < count; ++n)
               for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (row + i + n) + m];
-            const LaneMask<T> reversed = widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
-            const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]), last = load_lanes<Lanes<T>>(grad[2]);
+            const LaneMask<T> reversed =
+                widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
+            const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]),
+                           last = load_lanes<Lanes<T>>(grad[2]);
             const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
                                    choose(reversed, first, last)};
             Lanes<T> mean = zero;
@@ -322,7 +341,8 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
             for (int m = 0; m < 3; ++m) h[m] = h[m] + scale * (u[m] - mean);
           }
           for (int m = 0; m < 3; ++m)
-            add_to_faces<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p, 12, sums + 4 * m);
+            add_to_faces<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p, 12,
+                            sums + 4 * m);
         },
         [](int64_t) {});
   }
@@ -340,10 +360,13 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
       slope_y[m] = moderate_or_zero<T>(scratch.perspective ? my[m] / z[m] : my[m]) * half_height;
     }
     for (int k = 0; k < 3; ++k) {
-      out[3 * k] = zero - (sum[0][k] * slope_x[0] + sum[1][k] * slope_x[1] + sum[2][k] * slope_x[2]);
-      out[3 * k + 1] = zero - (sum[0][k] * slope_y[0] + sum[1][k] * slope_y[1] + sum[2][k] * slope_y[2]);
-      out[3 * k + 2] =
-          scratch.perspective ? (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k][3];
+      out[3 * k] =
+          zero - (sum[0][k] * slope_x[0] + sum[1][k] * slope_x[1] + sum[2][k] * slope_x[2]);
+      out[3 * k + 1] =
+          zero - (sum[0][k] * slope_y[0] + sum[1][k] * slope_y[1] + sum[2][k] * slope_y[2]);
+      out[3 * k + 2] = scratch.perspective
+                           ? (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k]))
+                           : sum[k][3];
     }
     store_face_gradients<T>(out, slot, result);
   }

@@ -1,9 +1,10 @@
-// Barycentric weights and depth of the nearest face at each pixel. They are computed from the face index map, by the
-// same expressions as in the rasterizer.
+// Barycentric weights and depth of the nearest face at each pixel. They are computed from the face
+// index map, by the same expressions as in the rasterizer.
 //
-// With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q, perspective-correct weights b_k = z
-// w_k / z_k. Without perspective, z = sum_k w_k z_k and b_k = w_k. Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0 dX + M_m1
-// dY), M as in geometry.h. The loops over pixels are in fragment_rows.h.
+// With w_k the normalised screen weights and q = sum_k w_k / z_k: depth z = 1 / q,
+// perspective-correct weights b_k = z w_k / z_k. Without perspective, z = sum_k w_k z_k and b_k =
+// w_k. Moving corner k by (dX, dY) pixels changes the weights at a fixed pixel by dw_m = -w_k (M_m0
+// dX + M_m1 dY), M as in geometry.h. The loops over pixels are in fragment_rows.h.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -28,9 +29,9 @@ constexpr int64_t kEntry = 16;
 template <class T>
 struct FragmentScratch {
   VisibleFaces visible;
-  std::vector<T> table;        // [visible + 1 + 8, kEntry]
-  std::vector<T> rows;         // [2, W + 8] a row of depths or gradients each
-  std::vector<T> sums;         // [visible + 1 + 8, 4 or 12] gradients per face
+  std::vector<T> table;  // [visible + 1 + 8, kEntry]
+  std::vector<T> rows;   // [2, W + 8] a row of depths or gradients each
+  std::vector<T> sums;   // [visible + 1 + 8, 4 or 12] gradients per face
   bool perspective;
 
   void reserve_for(int64_t num_faces, const RowBlocks& blocks, bool has_perspective) {
@@ -50,12 +51,12 @@ struct FragmentBlock {
   int64_t num_faces;
   Size raster;
   const int32_t* face_index;  // [H, W], row 0 = top
-  int64_t first, last;   // rows
+  int64_t first, last;        // rows
 };
 
 template <class T>
-FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* face_index, const RowBlocks& blocks, int64_t b,
-                            int64_t block) {
+FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* face_index,
+                            const RowBlocks& blocks, int64_t b, int64_t block) {
   return {mesh.image_vertices(b),
           mesh.image_faces(b),
           mesh.face_count(b),
@@ -74,8 +75,8 @@ FragmentBlock<T> make_block(const MeshBatch<T>& mesh, const int32_t* face_index,
 namespace nmr {
 namespace {
 
-// The blocks of an image depend only on its own number of faces, so that results do not depend on other images of a
-// packed batch. Calls body(block, b, scratch) for each block.
+// The blocks of an image depend only on its own number of faces, so that results do not depend on
+// other images of a packed batch. Calls body(block, b, scratch) for each block.
 template <class Args, class Body, class T = std::remove_pointer_t<decltype(Args::depth)>>
 void forward(const Args& args, Size raster, const Body& body) {
   const MeshBatch<T>& mesh = args.mesh;
@@ -92,13 +93,15 @@ void forward(const Args& args, Size raster, const Body& body) {
   });
 }
 
-// Sums the gradients that body(block, b, scratch, result) computes for each block. It needs `sums` numbers per face.
+// Sums the gradients that body(block, b, scratch, result) computes for each block. It needs `sums`
+// numbers per face.
 template <class Args, class Body, class T = std::remove_pointer_t<decltype(Args::grad_vertices)>>
 void backward(const Args& args, Size raster, int64_t sums, const Body& body) {
   const MeshBatch<T>& mesh = args.mesh;
   std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
   sum_blocks<FaceGradients<T>>(
-      mesh.batch, false, args.num_threads, [&](int64_t b) { return RowBlocks(raster, mesh.face_count(b)).count; },
+      mesh.batch, false, args.num_threads,
+      [&](int64_t b) { return RowBlocks(raster, mesh.face_count(b)).count; },
       [&](int64_t b, int64_t block, FaceGradients<T>& result) {
         const int64_t F = mesh.face_count(b);
         const RowBlocks blocks(raster, F);
@@ -120,15 +123,17 @@ void backward(const Args& args, Size raster, int64_t sums, const Body& body) {
 
 template <class T>
 void fragments_forward(const Fragments<T>& args) {
-  forward(args, args.raster, [&](const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch) {
-    NMR_AT_BEST_LEVEL(fragments_forward_block, args, block, b, scratch);
-  });
+  forward(args, args.raster,
+          [&](const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch) {
+            NMR_AT_BEST_LEVEL(fragments_forward_block, args, block, b, scratch);
+          });
 }
 
 template <class T>
 void fragments_backward(const Fragments<T>& args) {
   backward(args, args.raster, 12,
-           [&](const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch, FaceGradients<T>& result) {
+           [&](const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch,
+               FaceGradients<T>& result) {
              NMR_AT_BEST_LEVEL(fragments_backward_block, args, block, b, scratch, result);
            });
 }
@@ -144,7 +149,8 @@ void depth_forward(const DepthImage<T>& args) {
 template <class T>
 void depth_backward(const DepthImage<T>& args) {
   backward(args, raster_of(args.image, args.anti_aliasing), 4,
-           [&](const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch, FaceGradients<T>& result) {
+           [&](const FragmentBlock<T>& block, int64_t b, FragmentScratch<T>& scratch,
+               FaceGradients<T>& result) {
              NMR_AT_BEST_LEVEL(depth_backward_block, args, block, b, scratch, result);
            });
 }

@@ -1,6 +1,6 @@
-// Screen geometry: pixel coordinates, facing, barycentric weights. Every expression is evaluated in the written order,
-// in T, without fused multiply-adds: rounding decides which face owns a pixel on an edge, so the order of operations
-// is part of the definition.
+// Screen geometry: pixel coordinates, facing, barycentric weights. Every expression is evaluated in
+// the written order, in T, without fused multiply-adds: rounding decides which face owns a pixel on
+// an edge, so the order of operations is part of the definition.
 #pragma once
 
 #include <cmath>
@@ -16,7 +16,8 @@ NMR_INLINE T pixel_centre(int64_t i, int64_t size) {
   return static_cast<T>(2 * i + 1 - size) / static_cast<T>(size);
 }
 
-// Pixel coordinate of x (or y) in [-1, 1]: pixel centres are the integers. size: the number of columns (or rows).
+// Pixel coordinate of x (or y) in [-1, 1]: pixel centres are the integers. size: the number of
+// columns (or rows).
 template <class T>
 NMR_INLINE T to_pixel(T x, T size) {
   return (x * size + size - 1) / 2;
@@ -40,19 +41,20 @@ NMR_INLINE Triangle<T> load_triangle(const T* vertices, const int64_t* face, boo
   return t;
 }
 
-// Faces with a non-finite x or y, a NaN depth, or no area are not drawn. The area is computed in double, which is
-// almost exact for float coordinates. Otherwise the inclusive edge tests of a collinear face could pass along its
-// whole line.
+// Faces with a non-finite x or y, a NaN depth, or no area are not drawn. The area is computed in
+// double, which is almost exact for float coordinates. Otherwise the inclusive edge tests of a
+// collinear face could pass along its whole line.
 template <class T>
 NMR_INLINE bool is_drawable(const Triangle<T>& t) {
   bool finite = true;
-  for (int k = 0; k < 3; ++k) finite = finite && std::isfinite(t.x[k]) && std::isfinite(t.y[k]) && !std::isnan(t.z[k]);
+  for (int k = 0; k < 3; ++k)
+    finite = finite && std::isfinite(t.x[k]) && std::isfinite(t.y[k]) && !std::isnan(t.z[k]);
   const double x0 = t.x[0], y0 = t.y[0];
   return finite && ((t.x[1] - x0) * (t.y[2] - y0) != (t.y[1] - y0) * (t.x[2] - x0));
 }
 
-// Rows of the matrix M with barycentric weight w_k = M[k][0] X + M[k][1] Y + M[k][2] at pixel coordinates (X, Y): the
-// inverse of the matrix with columns (X_k, Y_k, 1).
+// Rows of the matrix M with barycentric weight w_k = M[k][0] X + M[k][1] Y + M[k][2] at pixel
+// coordinates (X, Y): the inverse of the matrix with columns (X_k, Y_k, 1).
 template <class T>
 struct BarycentricMatrix {
   T m[3][3];

@@ -1,8 +1,9 @@
-// The K nearest faces at each pixel, by the same tests and the same depth as in the rasterizer: the first layer is its
-// face index map.
+// The K nearest faces at each pixel, by the same tests and the same depth as in the rasterizer: the
+// first layer is its face index map.
 //
-// Faces are visited in ascending order, all originals, then all reversed copies, and inserted into the sorted list of
-// each pixel that they cover, behind those that are equally near. Bands of rows are independent.
+// Faces are visited in ascending order, all originals, then all reversed copies, and inserted into
+// the sorted list of each pixel that they cover, behind those that are equally near. Bands of rows
+// are independent.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -27,8 +28,8 @@ struct LayerBand {
   int64_t num_faces;
   RasterSettings<T> settings;
   int64_t layers, first, last;
-  const T* centres;  // centres of the columns, padded to whole groups
-  T* depth;          // [rows, W, K], sorted; `far` without a face
+  const T* centres;     // centres of the columns, padded to whole groups
+  T* depth;             // [rows, W, K], sorted; `far` without a face
   int32_t* face_index;  // [H, W, K] of the image, row 0 = top
 };
 
@@ -52,9 +53,18 @@ void rasterize_layers(const RasterizeLayers<T>& args) {
                   last = std::min(first + kBandRows, raster.height) - 1;
     std::vector<T> depth((last - first + 1) * raster.width * K, args.settings.far);
     int32_t* face_index = args.face_index + b * raster.pixels() * K;
-    std::fill_n(face_index + (raster.height - 1 - last) * raster.width * K, (last - first + 1) * raster.width * K, -1);
-    const LayerBand<T> band{args.mesh.image_vertices(b), args.mesh.image_faces(b), args.mesh.face_count(b),
-                            args.settings, K, first, last, centres.data(), depth.data(), face_index};
+    std::fill_n(face_index + (raster.height - 1 - last) * raster.width * K,
+                (last - first + 1) * raster.width * K, -1);
+    const LayerBand<T> band{args.mesh.image_vertices(b),
+                            args.mesh.image_faces(b),
+                            args.mesh.face_count(b),
+                            args.settings,
+                            K,
+                            first,
+                            last,
+                            centres.data(),
+                            depth.data(),
+                            face_index};
     NMR_AT_BEST_LEVEL(fill_layers, band);
   });
 }

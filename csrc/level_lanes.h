@@ -1,6 +1,6 @@
-// Eight values that are processed together (lanes), for one level: levels.h includes this file in the namespace of
-// each. A vector that does not fit into a register of the level is two halves. Every operation treats each lane
-// separately, so results do not depend on the level.
+// Eight values that are processed together (lanes), for one level: levels.h includes this file in
+// the namespace of each. A vector that does not fit into a register of the level is two halves.
+// Every operation treats each lane separately, so results do not depend on the level.
 
 constexpr int64_t kLanes = 8;
 
@@ -66,39 +66,43 @@ typedef long long Mask64;  // result of comparing vectors of double
 #else
 typedef int64_t Mask64;
 #endif
-template <class T> using MaskElement = std::conditional_t<sizeof(T) == 8, Mask64, int32_t>;
-template <class T> using Lanes = typename LaneType<T, kLanes>::Type;
+template <class T>
+using MaskElement = std::conditional_t<sizeof(T) == 8, Mask64, int32_t>;
+template <class T>
+using Lanes = typename LaneType<T, kLanes>::Type;
 using Lanes32 = Lanes<int32_t>;
 
-template <class V> struct IsHalves : std::false_type {};
-template <class V> struct IsHalves<Halves<V>> : std::true_type {};
+template <class V>
+struct IsHalves : std::false_type {};
+template <class V>
+struct IsHalves<Halves<V>> : std::true_type {};
 
 #if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
 #define NMR_ONE_OPERATOR(op)
 #define NMR_ONE_COMPARISON(op)
 #else
-#define NMR_ONE_OPERATOR(op)                             \
-  template <class E>                                     \
-  NMR_INLINE One<E> operator op(One<E> a, One<E> b) {    \
-    return {static_cast<E>(a.value op b.value)};         \
+#define NMR_ONE_OPERATOR(op)                          \
+  template <class E>                                  \
+  NMR_INLINE One<E> operator op(One<E> a, One<E> b) { \
+    return {static_cast<E>(a.value op b.value)};      \
   }
-#define NMR_ONE_COMPARISON(op)                                      \
-  template <class E>                                                \
-  NMR_INLINE One<MaskElement<E>> operator op(One<E> a, One<E> b) {  \
-    return {a.value op b.value ? -1 : 0};                           \
+#define NMR_ONE_COMPARISON(op)                                     \
+  template <class E>                                               \
+  NMR_INLINE One<MaskElement<E>> operator op(One<E> a, One<E> b) { \
+    return {a.value op b.value ? -1 : 0};                          \
   }
 #endif
-#define NMR_LANE_OPERATOR(op)                                   \
-  NMR_ONE_OPERATOR(op)                                          \
-  template <class V>                                            \
-  NMR_INLINE Halves<V> operator op(Halves<V> a, Halves<V> b) {  \
-    return {a.low op b.low, a.high op b.high};                  \
+#define NMR_LANE_OPERATOR(op)                                  \
+  NMR_ONE_OPERATOR(op)                                         \
+  template <class V>                                           \
+  NMR_INLINE Halves<V> operator op(Halves<V> a, Halves<V> b) { \
+    return {a.low op b.low, a.high op b.high};                 \
   }
-#define NMR_LANE_COMPARISON(op)                                                     \
-  NMR_ONE_COMPARISON(op)                                                            \
-  template <class V>                                                                \
-  NMR_INLINE auto operator op(Halves<V> a, Halves<V> b) {                           \
-    return Halves<decltype(a.low op b.low)>{a.low op b.low, a.high op b.high};      \
+#define NMR_LANE_COMPARISON(op)                                                \
+  NMR_ONE_COMPARISON(op)                                                       \
+  template <class V>                                                           \
+  NMR_INLINE auto operator op(Halves<V> a, Halves<V> b) {                      \
+    return Halves<decltype(a.low op b.low)>{a.low op b.low, a.high op b.high}; \
   }
 NMR_LANE_OPERATOR(+)
 NMR_LANE_OPERATOR(-)
@@ -117,7 +121,8 @@ NMR_LANE_COMPARISON(==)
 #undef NMR_ONE_COMPARISON
 
 // What a comparison gives: all bits of a lane are set or none.
-template <class T> using LaneMask = decltype(std::declval<Lanes<T>>() < std::declval<Lanes<T>>());
+template <class T>
+using LaneMask = decltype(std::declval<Lanes<T>>() < std::declval<Lanes<T>>());
 
 template <class V, class U>
 NMR_INLINE V load_lanes(const U* p) {
@@ -234,7 +239,8 @@ template <class E>
 NMR_INLINE E least_lane(Lanes<E> v) {
 #if defined(__AVX2__) || NMR_AVX2
   if constexpr (std::is_same_v<E, float>) {
-    const __m128 four = _mm_min_ps(_mm256_castps256_ps128((__m256)v), _mm256_extractf128_ps((__m256)v, 1));
+    const __m128 four =
+        _mm_min_ps(_mm256_castps256_ps128((__m256)v), _mm256_extractf128_ps((__m256)v, 1));
     const __m128 two = _mm_min_ps(four, _mm_movehl_ps(four, four));
     return _mm_cvtss_f32(_mm_min_ss(two, _mm_movehdup_ps(two)));
   }
@@ -250,19 +256,21 @@ NMR_INLINE Lanes<T> pixel_coordinates(Lanes<T> x, Lanes<T> size) {
   return (x * size + size - splat(T(1))) / splat(T(2));
 }
 
-// Each lane converted to the element type of `To`; to integers truncated, and then every lane must be in range. Halves
-// on one side only come from element types of different size.
+// Each lane converted to the element type of `To`; to integers truncated, and then every lane must
+// be in range. Halves on one side only come from element types of different size.
 template <class To, class V>
 NMR_INLINE To convert_lanes(V v) {
   if constexpr (IsHalves<V>::value && IsHalves<To>::value) {
     return {convert_lanes<decltype(To::low)>(v.low), convert_lanes<decltype(To::low)>(v.high)};
   } else if constexpr (IsHalves<To>::value) {
-    typename LaneType<std::decay_t<decltype(v[0])>, static_cast<int64_t>(sizeof(V) / sizeof(v[0])) / 2>::Type half[2];
+    typename LaneType<std::decay_t<decltype(v[0])>,
+                      static_cast<int64_t>(sizeof(V) / sizeof(v[0])) / 2>::Type half[2];
     std::memcpy(half, &v, sizeof v);
     return {convert_lanes<decltype(To::low)>(half[0]), convert_lanes<decltype(To::low)>(half[1])};
   } else if constexpr (IsHalves<V>::value) {
     using Element = std::decay_t<decltype(std::declval<To>()[0])>;
-    using Half = typename LaneType<Element, static_cast<int64_t>(sizeof(To) / sizeof(Element)) / 2>::Type;
+    using Half =
+        typename LaneType<Element, static_cast<int64_t>(sizeof(To) / sizeof(Element)) / 2>::Type;
     const Half half[2] = {convert_lanes<Half>(v.low), convert_lanes<Half>(v.high)};
     To result;
     std::memcpy(&result, half, sizeof result);
@@ -356,13 +364,14 @@ struct SetBits {
 constexpr SetBits kSetBits;
 #endif
 
-// Writes the lanes whose bit is set to out, one after the other, and anything to the rest of out[0..7]; returns how
-// many are set.
+// Writes the lanes whose bit is set to out, one after the other, and anything to the rest of
+// out[0..7]; returns how many are set.
 template <class E>
 NMR_INLINE int64_t compress_lanes(Lanes<E> v, uint32_t bits, E* out) {
 #if defined(__AVX2__) || NMR_AVX2
   if constexpr (sizeof(E) == 4) {
-    const __m256i order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(kSetBits.entry[bits])));
+    const __m256i order =
+        _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(static_cast<int64_t>(kSetBits.entry[bits])));
     store_lanes(out, _mm256_permutevar8x32_epi32((__m256i)v, order));
     return __builtin_popcount(bits);
   }
@@ -411,10 +420,13 @@ template <class T>
 NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4]) {
 #if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
   if constexpr (sizeof(T) == 4) {
-    const auto quad = [&](int64_t k) { return _mm_loadu_ps(reinterpret_cast<const float*>(row[k])); };
+    const auto quad = [&](int64_t k) {
+      return _mm_loadu_ps(reinterpret_cast<const float*>(row[k]));
+    };
 #if defined(__AVX2__) || NMR_AVX2
     __m256 q[4];
-    for (int k = 0; k < 4; ++k) q[k] = _mm256_insertf128_ps(_mm256_castps128_ps256(quad(k)), quad(k + 4), 1);
+    for (int k = 0; k < 4; ++k)
+      q[k] = _mm256_insertf128_ps(_mm256_castps128_ps256(quad(k)), quad(k + 4), 1);
     transpose_quads(q);
     for (int c = 0; c < 4; ++c) column[c] = (Lanes<T>)q[c];
 #else
@@ -432,7 +444,8 @@ NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4])
 #if defined(__AVX2__) || NMR_AVX2
   if constexpr (sizeof(T) == 8) {
     __m256d low[4], high[4];
-    for (int k = 0; k < 4; ++k) low[k] = _mm256_loadu_pd(row[k]), high[k] = _mm256_loadu_pd(row[k + 4]);
+    for (int k = 0; k < 4; ++k)
+      low[k] = _mm256_loadu_pd(row[k]), high[k] = _mm256_loadu_pd(row[k + 4]);
     transpose_quads(low);
     transpose_quads(high);
     for (int c = 0; c < 4; ++c) {
@@ -485,7 +498,8 @@ NMR_INLINE void store_quads(const Lanes<T> (&column)[4], T (&rows)[kLanes][4]) {
     }
     transpose_quads(low);
     transpose_quads(high);
-    for (int k = 0; k < 4; ++k) _mm256_storeu_pd(rows[k], low[k]), _mm256_storeu_pd(rows[k + 4], high[k]);
+    for (int k = 0; k < 4; ++k)
+      _mm256_storeu_pd(rows[k], low[k]), _mm256_storeu_pd(rows[k + 4], high[k]);
     return;
   }
 #endif
@@ -523,7 +537,8 @@ struct LaneArray {
   explicit NMR_INLINE LaneArray(V v) { store_lanes(lane, v); }
 };
 
-// sums[0] += the sum of the lanes of p, sums[1] += that of q; always in the order ((0 + 4) + (2 + 6)) + ((1 + 5) + (3
+// sums[0] += the sum of the lanes of p, sums[1] += that of q; always in the order ((0 + 4) + (2 +
+// 6)) + ((1 + 5) + (3
 // + 7)).
 template <class T>
 NMR_INLINE void add_lane_sums(Lanes<T> p, Lanes<T> q, T* sums) {
@@ -549,7 +564,9 @@ NMR_INLINE void add_lane_sums(Lanes<T> p, Lanes<T> q, T* sums) {
   }
 #endif
   const LaneArray<T, Lanes<T>> a(p), b(q);
-  const auto sum = [](const T* v) { return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7])); };
+  const auto sum = [](const T* v) {
+    return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]));
+  };
   sums[0] += sum(a.lane);
   sums[1] += sum(b.lane);
 }

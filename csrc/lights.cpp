@@ -1,6 +1,7 @@
 // Lights on the visible faces, and their normals. struct Lit in stages.h has the definition.
 //
-// Where the light depends only on the face (flat, no point lights, no highlights) it is computed once per visible face.
+// Where the light depends only on the face (flat, no point lights, no highlights) it is computed
+// once per visible face.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -127,7 +128,8 @@ Lamps<T> lamps_of(const Lit<T>& args, int64_t b) {
 // Whether the light varies over a face.
 template <class T>
 bool uses_position(const Lit<T>& args) {
-  return args.parameters && (light_count(args, Light::point, 4) > 0 || light_count(args, Light::specular, 2) > 0);
+  return args.parameters &&
+         (light_count(args, Light::point, 4) > 0 || light_count(args, Light::specular, 2) > 0);
 }
 
 // What a pixel shows: its point, normal and the direction towards the eye.
@@ -149,7 +151,8 @@ struct Highlight {
   T cosine, x, value;
   double log2_x = 0;
 
-  Highlight(const SurfacePoint<T>& surface, const Vec3<T>& l, T shininess) : cosine(surface.normal.dot(l)), value(0) {
+  Highlight(const SurfacePoint<T>& surface, const Vec3<T>& l, T shininess)
+      : cosine(surface.normal.dot(l)), value(0) {
     reflected = 2 * cosine * surface.normal - l;
     x = reflected.dot(surface.eye);
     if (!(x > 0)) return;
@@ -157,8 +160,8 @@ struct Highlight {
     value = static_cast<T>(exp2_of(shininess * log2_x));
   }
   // Adds the gradients of the normal, of l and of the direction towards the eye.
-  void backward(const SurfacePoint<T>& surface, const Vec3<T>& l, T shininess, T grad, SurfacePoint<T>& grads, Vec3<T>& grad_l,
-                T& grad_shininess) const {
+  void backward(const SurfacePoint<T>& surface, const Vec3<T>& l, T shininess, T grad,
+                SurfacePoint<T>& grads, Vec3<T>& grad_l, T& grad_shininess) const {
     if (!(x > 0)) return;
     grad_shininess += static_cast<T>(grad * value * log2_x * 0.69314718055994531);
     const T grad_x = grad * shininess * (value / x);
@@ -183,16 +186,20 @@ PixelLight<T> light_at(const Lamps<T>& lamps, const SurfacePoint<T>& surface, bo
     }
     const Unit<T> l(towards);
     const T strength = lamp.point ? 1 / (1 + lamp.falloff * towards.squaredNorm()) : l.length;
-    light.diffuse += (lamp.point ? strength * surface.normal.dot(l.unit) : surface.normal.dot(towards)) * color;
+    light.diffuse +=
+        (lamp.point ? strength * surface.normal.dot(l.unit) : surface.normal.dot(towards)) * color;
     if (highlights)
-      light.highlight += lamps.specular * strength * Highlight<T>(surface, l.unit, lamps.shininess).value * color;
+      light.highlight +=
+          lamps.specular * strength * Highlight<T>(surface, l.unit, lamps.shininess).value * color;
   }
   return light;
 }
 
-// Adds the gradients of the lamps and of the surface (its normal, point and direction towards the eye).
+// Adds the gradients of the lamps and of the surface (its normal, point and direction towards the
+// eye).
 template <class T>
-void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface, const PixelLight<T>& grad, Lamps<T>& grad_lamps,
+void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface,
+                    const PixelLight<T>& grad, Lamps<T>& grad_lamps,
                     SurfacePoint<T>& grad_surface) {
   grad_lamps.ambient += grad.diffuse.dot(lamps.ambient_color);
   grad_lamps.ambient_color += lamps.ambient * grad.diffuse;
@@ -205,7 +212,8 @@ void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface, const
     Vec3<T> grad_color = Vec3<T>::Zero(), grad_towards = Vec3<T>::Zero(), grad_l = Vec3<T>::Zero();
     T grad_strength = 0;
     const Unit<T> l(towards);
-    const T square = towards.squaredNorm(), strength = lamp.point ? 1 / (1 + lamp.falloff * square) : l.length;
+    const T square = towards.squaredNorm(),
+            strength = lamp.point ? 1 / (1 + lamp.falloff * square) : l.length;
     const T colored = grad.diffuse.dot(color);
     if (lamp.point) {
       const T cosine = surface.normal.dot(l.unit);
@@ -224,8 +232,8 @@ void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface, const
       grad_color += lamps.specular * strength * h.value * grad.highlight;
       grad_lamps.specular += shine * strength * h.value;
       grad_strength += shine * lamps.specular * h.value;
-      h.backward(surface, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_surface, grad_l,
-                 grad_lamps.shininess);
+      h.backward(surface, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_surface,
+                 grad_l, grad_lamps.shininess);
     }
     grad_lamp.intensity += grad_color.dot(lamp.color);
     grad_lamp.color += lamp.intensity * grad_color;
@@ -244,7 +252,8 @@ void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface, const
 
 // --- pixels
 
-constexpr double kShortest = 1e-5;  // an interpolated normal that is shorter stays short: its gradient is finite
+constexpr double kShortest =
+    1e-5;  // an interpolated normal that is shorter stays short: its gradient is finite
 
 // Pointers to the values of image b, and the sign of its front normals.
 template <class T>
@@ -277,7 +286,8 @@ struct Pixel {
 };
 
 template <class T>
-NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id, const T* weights, bool position) {
+NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id, const T* weights,
+                             bool position) {
   const int64_t F = view.image.num_faces;
   Pixel<T> p;
   p.face = id < F ? id : id - F;
@@ -295,30 +305,31 @@ NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id
   p.surface.point.setZero();
   p.surface.eye.setZero();
   if (position) {
-    for (int k = 0; k < 3; ++k) p.surface.point += weights[k] * load3(view.vertices + 3 * p.corners[k]);
+    for (int k = 0; k < 3; ++k)
+      p.surface.point += weights[k] * load3(view.vertices + 3 * p.corners[k]);
     p.to_eye = Unit<T>(load3(view.viewer) - view.viewer[3] * p.surface.point);
     p.surface.eye = p.to_eye.unit;
   }
   return p;
 }
 
-constexpr int64_t kSums =
-    18;  // per visible face: of the normal (smooth: of three corners), of the positions of the corners
+constexpr int64_t kSums = 18;  // per visible face: of the normal (smooth: of three corners), of the
+                               // positions of the corners
 
 // The sums of a block: of visible faces, and of the lamps.
 template <class T>
 struct LitSums {
   VisibleFaces visible;
-  std::vector<T> values;   // [count, kSums]
-  std::vector<T> faces;    // [count, 3] light of each face, or its gradient
+  std::vector<T> values;  // [count, kSums]
+  std::vector<T> faces;   // [count, 3] light of each face, or its gradient
   Lamps<T> lamps;
 };
 
 // The gradients of one pixel, or of one face if all its pixels are lit alike (weights: nullptr).
 template <class T>
-NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, const Pixel<T>& p,
-                               const T* weights, const PixelLight<T>& grad, bool position, Lamps<T>& grad_lamps,
-                               T* sums, T* grad_weights) {
+NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps,
+                               const Pixel<T>& p, const T* weights, const PixelLight<T>& grad,
+                               bool position, Lamps<T>& grad_lamps, T* sums, T* grad_weights) {
   SurfacePoint<T> grad_surface{Vec3<T>::Zero(), Vec3<T>::Zero(), Vec3<T>::Zero()};
   if (args.parameters)
     light_backward(lamps, p.surface, grad, grad_lamps, grad_surface);
@@ -353,19 +364,21 @@ void light_faces(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps,
   T* face = reserve(sums.faces, 3 * sums.visible.count);
   for (int64_t n = 1; n < sums.visible.count; ++n) {
     const Pixel<T> p = pixel_of<T>(args, view, sums.visible.ids[n], nullptr, false);
-    const Vec3<T> light = args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
+    const Vec3<T> light =
+        args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
     for (int k = 0; k < 3; ++k) face[3 * n + k] = light[k];
   }
 }
 
 template <class T>
-void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& blocks, int64_t begin, int64_t end,
-                  LitSums<T>& sums) {
+void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& blocks, int64_t begin,
+                  int64_t end, LitSums<T>& sums) {
   sums.visible.reserve_for(view.image.num_faces, blocks.most_visible(view.image.num_faces));
   sums.visible.find(args.at.face_index + begin, end - begin, view.image.num_faces);
 }
 
-// Pixels [begin, end) if the light depends only on the face. kColors: channels of colours; 0 means white.
+// Pixels [begin, end) if the light depends only on the face. kColors: channels of colours; 0 means
+// white.
 template <int64_t kColors, class T>
 void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const LitSums<T>& sums) {
   const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;
@@ -375,12 +388,14 @@ void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const Lit
     const bool drawn = face_index[n] >= 0;
     const T* face = faces + 3 * (drawn ? slots[face_index[n]] : 0);  // 0: any values
     T light[3];
-    for (int k = 0; k < 3; ++k) light[k] = kColors ? colors[kColors * n + (kColors == 3 ? k : 0)] * face[k] : face[k];
+    for (int k = 0; k < 3; ++k)
+      light[k] = kColors ? colors[kColors * n + (kColors == 3 ? k : 0)] * face[k] : face[k];
     for (int k = 0; k < 3; ++k) lit[k] = drawn ? light[k] : T(0);
   }
 }
 
-// Gradients of lit_faces_forward: those of colours, and in sums.values, from entry 9 of each face on, of its light.
+// Gradients of lit_faces_forward: those of colours, and in sums.values, from entry 9 of each face
+// on, of its light.
 template <int64_t kColors, class T>
 void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<T>& sums) {
   const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;
@@ -403,7 +418,8 @@ void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<
 
 // Pixels of a block.
 template <int64_t kColors, class T>
-void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block, LitSums<T>& sums) {
+void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block,
+                       LitSums<T>& sums) {
   const int64_t H = args.at.raster.height, W = args.at.raster.width;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   const View<T> view(args, b);
@@ -423,15 +439,17 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
     }
     const T* color = kColors ? args.colors + kColors * n : nullptr;
     const Pixel<T> p = pixel_of(args, view, id, args.at.weights + 3 * n, position);
-    const PixelLight<T> light =
-        args.parameters ? light_at(lamps, p.surface, lamps.highlights) : PixelLight<T>{p.surface.normal, Vec3<T>::Zero()};
+    const PixelLight<T> light = args.parameters ? light_at(lamps, p.surface, lamps.highlights)
+                                                : PixelLight<T>{p.surface.normal, Vec3<T>::Zero()};
     for (int k = 0; k < 3; ++k)
-      lit[k] = (kColors ? color[kColors == 3 ? k : 0] * light.diffuse[k] : light.diffuse[k]) + light.highlight[k];
+      lit[k] = (kColors ? color[kColors == 3 ? k : 0] * light.diffuse[k] : light.diffuse[k]) +
+               light.highlight[k];
   }
 }
 
 template <int64_t kColors, class T>
-void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block, LitSums<T>& sums) {
+void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block,
+                        LitSums<T>& sums) {
   const int64_t H = args.at.raster.height, W = args.at.raster.width;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   const View<T> view(args, b);
@@ -461,7 +479,8 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
     PixelLight<T> grads{load3(grad), load3(grad)};
     for (int k = 0; kColors && k < 3; ++k) grads.diffuse[k] *= color[kColors == 3 ? k : 0];
     if (grad_color) {
-      const Vec3<T> light = args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
+      const Vec3<T> light =
+          args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
       for (int k = 0; k < 3; ++k) grad_color[kColors == 3 ? k : 0] += light[k] * grad[k];
     }
     pixel_backward(args, view, lamps, p, weights, grads, position, sums.lamps, sum, grad_weights);
@@ -484,16 +503,19 @@ void scatter_lit(const Lit<T>& args, int64_t b, LitSums<T>& sums) {
     const int64_t id = sums.visible.ids[n], face = id < F ? id : id - F;
     const int64_t* corners = view.image.corners + 3 * face;
     const T* sum = sums.values.data() + kSums * n;
-    if (args.grad_normals && !args.smooth) add3(args.grad_normals + 3 * (view.first_normal + face), load3(sum));
+    if (args.grad_normals && !args.smooth)
+      add3(args.grad_normals + 3 * (view.first_normal + face), load3(sum));
     for (int k = 0; k < 3; ++k) {
       if (args.grad_normals && args.smooth)
         add3(args.grad_normals + 3 * (view.first_normal + corners[k]), load3(sum + 3 * k));
       if (args.at.grad_attributes && position)
-        add3(args.at.grad_attributes + 3 * (view.image.first_row + corners[k]), load3(sum + 9 + 3 * k));
+        add3(args.at.grad_attributes + 3 * (view.image.first_row + corners[k]),
+             load3(sum + 9 + 3 * k));
     }
   }
   if (args.parameters && args.grad_parameters)
-    for_parameters(args, b, sums.lamps, [&](int64_t n, T& value) { args.grad_parameters[n] += value; });
+    for_parameters(args, b, sums.lamps,
+                   [&](int64_t n, T& value) { args.grad_parameters[n] += value; });
 }
 
 template <class T, class Body>
@@ -507,15 +529,19 @@ void with_colors(const Lit<T>& args, const Body& body) {
 
 template <class T>
 void lit_forward(const Lit<T>& args) {
-  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces); };
+  const auto blocks_of = [&](int64_t b) {
+    return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces);
+  };
   int64_t most_blocks = 1;
-  for (int64_t b = 0; b < args.at.batch; ++b) most_blocks = std::max(most_blocks, blocks_of(b).count);
+  for (int64_t b = 0; b < args.at.batch; ++b)
+    most_blocks = std::max(most_blocks, blocks_of(b).count);
   parallel_for(args.at.batch * most_blocks, args.at.num_threads, [&](int64_t task) {
     const int64_t b = task / most_blocks, block = task % most_blocks;
     const RowBlocks blocks = blocks_of(b);
     if (block >= blocks.count) return;
-    with_colors(args,
-                [&](auto known) { lit_block_forward<known()>(args, blocks, b, block, thread_scratch<LitSums<T>>()); });
+    with_colors(args, [&](auto known) {
+      lit_block_forward<known()>(args, blocks, b, block, thread_scratch<LitSums<T>>());
+    });
   });
 }
 
@@ -528,11 +554,15 @@ void lit_backward(const Lit<T>& args) {
   if (args.grad_normals) std::fill_n(args.grad_normals, 3 * normals, T(0));
   if (args.at.grad_attributes) std::fill_n(args.at.grad_attributes, 3 * vertices, T(0));
   if (args.grad_parameters) std::fill_n(args.grad_parameters, args.num_parameters, T(0));
-  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces); };
+  const auto blocks_of = [&](int64_t b) {
+    return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces);
+  };
   sum_blocks<LitSums<T>>(
       args.at.batch, true, args.at.num_threads, [&](int64_t b) { return blocks_of(b).count; },
       [&](int64_t b, int64_t block, LitSums<T>& sums) {
-        with_colors(args, [&](auto known) { lit_block_backward<known()>(args, blocks_of(b), b, block, sums); });
+        with_colors(args, [&](auto known) {
+          lit_block_backward<known()>(args, blocks_of(b), b, block, sums);
+        });
       },
       [&](int64_t b, LitSums<T>& sums) { scatter_lit(args, b, sums); });
 }

@@ -1,15 +1,20 @@
-// The gradient of Kato and Harada 2019, which reaches one pixel: if a surface ends between two pixels, the loss
-// decides whether its border should move, and the point seen in the pixel of the surface moves.
+// The gradient of Kato and Harada 2019, which reaches one pixel: if a surface ends between two
+// pixels, the loss decides whether its border should move, and the point seen in the pixel of the
+// surface moves.
 //
-// I is the coverage (0 or 1) or a colour [C] (products are sums over its channels), g the gradient of the loss with
-// respect to I, both on the raster H x W; i and j are neighbours in a row, j to the right. If the content moves right
-// by a pixel (2 / W), I_j becomes I_i, and the loss falls at the rate
-//     right = -(I_i - I_j) g_j W / 2;      if it moves left, I_i becomes I_j:      left = -(I_j - I_i) g_i W / 2.
-// A covered pixel sums both rates over its pairs with neighbours before which its surface ends, and takes the better
-// direction, or none. The result is distributed to the corners of its face by their weights at its centre, which are
-// treated as constants. y is treated in the same way, upwards and with H. z gets nothing.
+// I is the coverage (0 or 1) or a colour [C] (products are sums over its channels), g the gradient
+// of the loss with respect to I, both on the raster H x W; i and j are neighbours in a row, j to
+// the right. If the content moves right by a pixel (2 / W), I_j becomes I_i, and the loss falls at
+// the rate
+//     right = -(I_i - I_j) g_j W / 2;      if it moves left, I_i becomes I_j:      left = -(I_j -
+//     I_i) g_i W / 2.
+// A covered pixel sums both rates over its pairs with neighbours before which its surface ends, and
+// takes the better direction, or none. The result is distributed to the corners of its face by
+// their weights at its centre, which are treated as constants. y is treated in the same way,
+// upwards and with H. z gets nothing.
 //
-// A surface ends before the background. In colours it also ends before another surface behind it: see is_in_front.
+// A surface ends before the background. In colours it also ends before another surface behind it:
+// see is_in_front.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -57,28 +62,33 @@ struct LocalCoverage : LocalRaster<T> {
   }
 };
 
-// 1 / z of the plane of a face at (x, y), -z without perspective: affine on the screen, and larger if it is nearer.
+// 1 / z of the plane of a face at (x, y), -z without perspective: affine on the screen, and larger
+// if it is nearer.
 template <class T>
 double nearness(const Triangle<T>& t, double x, double y, bool perspective) {
-  const auto at = [&](int k) { return perspective ? 1 / static_cast<double>(t.z[k]) : -static_cast<double>(t.z[k]); };
-  const double x1 = double(t.x[1]) - t.x[0], y1 = double(t.y[1]) - t.y[0], x2 = double(t.x[2]) - t.x[0],
-               y2 = double(t.y[2]) - t.y[0], det = x1 * y2 - y1 * x2;
+  const auto at = [&](int k) {
+    return perspective ? 1 / static_cast<double>(t.z[k]) : -static_cast<double>(t.z[k]);
+  };
+  const double x1 = double(t.x[1]) - t.x[0], y1 = double(t.y[1]) - t.y[0],
+               x2 = double(t.x[2]) - t.x[0], y2 = double(t.y[2]) - t.y[0], det = x1 * y2 - y1 * x2;
   x -= t.x[0], y -= t.y[0];
   return at(0) + ((x * y2 - y * x2) * (at(1) - at(0)) + (x1 * y - y1 * x) * (at(2) - at(0))) / det;
 }
 
-// Whether face f, seen in pixel (row, column), ends in front of face g, seen in the neighbour (r, c). Faces with a
-// common corner (by place: a seam may have doubled its vertices) belong to one surface. Other faces may, too, if
-// whole faces are between the two pixels; their planes then cross between the pixels, or almost coincide.
+// Whether face f, seen in pixel (row, column), ends in front of face g, seen in the neighbour (r,
+// c). Faces with a common corner (by place: a seam may have doubled its vertices) belong to one
+// surface. Other faces may, too, if whole faces are between the two pixels; their planes then cross
+// between the pixels, or almost coincide.
 template <class T>
-bool is_in_front(const LocalRaster<T>& image, const Triangle<T>& f, const Triangle<T>& g, int64_t row, int64_t column,
-                 int64_t r, int64_t c) {
+bool is_in_front(const LocalRaster<T>& image, const Triangle<T>& f, const Triangle<T>& g,
+                 int64_t row, int64_t column, int64_t r, int64_t c) {
   for (int k = 0; k < 3; ++k)
     for (int m = 0; m < 3; ++m)
       if (f.x[k] == g.x[m] && f.y[k] == g.y[m] && f.z[k] == g.z[m]) return false;
   const auto gap = [&](int64_t at_row, int64_t at_column) {
     const double x = pixel_centre<double>(at_column, image.raster.width),
-                 y = -pixel_centre<double>(at_row, image.raster.height), of_f = nearness(f, x, y, image.perspective);
+                 y = -pixel_centre<double>(at_row, image.raster.height),
+                 of_f = nearness(f, x, y, image.perspective);
     return of_f - nearness(g, x, y, image.perspective) - 1e-4 * std::abs(of_f);
   };
   return gap(row, column) > 0 && gap(r, c) > 0;
@@ -90,15 +100,18 @@ struct LocalColors : LocalRaster<T> {
   int64_t channels;
 
   const T* color(int64_t row, int64_t column) const {
-    return background && this->id(row, column) < 0 ? background
-                                                   : pixels + (row * this->raster.width + column) * channels;
+    return background && this->id(row, column) < 0
+               ? background
+               : pixels + (row * this->raster.width + column) * channels;
   }
   bool ends(int64_t row, int64_t column, int64_t r, int64_t c) const {
     const int32_t f = this->id(row, column), g = this->id(r, c);
-    return g < 0 || (f != g && is_in_front(*this, this->triangle(f), this->triangle(g), row, column, r, c));
+    return g < 0 ||
+           (f != g && is_in_front(*this, this->triangle(f), this->triangle(g), row, column, r, c));
   }
   void products(int64_t row, int64_t column, int64_t r, int64_t c, T& own, T& other) const {
-    const T *a = color(row, column), *b = color(r, c), *of_a = grad_resolved + this->image_pixel(row, column) * channels,
+    const T *a = color(row, column), *b = color(r, c),
+            *of_a = grad_resolved + this->image_pixel(row, column) * channels,
             *of_b = grad_resolved + this->image_pixel(r, c) * channels;
     own = other = 0;
     for (int64_t k = 0; k < channels; ++k) {
@@ -114,8 +127,8 @@ template <class T>
 struct Rates {
   T up = 0, down = 0;
 
-  // The surface ends before the upper (lower) neighbour. `own` and `other` are (I - I of the neighbour) times the
-  // gradients of the pixel and of that neighbour.
+  // The surface ends before the upper (lower) neighbour. `own` and `other` are (I - I of the
+  // neighbour) times the gradients of the pixel and of that neighbour.
   void add_upper_end(T own, T other) {
     up -= other;
     down += own;
@@ -125,8 +138,8 @@ struct Rates {
     down -= other;
   }
 
-  // d loss / d coordinate of the better direction, or 0 if it does not lower the loss or is not clearly better. NaN is
-  // kept.
+  // d loss / d coordinate of the better direction, or 0 if it does not lower the loss or is not
+  // clearly better. NaN is kept.
   T gradient(T per_pixel, T eps) const {
     const T u = up * per_pixel, d = down * per_pixel;
     if (!(u - d == u - d)) return u - d;
@@ -142,7 +155,8 @@ bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, Size rast
   const T width = static_cast<T>(raster.width), height = static_cast<T>(raster.height);
   const BarycentricMatrix<T> matrix = barycentric_matrix(t, width, height);
   const T x = static_cast<T>(column), y = static_cast<T>(raster.height - 1 - row);
-  for (int k = 0; k < 3; ++k) w[k] = clamp_weight(matrix.m[k][0] * x + matrix.m[k][1] * y + matrix.m[k][2]);
+  for (int k = 0; k < 3; ++k)
+    w[k] = clamp_weight(matrix.m[k][0] * x + matrix.m[k][1] * y + matrix.m[k][2]);
   const T sum = w[0] + w[1] + w[2];
   for (T& weight : w) weight /= sum;
   return sum > 0;
@@ -187,7 +201,8 @@ void find_pull(const Image& image, int64_t row, int64_t column, Pulls<T>& pulls)
   const T grad_x = x.gradient(static_cast<T>(raster.width) / 2, image.eps);
   const T grad_y = y.gradient(static_cast<T>(raster.height) / 2, image.eps);
   if (grad_x != 0 || grad_y != 0)
-    pulls.list[pulls.count++] = {static_cast<int32_t>(row), static_cast<int32_t>(column), grad_x, grad_y};
+    pulls.list[pulls.count++] = {static_cast<int32_t>(row), static_cast<int32_t>(column), grad_x,
+                                 grad_y};
 }
 
 // Adds them to the corners of their faces, in the order of the pixels.
@@ -199,7 +214,9 @@ void add_pulls(const LocalRaster<T>& image, const Pulls<T>& pulls, T* grad_verti
     const bool reversed = id >= image.num_faces;
     const int64_t* face = image.faces + 3 * (reversed ? id - image.num_faces : id);
     T w[3];
-    if (!screen_weights(load_triangle(image.vertices, face, reversed), pull.row, pull.column, image.raster, w)) continue;
+    if (!screen_weights(load_triangle(image.vertices, face, reversed), pull.row, pull.column,
+                        image.raster, w))
+      continue;
     for (int k = 0; k < 3; ++k) {
       T* grad = grad_vertices + 3 * face[reversed ? 2 - k : k];
       grad[0] += w[k] * pull.x;
@@ -210,7 +227,8 @@ void add_pulls(const LocalRaster<T>& image, const Pulls<T>& pulls, T* grad_verti
 
 // grad_vertices of all images; image_of(b) describes one of them.
 template <class T, class ImageOf>
-void local_pulls(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads, const ImageOf& image_of) {
+void local_pulls(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads,
+                 const ImageOf& image_of) {
   std::fill_n(grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
   const RowBlocks blocks(raster, 0);
   sum_blocks<Pulls<T>>(
@@ -220,7 +238,8 @@ void local_pulls(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int nu
         reserve(pulls.list, blocks.rows * raster.width);
         pulls.count = 0;
         for (int64_t row = blocks.first(block); row < blocks.last(block); ++row)
-          for (int64_t column = 0; column < raster.width; ++column) find_pull(image, row, column, pulls);
+          for (int64_t column = 0; column < raster.width; ++column)
+            find_pull(image, row, column, pulls);
       },
       [&](int64_t b, const Pulls<T>& pulls) {
         add_pulls<T>(image_of(b), pulls, grad_vertices + 3 * mesh.vertex_start(b));
@@ -228,11 +247,18 @@ void local_pulls(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int nu
 }
 
 template <class T>
-LocalRaster<T> raster_of_image(const MeshBatch<T>& mesh, Size size, bool anti_aliasing, bool perspective, T eps,
-                               const int32_t* face_index, int64_t b) {
+LocalRaster<T> raster_of_image(const MeshBatch<T>& mesh, Size size, bool anti_aliasing,
+                               bool perspective, T eps, const int32_t* face_index, int64_t b) {
   const Size raster = raster_of(size, anti_aliasing);
-  return {mesh.image_vertices(b), mesh.image_faces(b), mesh.face_count(b), raster, size, anti_aliasing,
-          perspective,            eps,                 face_index + b * raster.pixels()};
+  return {mesh.image_vertices(b),
+          mesh.image_faces(b),
+          mesh.face_count(b),
+          raster,
+          size,
+          anti_aliasing,
+          perspective,
+          eps,
+          face_index + b * raster.pixels()};
 }
 
 }  // namespace
@@ -241,9 +267,9 @@ template <class T>
 void local_gradient(const SilhouetteBackward<T>& args) {
   const Size raster = raster_of(args.image, args.anti_aliasing);
   local_pulls(args.mesh, raster, args.grad_vertices, args.num_threads, [&](int64_t b) {
-    return LocalCoverage<T>{
-        raster_of_image(args.mesh, args.image, args.anti_aliasing, true, args.eps, args.face_index, b),
-        args.grad_alpha + b * args.image.pixels()};
+    return LocalCoverage<T>{raster_of_image(args.mesh, args.image, args.anti_aliasing, true,
+                                            args.eps, args.face_index, b),
+                            args.grad_alpha + b * args.image.pixels()};
   });
 }
 
@@ -253,7 +279,8 @@ void local_edges_backward(const EdgesBackward<T>& args) {
   const int64_t C = args.channels;
   local_pulls(args.mesh, raster, args.grad_vertices, args.num_threads, [&](int64_t b) {
     return LocalColors<T>{
-        raster_of_image(args.mesh, args.image, args.anti_aliasing, args.perspective, args.eps, args.face_index, b),
+        raster_of_image(args.mesh, args.image, args.anti_aliasing, args.perspective, args.eps,
+                        args.face_index, b),
         args.pixels + b * raster.pixels() * C,
         args.background ? args.background + (args.background_batch == 1 ? 0 : b * C) : nullptr,
         args.grad_resolved + b * args.image.pixels() * C, C};

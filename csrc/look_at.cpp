@@ -1,5 +1,5 @@
-// Cameras given by a place and a direction, forward and backward: one call instead of about thirty tensor operations.
-// Poses that are not finite are handled here.
+// Cameras given by a place and a direction, forward and backward: one call instead of about thirty
+// tensor operations. Poses that are not finite are handled here.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -17,12 +17,15 @@ template <class T>
 using Matrix34 = Eigen::Matrix<T, 3, 4, Eigen::RowMajor>;
 using Vec3d = Vec3<double>;
 
-constexpr double kShortest = 1e-5;  // as published: a shorter vector is divided by this, and stays short
+constexpr double kShortest =
+    1e-5;  // as published: a shorter vector is divided by this, and stays short
 constexpr double kRadians = 3.14159265358979323846 / 180;  // of a degree
-constexpr double kLargest = 1e15;   // up to this size lengths and their derivatives do not overflow, even in float
+constexpr double kLargest =
+    1e15;  // up to this size lengths and their derivatives do not overflow, even in float
 
-// Lengths and cross products round as the published ones, which were compiled with fused multiply-adds. These are the
-// only fused multiply-adds in this library; they are written explicitly, so that every processor gives the same bits.
+// Lengths and cross products round as the published ones, which were compiled with fused
+// multiply-adds. These are the only fused multiply-adds in this library; they are written
+// explicitly, so that every processor gives the same bits.
 template <class T>
 T length(const Vec3<T>& v) {
   return std::sqrt(std::fma(v[2], v[2], std::fma(v[1], v[1], v[0] * v[0])));
@@ -63,10 +66,12 @@ struct Axes {
   bool usable;
 
   Axes(const LookAt<T>& args, int64_t b) : usable(true) {
-    const Vec3d place = parameter(args.eye, args.eye_each, b), target = parameter(args.at, args.at_each, b);
+    const Vec3d place = parameter(args.eye, args.eye_each, b),
+                target = parameter(args.at, args.at_each, b);
     forward = (args.along ? target : Vec3d(target - place)).template cast<T>();
     up = parameter(args.up, args.up_each, b).template cast<T>();
-    for (int k = 0; k < 3; ++k) usable = usable && std::abs(forward[k]) < T(kLargest) && std::abs(up[k]) < T(kLargest);
+    for (int k = 0; k < 3; ++k)
+      usable = usable && std::abs(forward[k]) < T(kLargest) && std::abs(up[k]) < T(kLargest);
     if (!usable) return;
     z = normalized(forward);
     sideways = cross(up, z);
@@ -93,7 +98,8 @@ void look_at_forward(const LookAt<T>& args) {
     const T scale = args.perspective ? T(1) : static_cast<T>(view);
     const T intrinsics[6] = {scale, 0, 0, 0, -scale, 0};
     std::copy_n(intrinsics, 6, camera + kIntrinsics);
-    for (int k = 0; k < 3; ++k) camera[kOrigin + k] = static_cast<T>(parameter(args.eye, args.eye_each, b)[k]);
+    for (int k = 0; k < 3; ++k)
+      camera[kOrigin + k] = static_cast<T>(parameter(args.eye, args.eye_each, b)[k]);
     const double angle = static_cast<T>(view * kRadians);  // rounded, as published
     camera[kExtent] = args.perspective ? static_cast<T>(std::tan(angle)) : T(1);
   }
@@ -105,8 +111,8 @@ struct PoseGradient {
   Vec3d forward = Vec3d::Zero(), up = Vec3d::Zero();
 };
 
-// In double: for float inputs, divisions by numbers as small as 1e-5 then cannot overflow. An upstream gradient that
-// is infinite or NaN makes the gradient NaN.
+// In double: for float inputs, divisions by numbers as small as 1e-5 then cannot overflow. An
+// upstream gradient that is infinite or NaN makes the gradient NaN.
 template <class T>
 PoseGradient pose_gradient(const Axes<T>& axes, const Matrix34<T>& grad_matrix, bool right_handed) {
   PoseGradient grad;
@@ -118,10 +124,12 @@ PoseGradient pose_gradient(const Axes<T>& axes, const Matrix34<T>& grad_matrix, 
   }
   const Vec3d up = axes.up.template cast<double>();
   const Vec3d x = axes.x.template cast<double>(), z = axes.z.template cast<double>();
-  const Eigen::Matrix<double, 3, 3> grad_rows = grad_matrix.template leftCols<3>().transpose().template cast<double>();
-  Vec3d grad_x = right_handed ? Vec3d(-grad_rows.col(0)) : Vec3d(grad_rows.col(0)), grad_z = grad_rows.col(2);
-  const Vec3d grad_upright =
-      normalized_backward(axes.upright.template cast<double>(), -grad_rows.col(1));  // gradient of z x x
+  const Eigen::Matrix<double, 3, 3> grad_rows =
+      grad_matrix.template leftCols<3>().transpose().template cast<double>();
+  Vec3d grad_x = right_handed ? Vec3d(-grad_rows.col(0)) : Vec3d(grad_rows.col(0)),
+        grad_z = grad_rows.col(2);
+  const Vec3d grad_upright = normalized_backward(axes.upright.template cast<double>(),
+                                                 -grad_rows.col(1));  // gradient of z x x
   grad_x += cross(grad_upright, z);
   grad_z += cross(x, grad_upright);
   const Vec3d grad_sideways =
@@ -153,17 +161,20 @@ void look_at_backward(const LookAt<T>& args) {
   clear(args.grad_view, args.view_each, 1);
   for (int64_t b = 0; b < args.batch; ++b) {
     const T* grad_camera = args.grad_camera + kCamera * b;
-    const PoseGradient grad = pose_gradient(
-        Axes<T>(args, b), Matrix34<T>(Eigen::Map<const Matrix34<T>>(grad_camera)), args.right_handed);
+    const PoseGradient grad =
+        pose_gradient(Axes<T>(args, b), Matrix34<T>(Eigen::Map<const Matrix34<T>>(grad_camera)),
+                      args.right_handed);
     const Vec3d of_forward = clamped<T>(grad.forward), of_up = clamped<T>(grad.up);
     Vec3d of_eye = Eigen::Map<const Vec3<T>>(grad_camera + kOrigin).template cast<double>();
     if (!args.along) of_eye -= of_forward;
     add(args.grad_eye, args.eye_each, b, of_eye.data(), 3);
     add(args.grad_at, args.at_each, b, of_forward.data(), 3);
     add(args.grad_up, args.up_each, b, of_up.data(), 3);
-    const double tangent = std::tan(static_cast<double>(static_cast<T>(args.view[args.view_each ? b : 0] * kRadians)));
-    const double of_view = args.perspective ? grad_camera[kExtent] * (1 + tangent * tangent) * kRadians
-                                            : double(grad_camera[kIntrinsics]) - double(grad_camera[kIntrinsics + 4]);
+    const double tangent =
+        std::tan(static_cast<double>(static_cast<T>(args.view[args.view_each ? b : 0] * kRadians)));
+    const double of_view =
+        args.perspective ? grad_camera[kExtent] * (1 + tangent * tangent) * kRadians
+                         : double(grad_camera[kIntrinsics]) - double(grad_camera[kIntrinsics + 4]);
     add(args.grad_view, args.view_each, b, &of_view, 1);
   }
 }

@@ -1,5 +1,5 @@
-// Normals of faces and of vertices. Computed in double, so that products of float coordinates neither over- nor
-// underflow.
+// Normals of faces and of vertices. Computed in double, so that products of float coordinates
+// neither over- nor underflow.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -19,8 +19,10 @@ using Vec3 = Eigen::Vector3d;
 constexpr double kLargest = 1e12;  // coordinates beyond this do not count
 
 // A shorter product counts as no area: its derivative could overflow.
-template <class T> constexpr double kShortest = 1e-290;
-template <> constexpr double kShortest<float> = std::numeric_limits<float>::min();
+template <class T>
+constexpr double kShortest = 1e-290;
+template <>
+constexpr double kShortest<float> = std::numeric_limits<float>::min();
 
 struct Direction {
   Vec3 unit;
@@ -44,7 +46,8 @@ NMR_INLINE Vec3 direction_backward(const Direction& d, const Vec3& grad) {
 // Whether a vertex is used: finite, with coordinates below kLargest. Others count as the origin.
 template <class T>
 NMR_INLINE bool counts(const T* vertex) {
-  return std::abs(vertex[0]) < T(kLargest) && std::abs(vertex[1]) < T(kLargest) && std::abs(vertex[2]) < T(kLargest);
+  return std::abs(vertex[0]) < T(kLargest) && std::abs(vertex[1]) < T(kLargest) &&
+         std::abs(vertex[2]) < T(kLargest);
 }
 
 template <class T>
@@ -66,7 +69,8 @@ NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face) {
 }
 
 // Adds the gradient of the product to the corners.
-NMR_INLINE void sides_backward(const Sides& s, const int64_t* face, const Vec3& grad_across, Vec3* grad_vertices) {
+NMR_INLINE void sides_backward(const Sides& s, const int64_t* face, const Vec3& grad_across,
+                               Vec3* grad_vertices) {
   const Vec3 grad_a = s.b.cross(grad_across), grad_b = grad_across.cross(s.a);
   grad_vertices[face[0]] += grad_a;
   grad_vertices[face[2]] += grad_b;
@@ -111,12 +115,14 @@ void normals_forward(const Normals<T>& args) {
     T* normals = args.normals + 3 * first_normal(args, b);
     if (args.smooth) {
       const std::vector<Vec3> sums = vertex_sums(mesh, b);
-      for (size_t v = 0; v < sums.size(); ++v) store(normals + 3 * v, direction_of<T>(sums[v]).unit);
+      for (size_t v = 0; v < sums.size(); ++v)
+        store(normals + 3 * v, direction_of<T>(sums[v]).unit);
       return;
     }
     for (int64_t f = 0; f < mesh.face_count(b); ++f)
       store(normals + 3 * f,
-            direction_of<T>(sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f).across).unit);
+            direction_of<T>(sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f).across)
+                .unit);
   });
 }
 
@@ -125,26 +131,30 @@ void normals_backward(const Normals<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   constexpr double largest = std::numeric_limits<T>::max();
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    const T *vertices = mesh.image_vertices(b), *grad_normals = args.grad_normals + 3 * first_normal(args, b);
+    const T *vertices = mesh.image_vertices(b),
+            *grad_normals = args.grad_normals + 3 * first_normal(args, b);
     const int64_t V = mesh.vertex_count(b), *face = mesh.image_faces(b);
     std::vector<Vec3> grads(V, Vec3::Zero()), grad_sums;
     if (args.smooth) {
       grad_sums = vertex_sums(mesh, b);
       for (int64_t v = 0; v < V; ++v)
-        grad_sums[v] = direction_backward(direction_of<T>(grad_sums[v]), load(grad_normals + 3 * v));
+        grad_sums[v] =
+            direction_backward(direction_of<T>(grad_sums[v]), load(grad_normals + 3 * v));
     }
     for (int64_t f = 0; f < mesh.face_count(b); ++f, face += 3) {
       const Sides sides = sides_of(vertices, face);
-      const Vec3 grad_across = args.smooth
-                                   ? Vec3(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
-                                   : direction_backward(direction_of<T>(sides.across), load(grad_normals + 3 * f));
+      const Vec3 grad_across =
+          args.smooth
+              ? Vec3(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
+              : direction_backward(direction_of<T>(sides.across), load(grad_normals + 3 * f));
       sides_backward(sides, face, grad_across, grads.data());
     }
     T* grad_vertices = args.grad_vertices + 3 * mesh.vertex_start(b);
     for (int64_t v = 0; v < V; ++v)
       for (int k = 0; k < 3; ++k)
-        grad_vertices[3 * v + k] =
-            counts(vertices + 3 * v) ? static_cast<T>(std::clamp(grads[v][k], -largest, largest)) : T(0);
+        grad_vertices[3 * v + k] = counts(vertices + 3 * v)
+                                       ? static_cast<T>(std::clamp(grads[v][k], -largest, largest))
+                                       : T(0);
   });
 }
 

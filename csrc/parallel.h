@@ -18,7 +18,8 @@
 #include "scratch.h"
 
 // Several x86-64 levels in one program: see levels.h.
-#if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
+#if defined(NMR_MULTIVERSION) && defined(__x86_64__) && defined(__GLIBC__) && \
+    !defined(__clang__) && __GNUC__ >= 12
 #define NMR_LEVELS 1
 #else
 #define NMR_LEVELS 0
@@ -45,12 +46,15 @@ NMR_INLINE int64_t lowest_bit(uint64_t bits) {
 #endif
 }
 
-// The highest level of this processor that inner loops are compiled for (levels.h): 4 for x86-64-v4, 3 for v3, else 1.
+// The highest level of this processor that inner loops are compiled for (levels.h): 4 for
+// x86-64-v4, 3 for v3, else 1.
 inline int cpu_level() {
 #if NMR_LEVELS
   static const int level = [] {
     const char* wanted = std::getenv("NMR_CPU_LEVEL");
-    const auto is_wanted = [wanted](const char* name) { return wanted && std::strcmp(wanted, name) == 0; };
+    const auto is_wanted = [wanted](const char* name) {
+      return wanted && std::strcmp(wanted, name) == 0;
+    };
     if (is_wanted("base") || !__builtin_cpu_supports("x86-64-v3")) return 1;
     return is_wanted("v3") || !__builtin_cpu_supports("x86-64-v4") ? 3 : 4;
   }();
@@ -60,9 +64,10 @@ inline int cpu_level() {
 #endif
 }
 
-// Keeps loops on one thread while cores are oversubscribed. A loop ends when its last thread has ended, and a thread
-// without a core may need many times as long as the whole loop. A caller that waited for such a thread
-// therefore works alone for 50 times as long as it waited, so that no more than a fiftieth of the time is lost.
+// Keeps loops on one thread while cores are oversubscribed. A loop ends when its last thread has
+// ended, and a thread without a core may need many times as long as the whole loop. A caller that
+// waited for such a thread therefore works alone for 50 times as long as it waited, so that no more
+// than a fiftieth of the time is lost.
 class OversubscriptionGuard {
  public:
   static OversubscriptionGuard& shared() {
@@ -70,7 +75,8 @@ class OversubscriptionGuard {
 #if !defined(_WIN32)
     // fork copies OpenMP's list of threads, but not the threads: a loop in the child would wait for
     // them. If the parent has never wanted several threads, the child may start its own.
-    static const int registered = pthread_atfork(nullptr, nullptr, [] { guard.alone_until_ = kForEver; });
+    static const int registered =
+        pthread_atfork(nullptr, nullptr, [] { guard.alone_until_ = kForEver; });
     static_cast<void>(registered);
 #endif
     return guard;
@@ -84,15 +90,16 @@ class OversubscriptionGuard {
   static int64_t on_core() {
 #if defined(CLOCK_THREAD_CPUTIME_ID)
     timespec time;
-    if (clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time) == 0) return time.tv_sec * INT64_C(1000000000) + time.tv_nsec;
+    if (clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time) == 0)
+      return time.tv_sec * INT64_C(1000000000) + time.tv_nsec;
 #endif
     return now();
   }
 
   bool allows_threads() const { return now() >= alone_until_.load(std::memory_order_relaxed); }
 
-  // finished: when the caller ran out of iterations. worked: the longest time that another thread spent on a core;
-  // stopped: the longest time that another thread spent without one.
+  // finished: when the caller ran out of iterations. worked: the longest time that another thread
+  // spent on a core; stopped: the longest time that another thread spent without one.
   void record_wait(int64_t finished, int64_t worked, int64_t stopped) {
     const int64_t time = now(), waited = time - finished;
     if (waited < kPatience || (waited < worked + kPatience && stopped < waited / 2)) return;
@@ -105,9 +112,9 @@ class OversubscriptionGuard {
   std::atomic<int64_t> alone_until_{0};
 };
 
-// Calls body(i) for i in [0, count), each i on one thread, on up to num_threads threads. Iterations must be independent,
-// so that the result does not depend on the number of threads. An exception (std::bad_alloc) reaches the caller after
-// all threads have stopped.
+// Calls body(i) for i in [0, count), each i on one thread, on up to num_threads threads. Iterations
+// must be independent, so that the result does not depend on the number of threads. An exception
+// (std::bad_alloc) reaches the caller after all threads have stopped.
 template <class Body>
 void parallel_for(int64_t count, int num_threads, const Body& body) {
   const int threads = static_cast<int>(count < num_threads ? count : num_threads);
@@ -135,7 +142,8 @@ void parallel_for(int64_t count, int num_threads, const Body& body) {
         if (!failure) failure = std::current_exception();
       }
     }
-    const int64_t end = OversubscriptionGuard::now(), with_core = OversubscriptionGuard::on_core() - start_on_core;
+    const int64_t end = OversubscriptionGuard::now(),
+                  with_core = OversubscriptionGuard::on_core() - start_on_core;
 #pragma omp critical(nmr_thread)
     if (&scratch == &mine) {
       finished = end;

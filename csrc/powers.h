@@ -1,13 +1,13 @@
-// Powers and logarithms with the same bits on every processor. (The C library chooses between versions that round
-// differently.)
+// Powers and logarithms with the same bits on every processor. (The C library chooses between
+// versions that round differently.)
 #pragma once
 
 #include <cmath>
 
 namespace nmr {
 
-// log2(x) of a positive, finite x, to a few units in the last place: x = m 2^e with m in [sqrt(1/2), sqrt(2)], and
-// ln m = 2 (s + s^3 / 3 + s^5 / 5 + ...) with s = (m - 1) / (m + 1).
+// log2(x) of a positive, finite x, to a few units in the last place: x = m 2^e with m in
+// [sqrt(1/2), sqrt(2)], and ln m = 2 (s + s^3 / 3 + s^5 / 5 + ...) with s = (m - 1) / (m + 1).
 inline double log2_of(double x) {
   int exponent;
   double m = std::frexp(x, &exponent);

@@ -1,4 +1,5 @@
-// Headers of most kernels, read once per build (CMakeLists.txt). Every file still includes all that it uses.
+// Headers of most kernels, read once per build (CMakeLists.txt). Every file still includes all that
+// it uses.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

@@ -10,23 +10,25 @@ NMR_INLINE bool is_finite(T value) {
   return std::abs(value) <= std::numeric_limits<T>::max();
 }
 
-// The image of a vertex. If there is none (the vertex is not finite, in the plane of the eye, or so close to it that x
-// / z^2 overflows), `size` is not finite and all else is undefined. (One number, because compilers do not vectorize
-// loops over `&&`.)
+// The image of a vertex. If there is none (the vertex is not finite, in the plane of the eye, or so
+// close to it that x / z^2 overflows), `size` is not finite and all else is undefined. (One number,
+// because compilers do not vectorize loops over `&&`.)
 template <class T>
 struct ProjectedVertex {
   T inverse_z;
-  T px, py;    // before the distortion
-  T cx, cy;    // the nearest point within the reach of the distortion: (px, py) itself, or share times that
+  T px, py;  // before the distortion
+  T cx, cy;  // the nearest point within the reach of the distortion: (px, py) itself, or share
+             // times that
   T share;
-  T qx, qy;    // after it, divided by the extent
-  T x, y, z;   // in renderer space
-  T slope;     // bound of the derivative of extent q by the vertex in camera axes, up to a factor below 10
-  T size;      // |x| + |y| + |z|
+  T qx, qy;   // after it, divided by the extent
+  T x, y, z;  // in renderer space
+  T slope;    // bound of the derivative of extent q by the vertex in camera axes, up to a factor
+              // below 10
+  T size;     // |x| + |y| + |z|
 };
 
-// x, y, z are relative to the origin. Images use divisions, which round as the published ones. Derivatives (kExact
-// false) use one reciprocal instead, which saves time.
+// x, y, z are relative to the origin. Images use divisions, which round as the published ones.
+// Derivatives (kExact false) use one reciprocal instead, which saves time.
 template <class T, bool kPerspective, int kDistortion, bool kExact>
 NMR_INLINE ProjectedVertex<T> project_vertex(const Lens<T>& c, T x, T y, T z) {
   ProjectedVertex<T> s;
@@ -62,12 +64,14 @@ NMR_INLINE ProjectedVertex<T> project_vertex(const Lens<T>& c, T x, T y, T z) {
   s.qy = kExact ? s.qy / c.extent : s.qy * c.inverse_extent;
   s.x = c.k[0] * s.qx + c.k[1] * s.qy + c.k[2];
   s.y = c.k[3] * s.qx + c.k[4] * s.qy + c.k[5];
-  s.size = s.slope < kLimit<T> ? std::abs(s.x) + std::abs(s.y) + std::abs(s.z) : std::numeric_limits<T>::infinity();
+  s.size = s.slope < kLimit<T> ? std::abs(s.x) + std::abs(s.y) + std::abs(s.z)
+                               : std::numeric_limits<T>::infinity();
   return s;
 }
 
 template <class T, bool kPerspective, int kDistortion>
-NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T* __restrict points) {
+NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices,
+                              T* __restrict points) {
   const T infinity = std::numeric_limits<T>::infinity();
   for (int l = 0; l < kGroup; ++l) {
     const ProjectedVertex<T> s = project_vertex<T, kPerspective, kDistortion, true>(
@@ -78,14 +82,17 @@ NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices, T*
   }
 }
 
-// Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial sums. A vertex without
-// an image, or whose gradient would overflow although the upstream gradient is finite, gets gradient 0 and contributes
-// 0 to the camera. If the upstream gradient is infinite or NaN, that of the vertex and of the camera is NaN.
+// Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial
+// sums. A vertex without an image, or whose gradient would overflow although the upstream gradient
+// is finite, gets gradient 0 and contributes 0 to the camera. If the upstream gradient is infinite
+// or NaN, that of the vertex and of the camera is NaN.
 template <class T, bool kPerspective, int kDistortion, bool kSumCamera>
-NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, const T* __restrict grad_points,
-                               T* __restrict grad_vertices, T (*__restrict sums)[kGroup]) {
+NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices,
+                               const T* __restrict grad_points, T* __restrict grad_vertices,
+                               T (*__restrict sums)[kGroup]) {
   for (int l = 0; l < kGroup; ++l) {
-    T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1], z = vertices[3 * l + 2] - c.o[2];
+    T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1],
+      z = vertices[3 * l + 2] - c.o[2];
     T gx = grad_points[3 * l], gy = grad_points[3 * l + 1], gz = grad_points[3 * l + 2];
     ProjectedVertex<T> s = project_vertex<T, kPerspective, kDistortion, false>(c, x, y, z);
     T reach = larger(std::abs(s.qx), std::abs(s.qy)) + c.largest_k * s.slope;
@@ -96,10 +103,11 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
     const T bound = ((std::abs(gx) + std::abs(gy)) * reach + std::abs(gz)) * c.largest_a *
                     larger(larger(larger(std::abs(x), std::abs(y)), std::abs(z)), T(1));
     const bool keep = is_finite(bound >= kLimit<T> ? std::numeric_limits<T>::infinity() : s.size);
-    // Values of skipped vertices are set to 0 before they are multiplied, so that no product is 0 * inf.
+    // Values of skipped vertices are set to 0 before they are multiplied, so that no product is 0 *
+    // inf.
     x = keep ? x : T(0), y = keep ? y : T(0), z = keep ? z : T(0);
-    const T nothing =
-        is_finite(s.size) ? gx * T(0) + gy * T(0) + gz * T(0) : T(0);  // NaN if the upstream gradient is not finite
+    const T nothing = is_finite(s.size) ? gx * T(0) + gy * T(0) + gz * T(0)
+                                        : T(0);  // NaN if the upstream gradient is not finite
     gx = keep ? gx : nothing, gy = keep ? gy : nothing, gz = keep ? gz : nothing;
     s.px = keep ? s.px : T(0), s.py = keep ? s.py : T(0);
     s.qx = keep ? s.qx : T(0), s.qy = keep ? s.qy : T(0);
@@ -124,9 +132,12 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
         gpy = gpy + cross * x + 4 * gqy * c.d[2] * y + 2 * g_r2 * y;
       }
       const bool within = s.share == T(1);
-      // Beyond the reach: q = q(c) + p - c, with c = share p. The length of c is the reach, a constant.
-      const T length2 = within ? T(1) : s.px * s.px + s.py * s.py, length = std::sqrt(keep ? length2 : T(1));
-      const T nx = s.px / length, ny = s.py / length, vx = gpx - gqx, vy = gpy - gqy, out = vx * nx + vy * ny;
+      // Beyond the reach: q = q(c) + p - c, with c = share p. The length of c is the reach, a
+      // constant.
+      const T length2 = within ? T(1) : s.px * s.px + s.py * s.py,
+              length = std::sqrt(keep ? length2 : T(1));
+      const T nx = s.px / length, ny = s.py / length, vx = gpx - gqx, vy = gpy - gqy,
+              out = vx * nx + vy * ny;
       gpx = within ? gpx : gqx + s.share * (vx - nx * out);
       gpy = within ? gpy : gqy + s.share * (vy - ny * out);
       if (kSumCamera) {  // beyond the reach: 0
@@ -153,7 +164,8 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices, c
         }
       }
     }
-    const T gux = kPerspective ? gpx * s.inverse_z : gpx, guy = kPerspective ? gpy * s.inverse_z : gpy;
+    const T gux = kPerspective ? gpx * s.inverse_z : gpx,
+            guy = kPerspective ? gpy * s.inverse_z : gpy;
     const T guz = kPerspective ? gz - (gux * s.px + guy * s.py) : gz;
     grad_vertices[3 * l] += c.a[0] * gux + c.a[4] * guy + c.a[8] * guz;
     grad_vertices[3 * l + 1] += c.a[1] * gux + c.a[5] * guy + c.a[9] * guz;
@@ -194,7 +206,7 @@ NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, cons
   Padded<T> last(vertices + 3 * whole, rest);
   for (int64_t n = 0; n < run.count; n += kGroup)  // one call, so that it is inlined
     forward_lanes<T, kPerspective, kDistortion>(lens, n < whole ? vertices + 3 * n : last.vertices,
-                                               n < whole ? points + 3 * n : last.out);
+                                                n < whole ? points + 3 * n : last.out);
   std::copy_n(last.out, 3 * rest, points + 3 * whole);
 }
 
@@ -221,8 +233,8 @@ void forward_run(const Project<T>& args, const Run& run) {
 }
 
 template <class T, bool kPerspective, int kDistortion, bool kSumCamera>
-NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run, T* grad_vertices,
-                                double* total) {
+NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run,
+                                T* grad_vertices, double* total) {
   T sums[kSums][kGroup] = {};
   const T* vertices = args.vertices + 3 * run.vertices;
   const T* grad_points = args.grad_points + 3 * run.points;
@@ -232,9 +244,10 @@ NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, con
   std::copy_n(grad_vertices + 3 * whole, 3 * rest, last.out);
   for (int64_t n = 0; n < run.count; n += kGroup) {
     const bool inside = n < whole;
-    backward_lanes<T, kPerspective, kDistortion, kSumCamera>(lens, inside ? vertices + 3 * n : last.vertices,
-                                                            inside ? grad_points + 3 * n : last.grad_points,
-                                                            inside ? grad_vertices + 3 * n : last.out, sums);
+    backward_lanes<T, kPerspective, kDistortion, kSumCamera>(
+        lens, inside ? vertices + 3 * n : last.vertices,
+        inside ? grad_points + 3 * n : last.grad_points, inside ? grad_vertices + 3 * n : last.out,
+        sums);
   }
   std::copy_n(last.out, 3 * rest, grad_vertices + 3 * whole);
   if (!kSumCamera) return;
@@ -245,9 +258,11 @@ NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, con
   // u depends on v - origin and q on p / extent.
   const double* t = total;
   for (int j = 0; j < 3; ++j)
-    total[kSums + j] = -(double(lens.a[j]) * t[3] + double(lens.a[4 + j]) * t[7] + double(lens.a[8 + j]) * t[11]);
-  total[kSums + 3] = -(double(lens.k[0]) * t[12] + double(lens.k[1]) * t[13] + double(lens.k[3]) * t[15] +
-                       double(lens.k[4]) * t[16]) / double(lens.extent);
+    total[kSums + j] =
+        -(double(lens.a[j]) * t[3] + double(lens.a[4 + j]) * t[7] + double(lens.a[8 + j]) * t[11]);
+  total[kSums + 3] = -(double(lens.k[0]) * t[12] + double(lens.k[1]) * t[13] +
+                       double(lens.k[3]) * t[15] + double(lens.k[4]) * t[16]) /
+                     double(lens.extent);
 }
 
 // total: kTotals gradients of the camera, summed over this run, or nullptr.

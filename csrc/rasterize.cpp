@@ -1,13 +1,14 @@
 // Which face is nearest at each pixel of each image.
 //
-// Three steps per image. Set-up: for each face, the vertex orders that face the camera, its box of pixels, bounds of
-// its depth. Fill: for each face (all originals, then all reversed copies), mark the pixels inside. Copy: to the face
-// index map. The published depth needs sixteen divisions per pixel, and its rounding decides which face is nearer; it
-// is computed only if the bounds do not decide. Several threads can share one image: set-up by chunks of faces, fill
-// by bands of rows.
+// Three steps per image. Set-up: for each face, the vertex orders that face the camera, its box of
+// pixels, bounds of its depth. Fill: for each face (all originals, then all reversed copies), mark
+// the pixels inside. Copy: to the face index map. The published depth needs sixteen divisions per
+// pixel, and its rounding decides which face is nearer; it is computed only if the bounds do not
+// decide. Several threads can share one image: set-up by chunks of faces, fill by bands of rows.
 //
-// The bounds are those of q = 1 / depth, or -depth without perspective, which is linear on the screen: at a pixel (i, j)
-// inside a face, q differs from slope_x i + slope_y j + level by at most `margin`. See `bound_depth` in fill.h, where the loops are.
+// The bounds are those of q = 1 / depth, or -depth without perspective, which is linear on the
+// screen: at a pixel (i, j) inside a face, q differs from slope_x i + slope_y j + level by at most
+// `margin`. See `bound_depth` in fill.h, where the loops are.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -23,19 +24,21 @@ namespace {
 
 // Faces or pixels of a row that are worked on together, and pixels per side of a block.
 constexpr int64_t kTogether = 8;
-constexpr int64_t kBandPixels = int64_t(1) << 16;  // pixels of a band that fits into a core's cache: 12 bytes each
-constexpr int64_t kPixelsPerFace = 64;             // bands get that small only with this many pixels per face
-constexpr int64_t kChunk = 2048;  // faces that one thread sets up together
+constexpr int64_t kBandPixels =
+    int64_t(1) << 16;  // pixels of a band that fits into a core's cache: 12 bytes each
+constexpr int64_t kPixelsPerFace = 64;  // bands get that small only with this many pixels per face
+constexpr int64_t kChunk = 2048;        // faces that one thread sets up together
 
 // Data of eight faces for the fill.
 template <class T>
 struct FaceBlock {
-  T x[3][kTogether], y[3][kTogether];                                // corners, in the face's own order
-  T slope_x[kTogether], slope_y[kTogether], level[kTogether];        // coefficients of q
-  T margin[kTogether];                                               // infinity: no bounds
-  T nearest[kTogether];                                              // largest q at any pixel
+  T x[3][kTogether], y[3][kTogether];                          // corners, in the face's own order
+  T slope_x[kTogether], slope_y[kTogether], level[kTogether];  // coefficients of q
+  T margin[kTogether];                                         // infinity: no bounds
+  T nearest[kTogether];                                        // largest q at any pixel
   // Pixels inside the box.
-  int32_t column_first[kTogether], column_last[kTogether], row_first[kTogether], row_last[kTogether];
+  int32_t column_first[kTogether], column_last[kTogether], row_first[kTogether],
+      row_last[kTogether];
 };
 
 // Pixels from the first to the last column and row, inclusive.
@@ -45,8 +48,9 @@ struct PixelBox {
 
 template <class T>
 struct FaceTable {
-  std::vector<FaceBlock<T>> blocks;          // [faces / 8]
-  std::vector<int32_t> front, back;          // per chunk: faces drawn in their own order, and reversed; ascending
+  std::vector<FaceBlock<T>> blocks;  // [faces / 8]
+  std::vector<int32_t> front,
+      back;  // per chunk: faces drawn in their own order, and reversed; ascending
   std::vector<int32_t> num_front, num_back;  // [chunks]
   std::vector<T> front_sum, back_sum;        // [chunks] sums of `nearest` over them
   std::vector<PixelBox> boxes;               // [chunks] around the boxes of all their faces
@@ -88,7 +92,7 @@ struct Band {
   int64_t row_first, row_last;  // inclusive, from the bottom
   Size raster;
   int64_t stride;
-  const T *columns, *rows;      // pixel centres
+  const T *columns, *rows;  // pixel centres
   T *most, *least;
   int32_t* face_index;
 };
@@ -107,7 +111,8 @@ NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   const int64_t* face = image.faces + 3 * (reversed ? id - image.num_faces : id);
   const Triangle<T> t = load_triangle(image.vertices, face, reversed);
   const Size raster = image.settings.raster;
-  return {barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height)), {t.z[0], t.z[1], t.z[2]}};
+  return {barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height)),
+          {t.z[0], t.z[1], t.z[2]}};
 }
 
 }  // namespace
@@ -128,10 +133,12 @@ void rasterize(const Rasterize<T>& args) {
     FaceTable<T>& table = thread_scratch<FaceTable<T>>();
     const int64_t num_faces = args.mesh.face_count(b);
     table.reserve_faces(num_faces);
-    const Image<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), num_faces, args.settings, &table};
+    const Image<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b), num_faces,
+                         args.settings, &table};
     const int threads = share ? args.num_threads : 1;
     // Small bands fit into a core's cache, but every band looks at all faces.
-    const int64_t small = std::min(H * W / kBandPixels, H * W / (kPixelsPerFace * std::max<int64_t>(num_faces, 1)));
+    const int64_t small =
+        std::min(H * W / kBandPixels, H * W / (kPixelsPerFace * std::max<int64_t>(num_faces, 1)));
     const int64_t bands = std::clamp<int64_t>(std::max<int64_t>(share ? threads * 4 : 1, small), 1,
                                               (H + 2 * kTogether - 1) / (2 * kTogether));
     parallel_for((num_faces + kChunk - 1) / kChunk, threads,
@@ -154,7 +161,8 @@ void rasterize(const Rasterize<T>& args) {
                    nullptr,
                    nullptr,
                    nullptr};
-      const int64_t rows = band.row_last - band.row_first + 1, blocks = (W + kTogether - 1) / kTogether;
+      const int64_t rows = band.row_last - band.row_first + 1,
+                    blocks = (W + kTogether - 1) / kTogether;
       band.most = reserve(scratch.most, rows * band.stride + kTogether);
       band.least = reserve(scratch.least, rows * band.stride + kTogether);
       band.face_index = reserve(scratch.face_index, rows * band.stride + kTogether);

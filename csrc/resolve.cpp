@@ -13,7 +13,8 @@ namespace {
 
 constexpr int64_t kBandPixels = int64_t(1) << 16;  // of an image, that one task averages
 
-// alpha [h, w]: the covered share of each pixel of an image whose face index map has twice its size.
+// alpha [h, w]: the covered share of each pixel of an image whose face index map has twice its
+// size.
 template <class T>
 void average_coverage(const int32_t* face_index, Size image, T* alpha) {
   for (int64_t y = 0; y < image.height; ++y, alpha += image.width) {
@@ -26,22 +27,25 @@ void average_coverage(const int32_t* face_index, Size image, T* alpha) {
   }
 }
 
-// A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the background and the
-// mean of four background pixels [2, C], or nullptr. kChannels: C, or 0 if it is known only at run time.
+// A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the
+// background and the mean of four background pixels [2, C], or nullptr. kChannels: C, or 0 if it is
+// known only at run time.
 template <int64_t kChannels, class T>
-NMR_INLINE void resolve_row(const int32_t* face_index, const T* pixels, const T* behind, int64_t w, bool anti_aliasing,
-                            int64_t channels, T* out) {
+NMR_INLINE void resolve_row(const int32_t* face_index, const T* pixels, const T* behind, int64_t w,
+                            bool anti_aliasing, int64_t channels, T* out) {
   const int64_t C = kChannels ? kChannels : channels, W = 2 * w;
   if (!anti_aliasing) {
     for (int64_t x = 0; x < w; ++x)
-      for (int64_t c = 0; c < C; ++c) out[x * C + c] = behind && face_index[x] < 0 ? behind[c] : pixels[x * C + c];
+      for (int64_t c = 0; c < C; ++c)
+        out[x * C + c] = behind && face_index[x] < 0 ? behind[c] : pixels[x * C + c];
     return;
   }
   for (int64_t x = 0; x < w; ++x, out += C) {
     const T *upper = pixels + 2 * x * C, *lower = upper + W * C;
     const int32_t* corner = behind ? face_index + 2 * x : nullptr;
     if (!behind || (corner[0] | corner[1] | corner[W] | corner[W + 1]) >= 0) {
-      for (int64_t c = 0; c < C; ++c) out[c] = (upper[c] + upper[C + c] + lower[c] + lower[C + c]) / 4;
+      for (int64_t c = 0; c < C; ++c)
+        out[c] = (upper[c] + upper[C + c] + lower[c] + lower[C + c]) / 4;
     } else if ((corner[0] & corner[1] & corner[W] & corner[W + 1]) < 0) {
       for (int64_t c = 0; c < C; ++c) out[c] = behind[C + c];
     } else {
@@ -52,11 +56,11 @@ NMR_INLINE void resolve_row(const int32_t* face_index, const T* pixels, const T*
   }
 }
 
-// Its gradient for one raster row [W, C]: `grad` is that of the image row, face_index nullptr if no background is mixed
-// in.
+// Its gradient for one raster row [W, C]: `grad` is that of the image row, face_index nullptr if no
+// background is mixed in.
 template <int64_t kChannels, class T>
-NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, int64_t w, bool anti_aliasing,
-                                     int64_t channels, T* out) {
+NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, int64_t w,
+                                     bool anti_aliasing, int64_t channels, T* out) {
   const int64_t C = kChannels ? kChannels : channels, scale = anti_aliasing ? 2 : 1;
   const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
   for (int64_t x = 0; x < w; ++x, grad += C)
@@ -76,7 +80,8 @@ void silhouette_forward(const SilhouetteForward<T>& args) {
   parallel_for(args.batch * bands, args.num_threads, [&](int64_t n) {
     const int64_t b = n / bands, k = n % bands, first = k * image.height / bands;
     const Size band{(k + 1) * image.height / bands - first, image.width};
-    const int32_t* face_index = args.face_index + b * raster.pixels() + first * (raster.pixels() / image.height);
+    const int32_t* face_index =
+        args.face_index + b * raster.pixels() + first * (raster.pixels() / image.height);
     T* alpha = args.alpha + b * image.pixels() + first * image.width;
     if (!args.anti_aliasing) {
       for (int64_t i = 0; i < band.pixels(); ++i) alpha[i] = face_index[i] >= 0 ? T(1) : T(0);
@@ -86,25 +91,28 @@ void silhouette_forward(const SilhouetteForward<T>& args) {
   });
 }
 
-// The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, if it is given.
+// The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, if it is
+// given.
 template <class T>
 void resolve_forward(const Resolve<T>& args) {
-  const int64_t h = args.image.height, w = args.image.width, C = args.channels, scale = args.anti_aliasing ? 2 : 1,
-                W = scale * w;
+  const int64_t h = args.image.height, w = args.image.width, C = args.channels,
+                scale = args.anti_aliasing ? 2 : 1, W = scale * w;
   std::vector<T> behind;  // colour of each background, as resolve_row takes it
   for (int64_t b = 0; args.background && b < args.background_batch; ++b) {
     const T* color = args.background + b * C;
     behind.insert(behind.end(), color, color + C);
-    for (int64_t c = 0; c < C; ++c) behind.push_back((color[c] + color[c] + color[c] + color[c]) / 4);
+    for (int64_t c = 0; c < C; ++c)
+      behind.push_back((color[c] + color[c] + color[c] + color[c]) / 4);
   }
   with_channels<T>(C, [&](auto known) {
     constexpr int64_t kChannels = known();
     parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
-      const T* background =
-          args.background ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C) : nullptr;
+      const T* background = args.background
+                                ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C)
+                                : nullptr;
       const int32_t* face_index = args.background ? args.face_index + n * scale * W : nullptr;
-      resolve_row<kChannels>(face_index, args.pixels + n * scale * W * C, background, w, args.anti_aliasing, C,
-                             args.resolved + n * w * C);
+      resolve_row<kChannels>(face_index, args.pixels + n * scale * W * C, background, w,
+                             args.anti_aliasing, C, args.resolved + n * w * C);
     });
   });
 }
@@ -112,7 +120,8 @@ void resolve_forward(const Resolve<T>& args) {
 // Gradients of the pixels and of the background. Each image is summed in the order of its pixels.
 template <class T>
 void resolve_backward(const Resolve<T>& args) {
-  const int64_t h = args.image.height, w = args.image.width, C = args.channels, scale = args.anti_aliasing ? 2 : 1;
+  const int64_t h = args.image.height, w = args.image.width, C = args.channels,
+                scale = args.anti_aliasing ? 2 : 1;
   const int64_t H = scale * h, W = scale * w;
   const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
   if (args.grad_pixels)
@@ -120,8 +129,8 @@ void resolve_backward(const Resolve<T>& args) {
       constexpr int64_t kChannels = known();
       parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
         resolve_row_backward<kChannels>(args.background ? args.face_index + n * W : nullptr,
-                                        args.grad_resolved + n / scale * w * C, w, args.anti_aliasing, C,
-                                        args.grad_pixels + n * W * C);
+                                        args.grad_resolved + n / scale * w * C, w,
+                                        args.anti_aliasing, C, args.grad_pixels + n * W * C);
       });
     });
   if (args.grad_background)

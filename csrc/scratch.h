@@ -11,12 +11,12 @@
 
 namespace nmr {
 
-// What one thread keeps: any number of objects, each of another type. They belong to the thread while it works
-// (ScratchUse); otherwise any thread may free them.
+// What one thread keeps: any number of objects, each of another type. They belong to the thread
+// while it works (ScratchUse); otherwise any thread may free them.
 class ThreadScratch {
  public:
-  // A thread whose buffers have grown by more than this since it last freed them frees them when it has finished.
-  // The silhouette gradient of an image of 1024x1024 with anti-aliasing needs 69 MB.
+  // A thread whose buffers have grown by more than this since it last freed them frees them when it
+  // has finished. The silhouette gradient of an image of 1024x1024 with anti-aliasing needs 69 MB.
   static constexpr int64_t kLimit = int64_t(128) << 20;
 
   static ThreadScratch& mine() {
@@ -76,7 +76,8 @@ class ThreadScratch {
   };
 
   static Registry& registry() {
-    static Registry* all = new Registry;  // never destroyed: threads may end after the program's static objects
+    static Registry* all =
+        new Registry;  // never destroyed: threads may end after the program's static objects
     return *all;
   }
 
@@ -101,8 +102,9 @@ class ThreadScratch {
   std::vector<std::unique_ptr<AnyKept>> objects_;
 };
 
-// While one of these lives, the references of thread_scratch stay valid on this thread. parallel_for makes one on
-// every thread; a function that calls thread_scratch outside parallel_for makes one itself.
+// While one of these lives, the references of thread_scratch stay valid on this thread.
+// parallel_for makes one on every thread; a function that calls thread_scratch outside parallel_for
+// makes one itself.
 struct ScratchUse {
   ScratchUse() { ThreadScratch::mine().start_use(); }
   ~ScratchUse() { ThreadScratch::mine().end_use(); }
@@ -131,12 +133,14 @@ struct Unset : std::allocator<T> {
 template <class T>
 using Buffer = std::vector<T, Unset<T>>;
 
-// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer builds) the buffer is
-// new, has exactly this size, and all its bits are set, which is NaN in a floating-point number: sanitizers and tests
-// then notice reads beyond it and reads of unwritten values.
+// Grows a buffer (never shrinks it) and returns its storage. With NMR_FRESH_SCRATCH (sanitizer
+// builds) the buffer is new, has exactly this size, and all its bits are set, which is NaN in a
+// floating-point number: sanitizers and tests then notice reads beyond it and reads of unwritten
+// values.
 template <class T, class Allocator>
 T* reserve(std::vector<T, Allocator>& buffer, size_t size) {
-  if (buffer.size() < size) ThreadScratch::mine().count(static_cast<int64_t>((size - buffer.size()) * sizeof(T)));
+  if (buffer.size() < size)
+    ThreadScratch::mine().count(static_cast<int64_t>((size - buffer.size()) * sizeof(T)));
 #ifdef NMR_FRESH_SCRATCH
   buffer = std::vector<T, Allocator>(size);
   if constexpr (std::is_trivially_copyable_v<T>)

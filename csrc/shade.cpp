@@ -1,6 +1,6 @@
-// Colours from texture cubes, and interpolation of values given at the corners of faces. Both read the face index map
-// and the perspective-correct weights, in the vertex order of the original face, so that reversed copies are not
-// special.
+// Colours from texture cubes, and interpolation of values given at the corners of faces. Both read
+// the face index map and the perspective-correct weights, in the vertex order of the original face,
+// so that reversed copies are not special.
 #include <algorithm>
 #include <vector>
 
@@ -9,8 +9,8 @@
 namespace nmr {
 namespace {
 
-// The texels around one pixel: texture = sum over the 8 corners c of weight[c] texel[offset[c]], trilinear at t_k =
-// b_k (ts - 1) clamped to [0, ts - 1 - eps].
+// The texels around one pixel: texture = sum over the 8 corners c of weight[c] texel[offset[c]],
+// trilinear at t_k = b_k (ts - 1) clamped to [0, ts - 1 - eps].
 template <class T>
 struct Texels {
   int64_t offset[8];  // offsets of texels within one face's cube
@@ -27,32 +27,37 @@ NMR_INLINE Texels<T> texels_of(const T* weights, int64_t texture_size, T eps) {
     T t = weights[k] * last;
     t = t > 0 ? t : T(0);  // NaN becomes 0
     t = t < limit ? t : limit;
-    cell[k] = std::max(std::min(static_cast<int64_t>(t), ts - 2), int64_t(0));  // ts - 1 - eps may round to ts - 1
+    cell[k] = std::max(std::min(static_cast<int64_t>(t), ts - 2),
+                       int64_t(0));  // ts - 1 - eps may round to ts - 1
     fraction[k] = t - static_cast<T>(cell[k]);
   }
   Texels<T> texels;
   for (int c = 0; c < 8; ++c) {
     const int bit[3] = {c >> 2 & 1, c >> 1 & 1, c & 1};
-    texels.offset[c] = ((cell[0] + next * bit[0]) * ts + cell[1] + next * bit[1]) * ts + cell[2] + next * bit[2];
-    texels.weight[c] = (bit[0] ? fraction[0] : 1 - fraction[0]) * (bit[1] ? fraction[1] : 1 - fraction[1]) *
+    texels.offset[c] =
+        ((cell[0] + next * bit[0]) * ts + cell[1] + next * bit[1]) * ts + cell[2] + next * bit[2];
+    texels.weight[c] = (bit[0] ? fraction[0] : 1 - fraction[0]) *
+                       (bit[1] ? fraction[1] : 1 - fraction[1]) *
                        (bit[2] ? fraction[2] : 1 - fraction[2]);
   }
   return texels;
 }
 
-// color = sum over the corners of weight texel; kChannels is the number of channels, or 0 if it is known only at run
-// time.
+// color = sum over the corners of weight texel; kChannels is the number of channels, or 0 if it is
+// known only at run time.
 template <int64_t kChannels, class T>
 NMR_INLINE void blend(const Texels<T>& texels, const T* texture, int64_t channels, T* color) {
   if constexpr (kChannels > 0) {
     T sum[kChannels] = {};
     for (int c = 0; c < 8; ++c)
-      for (int64_t k = 0; k < kChannels; ++k) sum[k] += texels.weight[c] * texture[texels.offset[c] * kChannels + k];
+      for (int64_t k = 0; k < kChannels; ++k)
+        sum[k] += texels.weight[c] * texture[texels.offset[c] * kChannels + k];
     for (int64_t k = 0; k < kChannels; ++k) color[k] = sum[k];
   } else {
     for (int64_t k = 0; k < channels; ++k) color[k] = 0;
     for (int c = 0; c < 8; ++c)
-      for (int64_t k = 0; k < channels; ++k) color[k] += texels.weight[c] * texture[texels.offset[c] * channels + k];
+      for (int64_t k = 0; k < channels; ++k)
+        color[k] += texels.weight[c] * texture[texels.offset[c] * channels + k];
   }
 }
 
@@ -73,8 +78,8 @@ template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args) {
   with_channels<T>(args.channels, [&](auto known) {
     constexpr int64_t kChannels = known();
-    const int64_t W = args.raster.width, C = kChannels ? kChannels : args.channels, ts = args.texture_size,
-                  cube = ts * ts * ts * C;
+    const int64_t W = args.raster.width, C = kChannels ? kChannels : args.channels,
+                  ts = args.texture_size, cube = ts * ts * ts * C;
     for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
       const int64_t start = (b * args.raster.height + row) * W, F = face_count(args, b);
       const T* textures = args.textures + first_cube(args, b) * cube;
@@ -82,8 +87,8 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
       for (int64_t n = start; n < start + W; ++n, color += C) {
         const int64_t id = args.face_index[n];
         if (id >= 0)
-          blend<kChannels>(texels_of(args.weights + 3 * n, ts, args.eps), textures + (id < F ? id : id - F) * cube, C,
-                           color);
+          blend<kChannels>(texels_of(args.weights + 3 * n, ts, args.eps),
+                           textures + (id < F ? id : id - F) * cube, C, color);
         else
           for (int64_t k = 0; k < C; ++k) color[k] = 0;
       }
@@ -93,10 +98,13 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
 
 namespace {
 
-// Adds the gradients of the pixels of image b whose face is in [first_face, last_face) to its cubes.
+// Adds the gradients of the pixels of image b whose face is in [first_face, last_face) to its
+// cubes.
 template <int64_t kChannels, class T>
-void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first_face, int64_t last_face) {
-  const int64_t C = kChannels ? kChannels : args.channels, ts = args.texture_size, cube = ts * ts * ts * C;
+void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first_face,
+                           int64_t last_face) {
+  const int64_t C = kChannels ? kChannels : args.channels, ts = args.texture_size,
+                cube = ts * ts * ts * C;
   const int64_t F = face_count(args, b), pixels = args.raster.pixels();
   T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
   for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
@@ -106,14 +114,16 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
     const T* grad = args.grad_colors + n * C;
     T* texture = grad_textures + f * cube;
     for (int c = 0; c < 8; ++c)
-      for (int64_t k = 0; k < C; ++k) texture[texels.offset[c] * C + k] += texels.weight[c] * grad[k];
+      for (int64_t k = 0; k < C; ++k)
+        texture[texels.offset[c] * C + k] += texels.weight[c] * grad[k];
   }
 }
 
 }  // namespace
 
-// Every texel is summed on one thread, over images and pixels in ascending order. If images share their textures, or
-// if there are fewer images than threads, each thread reads all pixels and uses those of its own range of faces.
+// Every texel is summed on one thread, over images and pixels in ascending order. If images share
+// their textures, or if there are fewer images than threads, each thread reads all pixels and uses
+// those of its own range of faces.
 template <class T>
 void texture_cubes_backward(const TextureCubes<T>& args) {
   const int64_t ts = args.texture_size, cube = ts * ts * ts * args.channels;
@@ -125,9 +135,11 @@ void texture_cubes_backward(const TextureCubes<T>& args) {
     const int64_t set = task / parts, part = task % parts;
     const int64_t F = shared ? args.num_faces : face_count(args, set);
     const int64_t first = part * F / parts, last = (part + 1) * F / parts;
-    std::fill_n(args.grad_textures + (first_cube(args, set) + first) * cube, (last - first) * cube, T(0));
+    std::fill_n(args.grad_textures + (first_cube(args, set) + first) * cube, (last - first) * cube,
+                T(0));
     with_channels<T>(args.channels, [&](auto known) {
-      for (int64_t b = set; b < set + images; ++b) add_texture_gradients<known()>(args, b, first, last);
+      for (int64_t b = set; b < set + images; ++b)
+        add_texture_gradients<known()>(args, b, first, last);
     });
   });
 }
@@ -136,10 +148,11 @@ namespace {
 
 // grad_weights of a block's pixels, and its sums of b_k g.
 template <int64_t kChannels, class T>
-void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks,
-                                int64_t b, int64_t block, CornerSums<T>& sums) {
-  const int64_t H = args.raster.height, W = args.raster.width, C = kChannels ? kChannels : args.channels,
-                F = image.num_faces;
+void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image,
+                                const RowBlocks& blocks, int64_t b, int64_t block,
+                                CornerSums<T>& sums) {
+  const int64_t H = args.raster.height, W = args.raster.width,
+                C = kChannels ? kChannels : args.channels, F = image.num_faces;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   if (args.grad_attributes) {
     sums.visible.reserve_for(F, blocks.most_visible(F));
@@ -184,9 +197,11 @@ void interpolate_forward(const Interpolate<T>& args) {
           for (int64_t c = 0; c < C; ++c) value[c] = 0;
           continue;
         }
-        const int64_t* corners = image.corners + 3 * (id < image.num_faces ? id : id - image.num_faces);
+        const int64_t* corners =
+            image.corners + 3 * (id < image.num_faces ? id : id - image.num_faces);
         const T* w = args.weights + 3 * n;
-        const T *p = attributes + corners[0] * C, *q = attributes + corners[1] * C, *r = attributes + corners[2] * C;
+        const T *p = attributes + corners[0] * C, *q = attributes + corners[1] * C,
+                *r = attributes + corners[2] * C;
         for (int64_t c = 0; c < C; ++c) value[c] = w[0] * p[c] + w[1] * q[c] + w[2] * r[c];
       }
     });
@@ -197,13 +212,16 @@ template <class T>
 void interpolate_backward(const Interpolate<T>& args) {
   const int64_t rows = args.num_attributes * (args.starts ? 1 : args.attribute_batch);
   if (args.grad_attributes) std::fill_n(args.grad_attributes, rows * args.channels, T(0));
-  const auto blocks_of = [&](int64_t b) { return RowBlocks(args.raster, image_attributes(args, b).num_faces); };
+  const auto blocks_of = [&](int64_t b) {
+    return RowBlocks(args.raster, image_attributes(args, b).num_faces);
+  };
   sum_blocks<CornerSums<T>>(
       args.batch, !args.starts && args.attribute_batch == 1, args.num_threads,
       [&](int64_t b) { return blocks_of(b).count; },
       [&](int64_t b, int64_t block, CornerSums<T>& sums) {
         with_channels<T>(args.channels, [&](auto known) {
-          interpolate_block_backward<known()>(args, image_attributes(args, b), blocks_of(b), b, block, sums);
+          interpolate_block_backward<known()>(args, image_attributes(args, b), blocks_of(b), b,
+                                              block, sums);
         });
       },
       [&](int64_t b, const CornerSums<T>& sums) {

@@ -1,10 +1,11 @@
-// Smoothness loss: sum over edges of (1 + cos(theta))^2; theta is the angle between the two faces at the edge
-// (cos = -1 when flat), with Kato's guards against division by zero. theta is the angle between the heights of the two
-// faces over the edge.
+// Smoothness loss: sum over edges of (1 + cos(theta))^2; theta is the angle between the two faces
+// at the edge (cos = -1 when flat), with Kato's guards against division by zero. theta is the angle
+// between the heights of the two faces over the edge.
 //
-// All meshes share the edges, so kGroup meshes are processed together, one per lane: their vertices are interleaved
-// first, and every load and every sum of the gradient is a whole vector. The remaining meshes are processed one by
-// one, kGroup edges at a time. Both ways sum a mesh's edges in the same order, and give the same bits.
+// All meshes share the edges, so kGroup meshes are processed together, one per lane: their vertices
+// are interleaved first, and every load and every sum of the gradient is a whole vector. The
+// remaining meshes are processed one by one, kGroup edges at a time. Both ways sum a mesh's edges
+// in the same order, and give the same bits.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -17,7 +18,8 @@ namespace {
 
 constexpr double kGuard = 1e-6;  // added to every squared length and denominator
 constexpr int kGroup = 16;
-constexpr int kCoordinates = 12;  // x, y, z of an edge's first and second vertex and of the two opposite ones
+constexpr int kCoordinates =
+    12;  // x, y, z of an edge's first and second vertex and of the two opposite ones
 
 template <class T>
 struct SmoothnessScratch {
@@ -51,10 +53,12 @@ void for_groups(int64_t batch, int num_threads, const Meshes& meshes, const Mesh
 template <class T>
 void smoothness_forward(const Smoothness<T>& args) {
   const auto meshes = [&](int64_t b) {
-    T* vertices = reserve(thread_scratch<SmoothnessScratch<T>>().vertices, args.num_vertices * 3 * kGroup);
+    T* vertices =
+        reserve(thread_scratch<SmoothnessScratch<T>>().vertices, args.num_vertices * 3 * kGroup);
     NMR_AT_BEST_LEVEL(meshes_forward, args, b, vertices);
   };
-  for_groups(args.batch, args.num_threads, meshes, [&](int64_t b) { NMR_AT_BEST_LEVEL(mesh_forward, args, b); });
+  for_groups(args.batch, args.num_threads, meshes,
+             [&](int64_t b) { NMR_AT_BEST_LEVEL(mesh_forward, args, b); });
 }
 
 template <class T>
@@ -65,7 +69,8 @@ void smoothness_backward(const Smoothness<T>& args) {
     T* grad = reserve(scratch.grad, args.num_vertices * 3 * kGroup);
     NMR_AT_BEST_LEVEL(meshes_backward, args, b, vertices, grad);
   };
-  for_groups(args.batch, args.num_threads, meshes, [&](int64_t b) { NMR_AT_BEST_LEVEL(mesh_backward, args, b); });
+  for_groups(args.batch, args.num_threads, meshes,
+             [&](int64_t b) { NMR_AT_BEST_LEVEL(mesh_backward, args, b); });
 }
 
 template void smoothness_forward(const Smoothness<float>&);

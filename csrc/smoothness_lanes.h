@@ -1,7 +1,7 @@
 // The loops of the smoothness loss over edges; included by levels.h for every instruction set.
 
-// Not a vector of Eigen: GCC does not inline its constructors into code for another level, and the loops over lanes
-// are then not vectorized (six times the instructions).
+// Not a vector of Eigen: GCC does not inline its constructors into code for another level, and the
+// loops over lanes are then not vectorized (six times the instructions).
 template <class T>
 struct Vec3 {
   T x, y, z;
@@ -38,7 +38,8 @@ NMR_INLINE Base<T> base(const Vec3<T>& a) {
   return {a, std::sqrt(a2), 1 / a2};
 }
 
-// Height of one face over the edge a: b runs from the edge's first vertex to the face's other corner.
+// Height of one face over the edge a: b runs from the edge's first vertex to the face's other
+// corner.
 template <class T>
 struct Height {
   Vec3<T> vector;  // b - a (a.b) / (|a|^2 + e)
@@ -66,21 +67,24 @@ NMR_INLINE Height<T> height(const Base<T>& base, const Vec3<T>& b) {
 
 // Adds to grad_a, sets grad_b.
 template <class T>
-NMR_INLINE void height_backward(const Base<T>& base, const Vec3<T>& b, const Height<T>& h, const Vec3<T>& grad_vector,
-                                T grad_length, Vec3<T>& grad_a, Vec3<T>& grad_b) {
+NMR_INLINE void height_backward(const Base<T>& base, const Vec3<T>& b, const Height<T>& h,
+                                const Vec3<T>& grad_vector, T grad_length, Vec3<T>& grad_a,
+                                Vec3<T>& grad_b) {
   const T inverse_length = 1 / h.length;  // times |b| it is 1 / sin, times sin it is 1 / |b|
   const T grad_cos = -grad_length * h.length_b * h.cos * (inverse_length * h.length_b);
   const T grad_q = -grad_cos * h.cos * h.inverse_q;
   const T grad_along = -dot(base.a, grad_vector);
   const T grad_ab = grad_along * base.inverse_2 + grad_cos * h.inverse_q;
   const T grad_length_b = grad_length * h.sin + grad_q * base.length;
-  const T twice_grad_a2 = (grad_q * h.length_b * base.length - 2 * grad_along * h.along) * base.inverse_2;
+  const T twice_grad_a2 =
+      (grad_q * h.length_b * base.length - 2 * grad_along * h.along) * base.inverse_2;
   grad_a = grad_a + grad_ab * b + twice_grad_a2 * base.a - h.along * grad_vector;
   grad_b = grad_vector + grad_ab * base.a + (grad_length_b * (inverse_length * h.sin)) * b;
 }
 
 template <class T>
-NMR_INLINE T edge_loss(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left, const Vec3<T>& right) {
+NMR_INLINE T edge_loss(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left,
+                       const Vec3<T>& right) {
   const Base<T> a = base(end - origin);
   const Height<T> h1 = height(a, left - origin), h2 = height(a, right - origin);
   const T cos = dot(h1.vector, h2.vector) / (h1.length * h2.length + T(kGuard));
@@ -89,8 +93,9 @@ NMR_INLINE T edge_loss(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>&
 
 // The gradients of end, left and right; that of origin is minus their sum.
 template <class T>
-NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left, const Vec3<T>& right,
-                              T grad_loss, Vec3<T>& grad_end, Vec3<T>& grad_left, Vec3<T>& grad_right) {
+NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const Vec3<T>& left,
+                              const Vec3<T>& right, T grad_loss, Vec3<T>& grad_end,
+                              Vec3<T>& grad_left, Vec3<T>& grad_right) {
   const Base<T> a = base(end - origin);
   const Vec3<T> b1 = left - origin, b2 = right - origin;
   const Height<T> h1 = height(a, b1), h2 = height(a, b2);
@@ -99,8 +104,10 @@ NMR_INLINE void edge_backward(const Vec3<T>& origin, const Vec3<T>& end, const V
   const T grad_dot = 2 * (1 + cos) * grad_loss * inverse;
   const T grad_denominator = -grad_dot * cos;
   grad_end = {0, 0, 0};
-  height_backward(a, b1, h1, grad_dot * h2.vector, grad_denominator * h2.length, grad_end, grad_left);
-  height_backward(a, b2, h2, grad_dot * h1.vector, grad_denominator * h1.length, grad_end, grad_right);
+  height_backward(a, b1, h1, grad_dot * h2.vector, grad_denominator * h2.length, grad_end,
+                  grad_left);
+  height_backward(a, b2, h2, grad_dot * h1.vector, grad_denominator * h1.length, grad_end,
+                  grad_right);
 }
 
 // kGroup points, as [3, kGroup].
@@ -116,18 +123,21 @@ NMR_INLINE void set_point(T* points, int l, const Vec3<T>& p) {
 }
 
 template <class T>
-NMR_INLINE void lanes_forward(const T* __restrict origin, const T* __restrict end, const T* __restrict left,
-                              const T* __restrict right, T* __restrict loss) {
+NMR_INLINE void lanes_forward(const T* __restrict origin, const T* __restrict end,
+                              const T* __restrict left, const T* __restrict right,
+                              T* __restrict loss) {
   for (int l = 0; l < kGroup; ++l)
     loss[l] = edge_loss(point(origin, l), point(end, l), point(left, l), point(right, l));
 }
 
 template <class T>
-NMR_INLINE void lanes_backward(const T* __restrict origin, const T* __restrict end, const T* __restrict left,
-                               const T* __restrict right, const T* __restrict grad_loss, T* __restrict grad) {
+NMR_INLINE void lanes_backward(const T* __restrict origin, const T* __restrict end,
+                               const T* __restrict left, const T* __restrict right,
+                               const T* __restrict grad_loss, T* __restrict grad) {
   for (int l = 0; l < kGroup; ++l) {
     Vec3<T> g1, g2, g3;
-    edge_backward(point(origin, l), point(end, l), point(left, l), point(right, l), grad_loss[l], g1, g2, g3);
+    edge_backward(point(origin, l), point(end, l), point(left, l), point(right, l), grad_loss[l],
+                  g1, g2, g3);
     set_point(grad, l, T(-1) * (g1 + g2 + g3));
     set_point(grad + 3 * kGroup, l, g1);
     set_point(grad + 6 * kGroup, l, g2);
@@ -187,7 +197,8 @@ void meshes_backward(const Smoothness<T>& args, int64_t b, T* vertices, T* grad)
 
 // kGroup edges of one mesh; if there are fewer, the last one is repeated.
 template <class T>
-NMR_INLINE void gather(const T* vertices, const int64_t* edges, int64_t count, T (&points)[kCoordinates][kGroup]) {
+NMR_INLINE void gather(const T* vertices, const int64_t* edges, int64_t count,
+                       T (&points)[kCoordinates][kGroup]) {
   for (int64_t l = 0; l < kGroup; ++l) {
     const int64_t* e = edges + 4 * std::min(l, count - 1);
     for (int k = 0; k < kCoordinates; ++k) points[k][l] = vertices[3 * e[k / 3] + k % 3];

@@ -1,13 +1,15 @@
 // The soft silhouette of SoftRas (Liu et al. 2019) and its derivative.
 //
-// At pixel centre p, face j has the probability D_j = 1 / (1 + exp(-x_j)) with x_j = +-d^2 / sigma: d is the distance
-// from p to the border of the triangle, + inside and - outside. Faces outside with d^2 >= reach are left out. alpha =
-// 1 - clear with clear = prod_j (1 - D_j). The derivative needs no division: d alpha / d x_j = clear D_j. That of
-// sigma is the sum of -x_j / sigma times this.
+// At pixel centre p, face j has the probability D_j = 1 / (1 + exp(-x_j)) with x_j = +-d^2 / sigma:
+// d is the distance from p to the border of the triangle, + inside and - outside. Faces outside
+// with d^2 >= reach are left out. alpha = 1 - clear with clear = prod_j (1 - D_j). The derivative
+// needs no division: d alpha / d x_j = clear D_j. That of sigma is the sum of -x_j / sigma times
+// this.
 //
-// Distances are measured in units of half the shorter side of the raster. The nearest point of the border is on one
-// of the three sides, at p_a + t (p_b - p_a); the derivative of d^2 with respect to p_a is -2 (1 - t) (p - nearest),
-// and with respect to p_b -2 t (p - nearest), because the nearest point itself is stationary.
+// Distances are measured in units of half the shorter side of the raster. The nearest point of the
+// border is on one of the three sides, at p_a + t (p_b - p_a); the derivative of d^2 with respect
+// to p_a is -2 (1 - t) (p - nearest), and with respect to p_b -2 t (p - nearest), because the
+// nearest point itself is stationary.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -58,11 +60,13 @@ NMR_INLINE void reached(T lo, T hi, int64_t size, int64_t& first, int64_t& last)
   last = std::min<int64_t>(size - 1, static_cast<int64_t>(to > -1 ? (to < n ? to : n) : T(-2)) + 1);
 }
 
-// Whether face f is drawn. It is not if its corners are all one vertex, if one of them is not finite, if all are nearer
-// than `near` or all farther than `far`, or, without fill_back, if it is seen from behind.
+// Whether face f is drawn. It is not if its corners are all one vertex, if one of them is not
+// finite, if all are nearer than `near` or all farther than `far`, or, without fill_back, if it is
+// seen from behind.
 template <class T>
 NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& face) {
-  const T largest = std::sqrt(std::sqrt(std::numeric_limits<T>::max()));  // squares of squares stay finite
+  const T largest =
+      std::sqrt(std::sqrt(std::numeric_limits<T>::max()));  // squares of squares stay finite
   const T limit = largest < T(1e9) ? largest : T(1e9);
   bool usable = true, beyond_near = false, before_far = false;
   for (int k = 0; k < 3; ++k) {
@@ -74,7 +78,8 @@ NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& f
     beyond_near = beyond_near || v[2] > image.settings.near;
     before_far = before_far || v[2] < image.settings.far;
   }
-  const bool listed = face.corner[0] != face.corner[1] || face.corner[1] != face.corner[2];  // else padding
+  const bool listed =
+      face.corner[0] != face.corner[1] || face.corner[1] != face.corner[2];  // else padding
   if (!listed || !usable || !beyond_near || !before_far) return false;
   T *x = face.x, *y = face.y;
   face.back = (y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0]);  // clockwise
@@ -90,14 +95,17 @@ NMR_INLINE bool set_up_face(const SoftImage<T>& image, int64_t f, SoftFace<T>& f
     face.inverse[k] = square > std::numeric_limits<T>::min() ? 1 / square : T(0);
   }
   const T margin = std::sqrt(image.reach);
-  reached((min3(x[0], x[1], x[2]) - margin) / image.scale_x, (max3(x[0], x[1], x[2]) + margin) / image.scale_x,
-          image.settings.raster.width, face.column_first, face.column_last);
-  reached((min3(y[0], y[1], y[2]) - margin) / image.scale_y, (max3(y[0], y[1], y[2]) + margin) / image.scale_y,
-          image.settings.raster.height, face.row_first, face.row_last);
+  reached((min3(x[0], x[1], x[2]) - margin) / image.scale_x,
+          (max3(x[0], x[1], x[2]) + margin) / image.scale_x, image.settings.raster.width,
+          face.column_first, face.column_last);
+  reached((min3(y[0], y[1], y[2]) - margin) / image.scale_y,
+          (max3(y[0], y[1], y[2]) + margin) / image.scale_y, image.settings.raster.height,
+          face.row_first, face.row_last);
   return face.column_first <= face.column_last && face.row_first <= face.row_last;
 }
 
-// Rows [first, last] of one image, from the bottom, and the faces that reach each pixel, nearest first.
+// Rows [first, last] of one image, from the bottom, and the faces that reach each pixel, nearest
+// first.
 template <class T>
 struct SoftBand {
   int64_t layers, first, last;
@@ -118,18 +126,28 @@ namespace {
 // Scaled centres of the columns, padded.
 template <class T>
 std::vector<T> scaled_columns(Size raster) {
-  const T scale = static_cast<T>(raster.width) / static_cast<T>(std::min(raster.height, raster.width));
+  const T scale =
+      static_cast<T>(raster.width) / static_cast<T>(std::min(raster.height, raster.width));
   std::vector<T> columns(raster.width + kGroup);
-  for (int64_t i = 0; i < raster.width + kGroup; ++i) columns[i] = pixel_centre<T>(i, raster.width) * scale;
+  for (int64_t i = 0; i < raster.width + kGroup; ++i)
+    columns[i] = pixel_centre<T>(i, raster.width) * scale;
   return columns;
 }
 
 template <class T>
-SoftImage<T> soft_image(const MeshBatch<T>& mesh, const SoftSettings<T>& soft, int64_t b, const T* columns) {
+SoftImage<T> soft_image(const MeshBatch<T>& mesh, const SoftSettings<T>& soft, int64_t b,
+                        const T* columns) {
   const Size raster = soft.raster.raster;
   const T shorter = static_cast<T>(std::min(raster.height, raster.width));
-  return {mesh.image_vertices(b), mesh.image_faces(b), mesh.face_count(b), soft.raster, soft.sigma, soft.reach,
-          static_cast<T>(raster.width) / shorter, static_cast<T>(raster.height) / shorter, columns};
+  return {mesh.image_vertices(b),
+          mesh.image_faces(b),
+          mesh.face_count(b),
+          soft.raster,
+          soft.sigma,
+          soft.reach,
+          static_cast<T>(raster.width) / shorter,
+          static_cast<T>(raster.height) / shorter,
+          columns};
 }
 
 }  // namespace
@@ -143,7 +161,8 @@ void soft_forward(const SoftForward<T>& args) {
     const int64_t b = task / bands, first = task % bands * kBandRows,
                   last = std::min(first + kBandRows, raster.height) - 1;
     T* clear = args.clear + b * raster.pixels();
-    std::fill_n(clear + (raster.height - 1 - last) * raster.width, (last - first + 1) * raster.width, T(1));
+    std::fill_n(clear + (raster.height - 1 - last) * raster.width,
+                (last - first + 1) * raster.width, T(1));
     const SoftImage<T> image = soft_image(args.mesh, args.settings, b, columns.data());
     NMR_AT_BEST_LEVEL(soft_forward_band, image, first, last, clear);
   });
@@ -171,7 +190,8 @@ void soft_backward(const SoftBackward<T>& args) {
   parallel_for(chunks.back(), args.num_threads, [&](int64_t task) {
     const int64_t b = std::upper_bound(chunks.begin(), chunks.end(), task) - chunks.begin() - 1;
     const SoftImage<T> image = soft_image(mesh, args.settings, b, columns.data());
-    const int64_t first = (task - chunks[b]) * kFaceChunk, last = std::min(first + kFaceChunk, image.num_faces);
+    const int64_t first = (task - chunks[b]) * kFaceChunk,
+                  last = std::min(first + kFaceChunk, image.num_faces);
     for (int64_t f = first; f < last; ++f) {
       SoftFace<T> face;
       drawn[first_face[b] + f] = set_up_face(image, f, face);
@@ -208,7 +228,8 @@ void soft_layers(const SoftLayers<T>& args) {
   const int64_t K = args.layers, bands = (raster.height + kBandRows - 1) / kBandRows;
   parallel_for(args.mesh.batch * bands, args.num_threads, [&](int64_t task) {
     const int64_t b = task / bands, first = task % bands * kBandRows,
-                  last = std::min(first + kBandRows, raster.height) - 1, count = (last - first + 1) * raster.width * K;
+                  last = std::min(first + kBandRows, raster.height) - 1,
+                  count = (last - first + 1) * raster.width * K;
     std::vector<T> depth(count, args.settings.raster.far);
     int32_t* face_index = args.face_index + b * raster.pixels() * K;
     std::fill_n(face_index + (raster.height - 1 - last) * raster.width * K, count, -1);

@@ -1,8 +1,8 @@
 // The loops of the soft silhouette over pixels; included by levels.h for every instruction set.
 
-// exp(-x) for x >= 0: 2^-n times the Taylor series of exp on [-ln 2 / 2, ln 2 / 2]. Written out because the library's
-// function is not the same on all processors, and the compiler does not vectorize it. Values below 1e-37 become 1e-37
-// (double: 1e-300).
+// exp(-x) for x >= 0: 2^-n times the Taylor series of exp on [-ln 2 / 2, ln 2 / 2]. Written out
+// because the library's function is not the same on all processors, and the compiler does not
+// vectorize it. Values below 1e-37 become 1e-37 (double: 1e-300).
 NMR_INLINE float exp_negative(float x) {
   x = x < 85 ? x : 85;
   const float n = static_cast<float>(static_cast<int32_t>(x * 1.44269504f + 0.5f));
@@ -20,8 +20,8 @@ NMR_INLINE double exp_negative(double x) {
   const double n = static_cast<double>(static_cast<int64_t>(x * 1.4426950408889634 + 0.5));
   const double r = n * 0.693145751953125 - x + n * 1.42860682030941723212e-6;
   double sum = 1.0 / 6227020800;
-  for (const double c : {1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320, 1.0 / 5040,
-                         1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 0.5, 1.0, 1.0})
+  for (const double c : {1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320,
+                         1.0 / 5040, 1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 0.5, 1.0, 1.0})
     sum = sum * r + c;
   const uint64_t bits = static_cast<uint64_t>(1023 - static_cast<int64_t>(n)) << 52;
   double scale;
@@ -62,7 +62,8 @@ NMR_INLINE SoftPixel<T> evaluate(const SoftFace<T>& face, T px, T py, T sigma, T
     }
   }
   const T e = exp_negative(least / sigma), large = 1 / (1 + e), small = e / (1 + e);
-  const T outside_clears = least < reach ? large : T(1), outside_covers = least < reach ? small : T(0);
+  const T outside_clears = least < reach ? large : T(1),
+          outside_covers = least < reach ? small : T(0);
   p.covers = inside ? large : outside_covers;
   p.clears = inside ? small : outside_clears;
   p.sign = inside ? T(1) : T(-1);
@@ -71,7 +72,8 @@ NMR_INLINE SoftPixel<T> evaluate(const SoftFace<T>& face, T px, T py, T sigma, T
   return p;
 }
 
-// Multiplies the rows [first, last] (from the bottom) of `clear [H, W]`, row 0 = top, by 1 - D of every face.
+// Multiplies the rows [first, last] (from the bottom) of `clear [H, W]`, row 0 = top, by 1 - D of
+// every face.
 template <class T>
 void soft_forward_band(const SoftImage<T>& image, int64_t first, int64_t last, T* clear) {
   const Size raster = image.settings.raster;
@@ -84,7 +86,8 @@ void soft_forward_band(const SoftImage<T>& image, int64_t first, int64_t last, T
       for (int64_t i = face.column_first; i <= face.column_last; i += kGroup) {
         T clears[kGroup];
         for (int64_t n = 0; n < kGroup; ++n)
-          clears[n] = evaluate<T, false>(face, image.columns[i + n], py, image.sigma, image.reach).clears;
+          clears[n] =
+              evaluate<T, false>(face, image.columns[i + n], py, image.sigma, image.reach).clears;
         const int64_t lanes = std::min(kGroup, face.column_last - i + 1);
         for (int64_t n = 0; n < lanes; ++n) row[i + n] *= clears[n];
       }
@@ -92,7 +95,8 @@ void soft_forward_band(const SoftImage<T>& image, int64_t first, int64_t last, T
   }
 }
 
-// Inserts every face into the lists of the pixels that it reaches, behind those that are equally near.
+// Inserts every face into the lists of the pixels that it reaches, behind those that are equally
+// near.
 template <class T>
 void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
   const Size raster = image.settings.raster;
@@ -103,7 +107,8 @@ void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
     T z[3];
     for (int k = 0; k < 3; ++k) z[k] = image.vertices[3 * face.corner[k] + 2];
     const int32_t id = static_cast<int32_t>(face.back ? image.num_faces + f : f);
-    for (int64_t j = std::max(face.row_first, band.first); j <= std::min(face.row_last, band.last); ++j) {
+    for (int64_t j = std::max(face.row_first, band.first); j <= std::min(face.row_last, band.last);
+         ++j) {
       const T py = image.row(j);
       for (int64_t i = face.column_first; i <= face.column_last; i += kGroup) {
         T depth[kGroup];
@@ -119,7 +124,8 @@ void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
         for (int64_t n = 0; n < lanes; ++n) {
           T* depths = band.depth + ((j - band.first) * raster.width + i + n) * K;
           if (!reaches[n] || !(depth[n] < depths[K - 1])) continue;
-          int32_t* face_indices = band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
+          int32_t* face_indices =
+              band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
           insert_sorted(depth[n], id, K, depths, face_indices);
         }
       }
@@ -127,10 +133,11 @@ void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
   }
 }
 
-// The gradient of one face: x and y of its corners, and sigma. pull [H, W] is grad_alpha * clear: the gradient of x_j
-// (soft.cpp) without its factor D_j.
+// The gradient of one face: x and y of its corners, and sigma. pull [H, W] is grad_alpha * clear:
+// the gradient of x_j (soft.cpp) without its factor D_j.
 template <class T>
-void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, const T* pull, T* grad) {
+void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, const T* pull,
+                        T* grad) {
   const Size raster = image.settings.raster;
   T sums[kSums][kGroup] = {};
   for (int64_t j = face.row_first; j <= face.row_last; ++j) {
@@ -141,7 +148,8 @@ void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, cons
       const int64_t lanes = std::min(kGroup, face.column_last - i + 1);
       for (int64_t n = 0; n < lanes; ++n) g[n] = row[i + n];
       for (int64_t n = 0; n < kGroup; ++n) {
-        const SoftPixel<T> p = evaluate<T, true>(face, image.columns[i + n], py, image.sigma, image.reach);
+        const SoftPixel<T> p =
+            evaluate<T, true>(face, image.columns[i + n], py, image.sigma, image.reach);
         const T strength = g[n] * p.covers * p.sign * (T(-2) / image.sigma);
         sums[6][n] += strength * p.square;
         for (int k = 0; k < 3; ++k) {

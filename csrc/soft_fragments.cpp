@@ -1,8 +1,10 @@
-// Weights, depth and signed squared distance of the faces around each pixel (soft_layers), and their derivatives.
+// Weights, depth and signed squared distance of the faces around each pixel (soft_layers), and
+// their derivatives.
 //
-// With v_k of SoftWeights and q = sum_k v_k / z_k: depth z = 1 / q and weights b_k = z v_k / z_k; without perspective z
-// = sum_k v_k z_k and b_k = v_k. A clamped weight has no derivative. Moving corner k by e changes the weight w_m on the
-// screen by -w_k (gradient of w_m at the pixel) . e. soft.cpp has the derivative of the distance.
+// With v_k of SoftWeights and q = sum_k v_k / z_k: depth z = 1 / q and weights b_k = z v_k / z_k;
+// without perspective z = sum_k v_k z_k and b_k = v_k. A clamped weight has no derivative. Moving
+// corner k by e changes the weight w_m on the screen by -w_k (gradient of w_m at the pixel) . e.
+// soft.cpp has the derivative of the distance.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -23,7 +25,8 @@ struct SoftFragment {
   SoftFragment(const SoftFragments<T>& args, int64_t b, int64_t id, int64_t row, int64_t column) {
     const Size raster = args.raster;
     const T shorter = static_cast<T>(std::min(raster.height, raster.width));
-    scale_x = static_cast<T>(raster.width) / shorter, scale_y = static_cast<T>(raster.height) / shorter;
+    scale_x = static_cast<T>(raster.width) / shorter,
+    scale_y = static_cast<T>(raster.height) / shorter;
     face = args.mesh.image_faces(b) + 3 * (id % args.mesh.face_count(b));
     for (int k = 0; k < 3; ++k) {
       const T* v = args.mesh.image_vertices(b) + 3 * face[k];
@@ -46,7 +49,9 @@ struct Nearest {
       const int q = (k + 1) % 3;
       const T sx = f.x[q] - f.x[k], sy = f.y[q] - f.y[k], dx = f.px - f.x[k], dy = f.py - f.y[k];
       const T length = sx * sx + sy * sy;
-      const T t = length > std::numeric_limits<T>::min() ? clamp_weight((dx * sx + dy * sy) / length) : T(0);
+      const T t = length > std::numeric_limits<T>::min()
+                      ? clamp_weight((dx * sx + dy * sy) / length)
+                      : T(0);
       const T ax = dx - t * sx, ay = dy - t * sy, d = ax * ax + ay * ay;
       if (d < square) square = d, away_x = ax, away_y = ay, share = t, side = k;
     }
@@ -60,8 +65,8 @@ bool inside(const SoftWeights<T>& weights) {
 
 // Adds the gradient of one fragment to the corners of its face, [3, 3].
 template <class T>
-void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad_weights, T grad_depth, T grad_distance,
-                       T* grads) {
+void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad_weights,
+                       T grad_depth, T grad_distance, T* grads) {
   const SoftWeights<T> weights(f.x, f.y, f.px, f.py);
   const T *v = weights.v, *z = f.z;
   T grad_v[3], mean = 0;
@@ -91,8 +96,11 @@ void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad
   const Nearest<T> nearest(f);
   const T strength = (inside(weights) ? 2 : -2) * grad_distance;
   for (int k = 0; k < 3; ++k) {
-    const T share = k == nearest.side ? 1 - nearest.share : k == (nearest.side + 1) % 3 ? nearest.share : T(0);
-    const T w = std::isfinite(weights.w[k]) ? weights.w[k] : T(0);  // not finite if the face has no area
+    const T share = k == nearest.side             ? 1 - nearest.share
+                    : k == (nearest.side + 1) % 3 ? nearest.share
+                                                  : T(0);
+    const T w =
+        std::isfinite(weights.w[k]) ? weights.w[k] : T(0);  // not finite if the face has no area
     grads[3 * k] += (strength * share * nearest.away_x - w * by_x) * f.scale_x;
     grads[3 * k + 1] += (strength * share * nearest.away_y - w * by_y) * f.scale_y;
   }
@@ -121,7 +129,8 @@ void soft_fragments_forward(const SoftFragments<T>& args) {
       const SoftWeights<T> screen(f.x, f.y, f.px, f.py);
       const T square = Nearest<T>(f).square;
       args.depth[n] = screen.depth(f.z, args.perspective);
-      for (int k = 0; k < 3; ++k) weights[k] = args.perspective ? args.depth[n] * screen.v[k] / f.z[k] : screen.v[k];
+      for (int k = 0; k < 3; ++k)
+        weights[k] = args.perspective ? args.depth[n] * screen.v[k] / f.z[k] : screen.v[k];
       args.distances[n] = inside(screen) ? -square : square;
     }
   });
@@ -147,15 +156,17 @@ void soft_fragments_backward(const SoftFragments<T>& args) {
           const int64_t id = args.face_index[n];
           if (id < 0) continue;
           const SoftFragment<T> f(args, b, id, n / wide % H, n % wide / args.layers);
-          fragment_backward(f, args.perspective, args.grad_weights + 3 * n, args.grad_depth[n], args.grad_distances[n],
-                            values + 9 * sums.visible.slots[id + 1]);
+          fragment_backward(f, args.perspective, args.grad_weights + 3 * n, args.grad_depth[n],
+                            args.grad_distances[n], values + 9 * sums.visible.slots[id + 1]);
         }
       },
       [&](int64_t b, SoftSums<T>& sums) {
         for (int64_t n = 1; n < sums.visible.count; ++n) {
-          const int64_t* face = mesh.image_faces(b) + 3 * (sums.visible.ids[n] % mesh.face_count(b));
+          const int64_t* face =
+              mesh.image_faces(b) + 3 * (sums.visible.ids[n] % mesh.face_count(b));
           for (int k = 0; k < 9; ++k)
-            args.grad_vertices[3 * (mesh.vertex_start(b) + face[k / 3]) + k % 3] += sums.values[9 * n + k];
+            args.grad_vertices[3 * (mesh.vertex_start(b) + face[k / 3]) + k % 3] +=
+                sums.values[9 * n + k];
         }
       });
 }

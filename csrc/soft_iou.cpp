@@ -1,4 +1,5 @@
-// Soft intersection over union of each pair of images: I / U with I = sum p t and U = sum (p + t - p t); 1 if U = 0.
+// Soft intersection over union of each pair of images: I / U with I = sum p t and U = sum (p + t -
+// p t); 1 if U = 0.
 #include <algorithm>
 
 #include "parallel.h"
@@ -42,9 +43,11 @@ void soft_iou_backward(const SoftIou<T>& args) {
     const T factor = static_cast<T>(scale * (either + both)), offset = static_cast<T>(scale * both);
     const int64_t first = b * args.count;
     if (args.grad_prediction)
-      NMR_AT_BEST_LEVEL(gradient_of, args.target + first, factor, offset, args.grad_prediction + first, args.count);
+      NMR_AT_BEST_LEVEL(gradient_of, args.target + first, factor, offset,
+                        args.grad_prediction + first, args.count);
     if (args.grad_target)
-      NMR_AT_BEST_LEVEL(gradient_of, args.prediction + first, factor, offset, args.grad_target + first, args.count);
+      NMR_AT_BEST_LEVEL(gradient_of, args.prediction + first, factor, offset,
+                        args.grad_target + first, args.count);
   });
 }
 

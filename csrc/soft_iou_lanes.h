@@ -8,8 +8,8 @@ NMR_INLINE void add_pairs(const T* p, const T* t, Lanes<T>& product, Lanes<T>& s
   sum = sum + (a + b);
 }
 
-// Two vectors of partial sums run side by side. After every kChunk values they are added, in order, to totals in
-// double precision. The order depends on the number of values alone.
+// Two vectors of partial sums run side by side. After every kChunk values they are added, in order,
+// to totals in double precision. The order depends on the number of values alone.
 template <class T>
 Totals totals_of(const T* p, const T* t, int64_t count) {
   Totals totals;
@@ -20,7 +20,8 @@ Totals totals_of(const T* p, const T* t, int64_t count) {
       add_pairs(p + n, t + n, product[0], sum[0]);
       add_pairs(p + n + kLanes, t + n + kLanes, product[1], sum[1]);
     }
-    T rest_p[2 * kLanes] = {}, rest_t[2 * kLanes] = {};  // the last, incomplete vectors, filled up with zeros
+    T rest_p[2 * kLanes] = {},
+                 rest_t[2 * kLanes] = {};  // the last, incomplete vectors, filled up with zeros
     for (int64_t n = whole; n < end; ++n) rest_p[n - whole] = p[n], rest_t[n - whole] = t[n];
     for (int k = 0; k < 2; ++k) {
       if (whole < end) add_pairs(rest_p + k * kLanes, rest_t + k * kLanes, product[k], sum[k]);

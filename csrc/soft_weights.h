@@ -5,8 +5,9 @@
 
 namespace nmr {
 
-// w_k are the weights on the screen, v_k these clamped to [0, 1] and divided by their sum (at least 1): those of the
-// pixel if it is inside, and of a point of the border if not. NaN if the face has no area.
+// w_k are the weights on the screen, v_k these clamped to [0, 1] and divided by their sum (at least
+// 1): those of the pixel if it is inside, and of a point of the border if not. NaN if the face has
+// no area.
 template <class T>
 struct SoftWeights {
   T w[3], v[3], sum, area;
@@ -23,7 +24,8 @@ struct SoftWeights {
     for (int k = 0; k < 3; ++k) v[k] /= sum;
   }
   NMR_INLINE T depth(const T* z, bool perspective) const {
-    return perspective ? 1 / (v[0] / z[0] + v[1] / z[1] + v[2] / z[2]) : v[0] * z[0] + v[1] * z[1] + v[2] * z[2];
+    return perspective ? 1 / (v[0] / z[0] + v[1] / z[1] + v[2] / z[2])
+                       : v[0] * z[0] + v[1] * z[1] + v[2] * z[2];
   }
 };
 

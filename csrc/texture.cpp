@@ -1,7 +1,8 @@
 // Colours from texture images: mipmaps, the level of each pixel, and sampling.
 //
-// A pixel with weights b has (u, v) = sum_k b_k (u_k, v_k). On a level of height x width texels its position is x =
-// u width - 1/2, y = (1 - v) height - 1/2, with texel centres at the integers and row 0 at the top.
+// A pixel with weights b has (u, v) = sum_k b_k (u_k, v_k). On a level of height x width texels its
+// position is x = u width - 1/2, y = (1 - v) height - 1/2, with texel centres at the integers and
+// row 0 at the top.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -19,14 +20,16 @@ struct Grid {
   int64_t first, height, width;
 };
 
-NMR_INLINE Grid grid_of(const int64_t* grids, int64_t images, int64_t levels, int64_t b, int64_t level) {
+NMR_INLINE Grid grid_of(const int64_t* grids, int64_t images, int64_t levels, int64_t b,
+                        int64_t level) {
   const int64_t* g = grids + 3 * ((images == 1 ? 0 : b) * levels + level);
   return {g[0], g[1], g[2]};
 }
 
 // --- mipmaps
 
-// The weights of the fine texels that texel i of a coarse row covers. The first is 2 i, or i if the sizes are equal.
+// The weights of the fine texels that texel i of a coarse row covers. The first is 2 i, or i if the
+// sizes are equal.
 template <class T>
 struct Share {
   int64_t count;
@@ -53,7 +56,8 @@ void for_pairs(const Grid& fine, const Grid& coarse, const Body& body) {
       const int64_t first_column = fine.width == coarse.width ? column : 2 * column;
       for (int64_t j = 0; j < down.count; ++j)
         for (int64_t i = 0; i < right.count; ++i)
-          body(coarse.first + row * coarse.width + column, fine.first + (first_row + j) * fine.width + first_column + i,
+          body(coarse.first + row * coarse.width + column,
+               fine.first + (first_row + j) * fine.width + first_column + i,
                down.share[j] * right.share[i]);
     }
   }
@@ -77,12 +81,14 @@ void mipmaps_forward(const Mipmaps<T>& args) {
   const int64_t C = args.channels;
   parallel_for(args.images, args.num_threads, [&](int64_t i) {
     Grid fine = grid_of(args.grids, args.images, args.levels, i, 0);
-    std::copy_n(args.texels + first_texel(args, i) * C, fine.height * fine.width * C, args.pyramid + fine.first * C);
+    std::copy_n(args.texels + first_texel(args, i) * C, fine.height * fine.width * C,
+                args.pyramid + fine.first * C);
     for (int64_t level = 1; level < args.levels; ++level) {
       const Grid coarse = grid_of(args.grids, args.images, args.levels, i, level);
       std::fill_n(args.pyramid + coarse.first * C, coarse.height * coarse.width * C, T(0));
       for_pairs<T>(fine, coarse, [&](int64_t to, int64_t from, T weight) {
-        for (int64_t c = 0; c < C; ++c) args.pyramid[to * C + c] += weight * args.pyramid[from * C + c];
+        for (int64_t c = 0; c < C; ++c)
+          args.pyramid[to * C + c] += weight * args.pyramid[from * C + c];
       });
       fine = coarse;
     }
@@ -142,9 +148,9 @@ NMR_INLINE Place<T> place_of(const T* uv, const int64_t* corners, const T* weigh
 
 // --- levels
 
-// Derivatives of (u, v) by the pixel coordinates (X, Y). With M the matrix of barycentric weights (geometry.h) and
-// N_k = M_k / z_k, b_k = z (N_k0 X + N_k1 Y + N_k2) and 1 / z = sum_k N_k . (X, Y, 1), so that du/dX = z (sum_k
-// N_k0 u_k - u sum_k N_k0).
+// Derivatives of (u, v) by the pixel coordinates (X, Y). With M the matrix of barycentric weights
+// (geometry.h) and N_k = M_k / z_k, b_k = z (N_k0 X + N_k1 Y + N_k2) and 1 / z = sum_k N_k . (X, Y,
+// 1), so that du/dX = z (sum_k N_k0 u_k - u sum_k N_k0).
 template <class T>
 struct Slopes {
   T u[2], v[2], one[2];  // sums over k of N_k0 and N_k1, times u_k, v_k and 1
@@ -152,8 +158,10 @@ struct Slopes {
 };
 
 template <class T>
-NMR_INLINE Slopes<T> slopes_of(const Triangle<T>& t, Size raster, const T* uv, const int64_t* corners) {
-  const BarycentricMatrix<T> M = barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height));
+NMR_INLINE Slopes<T> slopes_of(const Triangle<T>& t, Size raster, const T* uv,
+                               const int64_t* corners) {
+  const BarycentricMatrix<T> M =
+      barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height));
   Slopes<T> s{};
   for (int k = 0; k < 3; ++k) {
     s.z[k] = t.z[k];
@@ -168,7 +176,8 @@ NMR_INLINE Slopes<T> slopes_of(const Triangle<T>& t, Size raster, const T* uv, c
 }
 
 template <class T>
-NMR_INLINE T level_of(const Slopes<T>& s, const Place<T>& place, const T* weights, const Grid& grid, int64_t levels) {
+NMR_INLINE T level_of(const Slopes<T>& s, const Place<T>& place, const T* weights, const Grid& grid,
+                      int64_t levels) {
   const T z = weights[0] * s.z[0] + weights[1] * s.z[1] + weights[2] * s.z[2];
   T largest = 0;
   for (int axis = 0; axis < 2; ++axis) {
@@ -177,7 +186,8 @@ NMR_INLINE T level_of(const Slopes<T>& s, const Place<T>& place, const T* weight
     largest = std::max(largest, x * x + y * y);
   }
   if (!(largest > 1)) return 0;  // NaN as well: a corner in the plane of the eye
-  const double level = largest <= std::numeric_limits<T>::max() ? log2_of(static_cast<double>(largest)) / 2 : levels;
+  const double level =
+      largest <= std::numeric_limits<T>::max() ? log2_of(static_cast<double>(largest)) / 2 : levels;
   return static_cast<T>(std::min(level, static_cast<double>(levels - 1)));
 }
 
@@ -202,7 +212,8 @@ void uv_levels(const UVLevels<T>& args) {
     Slopes<T>* slopes = reserve(scratch.slopes, scratch.visible.count);
     for (int64_t n = 1; n < scratch.visible.count; ++n) {
       const int64_t id = scratch.visible.ids[n], face = id < F ? id : id - F;
-      const Triangle<T> t = load_triangle(args.mesh.image_vertices(b), args.mesh.image_faces(b) + 3 * face, false);
+      const Triangle<T> t =
+          load_triangle(args.mesh.image_vertices(b), args.mesh.image_faces(b) + 3 * face, false);
       slopes[n] = slopes_of(t, raster, uv, image.corners + 3 * face);
     }
     const Grid grid = grid_of(args.grids, args.images, args.levels, b, 0);
@@ -212,7 +223,8 @@ void uv_levels(const UVLevels<T>& args) {
       if (id < 0) continue;
       const T* weights = args.uv.weights + 3 * n;
       const Place<T> place = place_of(uv, image.corners + 3 * (id < F ? id : id - F), weights);
-      args.level[n] = level_of(slopes[scratch.visible.slots[id + 1]], place, weights, grid, args.levels);
+      args.level[n] =
+          level_of(slopes[scratch.visible.slots[id + 1]], place, weights, grid, args.levels);
     }
   });
 }
@@ -234,17 +246,20 @@ NMR_INLINE int64_t wrapped(int64_t n, int64_t size, Wrap wrap) {
 // The four texels around a place on one level: upper left, upper right, lower left, lower right.
 template <class T>
 struct BilinearTaps {
-  int64_t row[2];     // first texel of the upper and the lower row
+  int64_t row[2];  // first texel of the upper and the lower row
   int64_t column[2];
-  T right, down;      // position between the columns and the rows, in [0, 1)
+  T right, down;  // position between the columns and the rows, in [0, 1)
 
   NMR_INLINE int64_t texel(int k) const { return row[k >> 1] + column[k & 1]; }
-  NMR_INLINE T weight(int k) const { return (k >> 1 ? down : 1 - down) * (k & 1 ? right : 1 - right); }
+  NMR_INLINE T weight(int k) const {
+    return (k >> 1 ? down : 1 - down) * (k & 1 ? right : 1 - right);
+  }
 };
 
 template <class T>
 NMR_INLINE BilinearTaps<T> taps_of(const Grid& grid, const Place<T>& place, Wrap wrap) {
-  const T x = place.u * static_cast<T>(grid.width) - T(0.5), y = (1 - place.v) * static_cast<T>(grid.height) - T(0.5);
+  const T x = place.u * static_cast<T>(grid.width) - T(0.5),
+          y = (1 - place.v) * static_cast<T>(grid.height) - T(0.5);
   int64_t column = static_cast<int64_t>(x), row = static_cast<int64_t>(y);
   column -= static_cast<T>(column) > x;  // floor
   row -= static_cast<T>(row) > y;
@@ -268,7 +283,8 @@ struct MipBlend {
 
 template <class T>
 NMR_INLINE MipBlend<T> blend_of(const SampleUV<T>& args, int64_t b, int64_t n) {
-  if (!args.level) return {1, {grid_of(args.grids, args.images, args.levels, b, 0), {}}, {T(1), T(0)}};
+  if (!args.level)
+    return {1, {grid_of(args.grids, args.images, args.levels, b, 0), {}}, {T(1), T(0)}};
   const T level = args.level[n];
   const int64_t low = std::max(std::min(static_cast<int64_t>(level), args.levels - 1), int64_t(0));
   const T share = level - static_cast<T>(low);
@@ -279,7 +295,8 @@ NMR_INLINE MipBlend<T> blend_of(const SampleUV<T>& args, int64_t b, int64_t n) {
 
 // color (+)= share * sum over the taps of weight texel
 template <int64_t kChannels, bool kAdd, class T>
-NMR_INLINE void add_taps(const BilinearTaps<T>& taps, const T* texels, T share, int64_t C, T* color) {
+NMR_INLINE void add_taps(const BilinearTaps<T>& taps, const T* texels, T share, int64_t C,
+                         T* color) {
   const T *a = texels + taps.texel(0) * C, *b = texels + taps.texel(1) * C;
   const T *c = texels + taps.texel(2) * C, *d = texels + taps.texel(3) * C;
   const T wa = taps.weight(0), wb = taps.weight(1), wc = taps.weight(2), wd = taps.weight(3);
@@ -291,8 +308,8 @@ NMR_INLINE void add_taps(const BilinearTaps<T>& taps, const T* texels, T share, 
 
 // Adds the gradient of a color to the texels whose row begins in [first, last).
 template <int64_t kChannels, class T>
-NMR_INLINE void add_texel_gradients(const BilinearTaps<T>& taps, T share, const T* grad, int64_t C, int64_t first, int64_t last,
-                                    T* grad_texels) {
+NMR_INLINE void add_texel_gradients(const BilinearTaps<T>& taps, T share, const T* grad, int64_t C,
+                                    int64_t first, int64_t last, T* grad_texels) {
   for (int k = 0; k < 4; ++k) {
     const int64_t row = taps.row[k >> 1];
     if (row < first || row >= last) continue;
@@ -304,8 +321,8 @@ NMR_INLINE void add_texel_gradients(const BilinearTaps<T>& taps, T share, const 
 
 // Adds dL/du and dL/dv of one level.
 template <int64_t kChannels, class T>
-NMR_INLINE void add_place_gradient(const BilinearTaps<T>& taps, const Grid& grid, const T* texels, T share, const T* grad,
-                                   int64_t C, T& grad_u, T& grad_v) {
+NMR_INLINE void add_place_gradient(const BilinearTaps<T>& taps, const Grid& grid, const T* texels,
+                                   T share, const T* grad, int64_t C, T& grad_u, T& grad_v) {
   const T *a = texels + taps.texel(0) * C, *b = texels + taps.texel(1) * C;
   const T *c = texels + taps.texel(2) * C, *d = texels + taps.texel(3) * C;
   T by_x = 0, by_y = 0;
@@ -319,15 +336,16 @@ NMR_INLINE void add_place_gradient(const BilinearTaps<T>& taps, const Grid& grid
 
 constexpr int64_t kNoRow = -1;
 
-// The gradients of a block's pixels: those of weights, the sums of uv per corner, and, if `direct`, those of
-// texels. Otherwise `rows` gets the first texel of the (up to four) rows of each pixel, from which scatter_texels
-// continues.
+// The gradients of a block's pixels: those of weights, the sums of uv per corner, and, if `direct`,
+// those of texels. Otherwise `rows` gets the first texel of the (up to four) rows of each pixel,
+// from which scatter_texels continues.
 template <int64_t kChannels, class T>
-void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>& image, const RowBlocks& blocks,
-                              int64_t b, int64_t block, bool direct, int32_t* rows, CornerSums<T>& sums) {
+void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>& image,
+                              const RowBlocks& blocks, int64_t b, int64_t block, bool direct,
+                              int32_t* rows, CornerSums<T>& sums) {
   const Interpolate<T>& at = args.uv;
-  const int64_t H = at.raster.height, W = at.raster.width, C = kChannels ? kChannels : args.channels,
-                F = image.num_faces;
+  const int64_t H = at.raster.height, W = at.raster.width,
+                C = kChannels ? kChannels : args.channels, F = image.num_faces;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   const int64_t per_pixel = args.level ? 4 : 2;
   const T* uv = at.attributes + 2 * image.first_row;
@@ -350,11 +368,15 @@ void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>&
     T grad_u = 0, grad_v = 0;
     for (int l = 0; l < blend.count; ++l) {
       const BilinearTaps<T> taps = taps_of(blend.grid[l], place, args.wrap);
-      if (direct) add_texel_gradients<kChannels>(taps, blend.share[l], grad, C, 0, args.num_texels, args.grad_texels);
+      if (direct)
+        add_texel_gradients<kChannels>(taps, blend.share[l], grad, C, 0, args.num_texels,
+                                       args.grad_texels);
       if (rows)
-        for (int k = 0; k < 2; ++k) rows[n * per_pixel + 2 * l + k] = static_cast<int32_t>(taps.row[k]);
+        for (int k = 0; k < 2; ++k)
+          rows[n * per_pixel + 2 * l + k] = static_cast<int32_t>(taps.row[k]);
       if (at.grad_attributes || at.grad_weights)
-        add_place_gradient<kChannels>(taps, blend.grid[l], args.texels, blend.share[l], grad, C, grad_u, grad_v);
+        add_place_gradient<kChannels>(taps, blend.grid[l], args.texels, blend.share[l], grad, C,
+                                      grad_u, grad_v);
     }
     if (!place.u_counts) grad_u = 0;
     if (!place.v_counts) grad_v = 0;
@@ -377,7 +399,8 @@ void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>&
 template <int64_t kChannels, class T>
 void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first, int64_t last) {
   const Interpolate<T>& at = args.uv;
-  const int64_t C = kChannels ? kChannels : args.channels, per_pixel = args.level ? 4 : 2, pixels = at.raster.pixels();
+  const int64_t C = kChannels ? kChannels : args.channels, per_pixel = args.level ? 4 : 2,
+                pixels = at.raster.pixels();
   for (int64_t b = 0; b < at.batch; ++b) {
     const ImageAttributes<T> image = image_attributes(at, b);
     const int64_t F = image.num_faces;
@@ -388,7 +411,8 @@ void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first,
       if (!inside) continue;
       const int64_t id = at.face_index[n];
       const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
-      const Place<T> place = place_of(at.attributes + 2 * image.first_row, corners, at.weights + 3 * n);
+      const Place<T> place =
+          place_of(at.attributes + 2 * image.first_row, corners, at.weights + 3 * n);
       const MipBlend<T> blend = blend_of(args, b, n);
       for (int l = 0; l < blend.count; ++l)
         add_texel_gradients<kChannels>(taps_of(blend.grid[l], place, args.wrap), blend.share[l],
@@ -416,54 +440,63 @@ void sample_uv_forward(const SampleUV<T>& args) {
           for (int64_t c = 0; c < C; ++c) color[c] = 0;
           continue;
         }
-        const Place<T> place = place_of(uv, image.corners + 3 * (id < F ? id : id - F), at.weights + 3 * n);
+        const Place<T> place =
+            place_of(uv, image.corners + 3 * (id < F ? id : id - F), at.weights + 3 * n);
         const MipBlend<T> blend = blend_of(args, b, n);
-        add_taps<kChannels, false>(taps_of(blend.grid[0], place, args.wrap), args.texels, blend.share[0], C, color);
+        add_taps<kChannels, false>(taps_of(blend.grid[0], place, args.wrap), args.texels,
+                                   blend.share[0], C, color);
         if (blend.count == 2)
-          add_taps<kChannels, true>(taps_of(blend.grid[1], place, args.wrap), args.texels, blend.share[1], C, color);
+          add_taps<kChannels, true>(taps_of(blend.grid[1], place, args.wrap), args.texels,
+                                    blend.share[1], C, color);
       }
     });
   });
 }
 
-// Every texel is summed on one thread, over images and pixels in ascending order: on one thread, or if each image
-// has its own texels and its own uv, directly; otherwise each thread takes ranges of texels, and reads the pixels
-// that touch them.
+// Every texel is summed on one thread, over images and pixels in ascending order: on one thread, or
+// if each image has its own texels and its own uv, directly; otherwise each thread takes ranges of
+// texels, and reads the pixels that touch them.
 template <class T>
 void sample_uv_backward(const SampleUV<T>& args) {
   const Interpolate<T>& at = args.uv;
   const int64_t uv_rows = at.num_attributes * (at.starts ? 1 : at.attribute_batch);
   const bool shared_uv = !at.starts && at.attribute_batch == 1;
-  const bool alone = at.num_threads <= 1 || (!shared_uv && args.images == at.batch && at.batch >= at.num_threads);
+  const bool alone =
+      at.num_threads <= 1 || (!shared_uv && args.images == at.batch && at.batch >= at.num_threads);
   const bool direct = args.grad_texels && alone, scatter = args.grad_texels && !alone;
   if (at.grad_attributes) std::fill_n(at.grad_attributes, 2 * uv_rows, T(0));
   if (args.grad_texels) std::fill_n(args.grad_texels, args.num_texels * args.channels, T(0));
   std::vector<int32_t> rows(scatter ? at.batch * at.raster.pixels() * (args.level ? 4 : 2) : 0);
-  const auto blocks_of = [&](int64_t b) { return RowBlocks(at.raster, image_attributes(at, b).num_faces); };
+  const auto blocks_of = [&](int64_t b) {
+    return RowBlocks(at.raster, image_attributes(at, b).num_faces);
+  };
   sum_blocks<CornerSums<T>>(
       at.batch, shared_uv, at.num_threads, [&](int64_t b) { return blocks_of(b).count; },
       [&](int64_t b, int64_t block, CornerSums<T>& sums) {
         with_channels<T>(args.channels, [&](auto known) {
-          sample_uv_block_backward<known()>(args, image_attributes(at, b), blocks_of(b), b, block, direct,
-                                            scatter ? rows.data() : nullptr, sums);
+          sample_uv_block_backward<known()>(args, image_attributes(at, b), blocks_of(b), b, block,
+                                            direct, scatter ? rows.data() : nullptr, sums);
         });
       },
       [&](int64_t b, const CornerSums<T>& sums) {
-        if (at.grad_attributes) scatter_corner_sums(sums, image_attributes(at, b), 2, at.grad_attributes);
+        if (at.grad_attributes)
+          scatter_corner_sums(sums, image_attributes(at, b), 2, at.grad_attributes);
       });
   if (!scatter) return;
   const int64_t parts = 2 * static_cast<int64_t>(at.num_threads);
   parallel_for(parts, at.num_threads, [&](int64_t part) {
-    const int64_t first = part * args.num_texels / parts, last = (part + 1) * args.num_texels / parts;
-    with_channels<T>(args.channels, [&](auto known) { scatter_texels<known()>(args, rows.data(), first, last); });
+    const int64_t first = part * args.num_texels / parts,
+                  last = (part + 1) * args.num_texels / parts;
+    with_channels<T>(args.channels,
+                     [&](auto known) { scatter_texels<known()>(args, rows.data(), first, last); });
   });
 }
 
-#define NMR_DEFINE_TEXTURES(T)                            \
-  template void mipmaps_forward(const Mipmaps<T>&);       \
-  template void mipmaps_backward(const Mipmaps<T>&);      \
-  template void uv_levels(const UVLevels<T>&);            \
-  template void sample_uv_forward(const SampleUV<T>&);    \
+#define NMR_DEFINE_TEXTURES(T)                         \
+  template void mipmaps_forward(const Mipmaps<T>&);    \
+  template void mipmaps_backward(const Mipmaps<T>&);   \
+  template void uv_levels(const UVLevels<T>&);         \
+  template void sample_uv_forward(const SampleUV<T>&); \
   template void sample_uv_backward(const SampleUV<T>&);
 NMR_DEFINE_TEXTURES(float)
 NMR_DEFINE_TEXTURES(double)

@@ -1,6 +1,6 @@
-// Occupancy grids: the surface cells, and all cells that cannot be reached from the border of the grid through empty
-// cells. Surface cells are those of Kato et al. 2018 ("kato18", used for most published voxel IoU) or of Kato and
-// Harada 2019 ("kato19"): every cell that a face touches.
+// Occupancy grids: the surface cells, and all cells that cannot be reached from the border of the
+// grid through empty cells. Surface cells are those of Kato et al. 2018 ("kato18", used for most
+// published voxel IoU) or of Kato and Harada 2019 ("kato19"): every cell that a face touches.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -19,18 +19,20 @@ using Vec3f = Eigen::Vector3f;
 constexpr uint8_t kEmpty = 0, kSurface = 1, kOutside = 2;
 
 struct VoxelScratch {
-  std::vector<uint8_t> cells;   // [s + 2, s + 2, s + 2]
+  std::vector<uint8_t> cells;  // [s + 2, s + 2, s + 2]
   std::vector<int32_t> frontier;
 };
 
-// The cells of the grid, surrounded by a layer of outside cells, so that code that visits neighbours needs no test for
-// the border.
+// The cells of the grid, surrounded by a layer of outside cells, so that code that visits
+// neighbours needs no test for the border.
 struct Grid {
   uint8_t* cells;
   int64_t size;
 
   int64_t side() const { return size + 2; }
-  int64_t index(int64_t x, int64_t y, int64_t z) const { return ((x + 1) * side() + y + 1) * side() + z + 1; }
+  int64_t index(int64_t x, int64_t y, int64_t z) const {
+    return ((x + 1) * side() + y + 1) * side() + z + 1;
+  }
 
   void clear() {
     const int64_t row = side(), slab = row * row;
@@ -55,11 +57,12 @@ void lattice_range(float lo, float hi, int64_t size, int64_t& first, int64_t& la
   last = static_cast<int64_t>(std::floor(std::min(std::max(hi, -1.f), end - 1)));
 }
 
-// Rays along `axis` through the integer points (p, q) of the other two axes. Each hit marks the four cells around the
-// ray at the depth of the hit.
+// Rays along `axis` through the integer points (p, q) of the other two axes. Each hit marks the
+// four cells around the ray at the depth of the hit.
 void mark_ray_hits(const Vec3f (&v)[3], int axis, Grid& grid) {
   const int pa = (axis + 1) % 3, qa = (axis + 2) % 3;
-  const float p0 = v[0][pa], p1 = v[1][pa], p2 = v[2][pa], q0 = v[0][qa], q1 = v[1][qa], q2 = v[2][qa];
+  const float p0 = v[0][pa], p1 = v[1][pa], p2 = v[2][pa], q0 = v[0][qa], q1 = v[1][qa],
+              q2 = v[2][qa];
   const float det = (p1 - p0) * (q2 - q0) - (p2 - p0) * (q1 - q0);
   if (det == 0) return;
   int64_t p_first, p_last, q_first, q_last;
@@ -71,7 +74,8 @@ void mark_ray_hits(const Vec3f (&v)[3], int axis, Grid& grid) {
       const float t1 = (dp * (q2 - q0) - (p2 - p0) * dq) / det;
       const float t2 = ((p1 - p0) * dq - dp * (q1 - q0)) / det;
       if (!(t1 >= 0 && t2 >= 0 && t1 + t2 <= 1)) continue;
-      const float depth = std::floor(v[0][axis] + t1 * (v[1][axis] - v[0][axis]) + t2 * (v[2][axis] - v[0][axis]));
+      const float depth =
+          std::floor(v[0][axis] + t1 * (v[1][axis] - v[0][axis]) + t2 * (v[2][axis] - v[0][axis]));
       if (!(depth >= 0 && depth < static_cast<float>(grid.size))) continue;
       int64_t cell[3];
       cell[axis] = static_cast<int64_t>(depth);
@@ -146,7 +150,8 @@ void voxelize(const Voxelize& args) {
     for (int64_t f = 0; f < args.mesh.face_count(b); ++f) {
       Vec3f corners[3];
       for (int k = 0; k < 3; ++k)
-        corners[k] = Eigen::Map<const Vec3f>(vertices + 3 * faces[3 * f + k]) * static_cast<float>(s);
+        corners[k] =
+            Eigen::Map<const Vec3f>(vertices + 3 * faces[3 * f + k]) * static_cast<float>(s);
       if (args.touched)
         mark_touched(corners, grid);
       else

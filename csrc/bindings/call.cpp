@@ -31,18 +31,21 @@ std::pair<std::string_view, int64_t> name_and_more(std::string_view size) {
 }
 
 const char* type_name(Type type) {
-  const char* names[] = {"None", "a number", "float32", "float64", "int32", "int64", "bool", "another type"};
+  const char* names[] = {"None",  "a number", "float32", "float64",
+                         "int32", "int64",    "bool",    "another type"};
   return names[static_cast<int>(type)];
 }
 
 Argument& require_type(Argument& argument, Type type) {
-  if (argument.type == Type::none || (argument.type == type && argument.contiguous)) return argument;
+  if (argument.type == Type::none || (argument.type == type && argument.contiguous))
+    return argument;
   throw WrongType(argument.name + " must be a C-contiguous array of " + type_name(type) + ", got " +
                   (argument.type == type ? "one with gaps" : type_name(argument.type)));
 }
 
 [[noreturn]] void refuse_shape(const Argument& argument, const std::string& wanted) {
-  throw std::invalid_argument(argument.name + " must have shape " + wanted + ", got " + argument.shape_text());
+  throw std::invalid_argument(argument.name + " must have shape " + wanted + ", got " +
+                              argument.shape_text());
 }
 
 }  // namespace
@@ -79,7 +82,8 @@ const Argument& Call::operator()(const std::string& name) const {
 bool Call::is_double(const std::string& of) const {
   if (!of.empty()) return (*this)((backward ? "grad_" : "") + of).type == Type::float64;
   for (const Argument& argument : arguments_)
-    if (argument.type == Type::float32 || argument.type == Type::float64) return argument.type == Type::float64;
+    if (argument.type == Type::float32 || argument.type == Type::float64)
+      return argument.type == Type::float64;
   return false;
 }
 
@@ -92,7 +96,8 @@ Argument& Call::find(const std::string& name, bool may_be_none) {
 
 double Call::number(const std::string& name) {
   const Argument& argument = find(name, false);
-  if (argument.type != Type::number) throw WrongType(name + " must be a number, got " + type_name(argument.type));
+  if (argument.type != Type::number)
+    throw WrongType(name + " must be a number, got " + type_name(argument.type));
   return argument.number;
 }
 
@@ -128,7 +133,8 @@ bool Call::fits(std::string_view shape, const Argument& argument) {
   std::vector<std::string_view> axes = axes_of(shape);
   const bool open = !axes.empty() && axes.back() == "...";
   if (open) axes.pop_back();
-  if (open ? axes.size() > argument.shape.size() : axes.size() != argument.shape.size()) return false;
+  if (open ? axes.size() > argument.shape.size() : axes.size() != argument.shape.size())
+    return false;
   const size_t known = sizes_.size();
   for (size_t d = 0; d < axes.size(); ++d) {
     if (fits(axes[d], argument.shape[d])) continue;
@@ -147,7 +153,8 @@ std::string Call::wanted(std::string_view shapes) const {
       sizes += sizes.empty() ? "" : ", ";
       for (std::string_view choice : split(axis, "|")) {
         const int64_t value = value_of(choice);
-        sizes += (choice.data() == axis.data() ? "" : " or ") + (value < 0 ? std::string(choice) : std::to_string(value));
+        sizes += (choice.data() == axis.data() ? "" : " or ") +
+                 (value < 0 ? std::string(choice) : std::to_string(value));
       }
     }
     text += (text.empty() ? "[" : " or [") + sizes + "]";
@@ -164,10 +171,12 @@ Argument& Call::bind(std::string_view text, const char* prefix, Type type, bool 
   refuse_shape(argument, wanted(shapes_of(text)));
 }
 
-Argument& Call::bind_like(const std::string& of, const std::string& name, Type type, bool may_be_none) {
+Argument& Call::bind_like(const std::string& of, const std::string& name, Type type,
+                          bool may_be_none) {
   Argument& argument = require_type(find(name, may_be_none), type);
   const Argument& like = (*this)(of);
-  if (argument.type != Type::none && argument.shape != like.shape) refuse_shape(argument, like.shape_text());
+  if (argument.type != Type::none && argument.shape != like.shape)
+    refuse_shape(argument, like.shape_text());
   return argument;
 }
 
@@ -179,7 +188,8 @@ int64_t Call::count_of(std::string_view text) const {
 
 void Call::require_all_read() const {
   for (const Argument& argument : arguments_)
-    if (!argument.read && argument.type > Type::number) throw WrongType("there is no argument " + argument.name);
+    if (!argument.read && argument.type > Type::number)
+      throw WrongType("there is no argument " + argument.name);
 }
 
 }  // namespace nmr

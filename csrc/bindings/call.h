@@ -1,6 +1,7 @@
-// The arguments of a kernel, by name. A text says how each array is shaped, such as "attributes [1|B, N, C]": the first
-// array that names a size fixes it, all others must agree. Nothing here knows Python (module.cpp does), so the GIL is
-// not held while arguments are checked and kernels run.
+// The arguments of a kernel, by name. A text says how each array is shaped, such as "attributes
+// [1|B, N, C]": the first array that names a size fixes it, all others must agree. Nothing here
+// knows Python (module.cpp does), so the GIL is not held while arguments are checked and kernels
+// run.
 #pragma once
 
 #include <cstdint>
@@ -48,20 +49,22 @@ class Call {
  public:
   const bool backward;  // a backward pass: results are not computed, but come with their gradients
 
-  Call(std::vector<Argument> arguments, bool backward) : backward(backward), arguments_(std::move(arguments)) {}
+  Call(std::vector<Argument> arguments, bool backward)
+      : backward(backward), arguments_(std::move(arguments)) {}
 
-  // Whether the floats are float64: those of a result, or else those of the first array that has floats.
+  // Whether the floats are float64: those of a result, or else those of the first array that has
+  // floats.
   bool is_double(const std::string& of) const;
-  bool has(const std::string& name) const;               // an array is given, and not None
+  bool has(const std::string& name) const;  // an array is given, and not None
   const Argument& operator()(const std::string& name) const;
-  int64_t operator[](std::string_view size) const;       // a size that is known by now
+  int64_t operator[](std::string_view size) const;  // a size that is known by now
   void let(std::string_view size, int64_t value) { sizes_.emplace_back(size, value); }
   double number(const std::string& name);
   bool flag(const std::string& name) { return number(name) != 0; }
 
-  // Binds an array to a field of the kernel's struct: "name [sizes] or [sizes]". A size is a number, a name, a name + 1,
-  // or several of these with | between them; "..." at the end stands for any more. With "name?" the array may be None;
-  // the field is then nullptr.
+  // Binds an array to a field of the kernel's struct: "name [sizes] or [sizes]". A size is a
+  // number, a name, a name + 1, or several of these with | between them; "..." at the end stands
+  // for any more. With "name?" the array may be None; the field is then nullptr.
   template <class P>
   const Argument& read(std::string_view text, P*& field) {
     return assign(bind(text, "", type_of(field), text.find('?') != text.npos), field);
@@ -73,8 +76,8 @@ class Call {
     assign(bind_like(of, name, type_of(field), false), field);
   }
 
-  // A result in the forward pass; in the backward pass its gradient, an input. If that is None, it is an array of zeros
-  // or, with "name?", nullptr.
+  // A result in the forward pass; in the backward pass its gradient, an input. If that is None, it
+  // is an array of zeros or, with "name?", nullptr.
   template <class T>
   void result(std::string_view text, T*& out, const T*& grad) {
     if (!backward) {
@@ -100,7 +103,9 @@ class Call {
     if (backward) assign(bind_like(of, "grad_" + of, type_of(grad), false), grad);
   }
 
-  void skip(const std::string& name) { find(name, true); }  // an array that only the other pass needs
+  void skip(const std::string& name) {
+    find(name, true);
+  }  // an array that only the other pass needs
   void require_all_read() const;
 
  private:
@@ -124,7 +129,8 @@ class Call {
   int64_t count_of(std::string_view text) const;
 };
 
-// All kernels by name. Those with a backward pass are in the module twice: as "name" and as "name_backward".
+// All kernels by name. Those with a backward pass are in the module twice: as "name" and as
+// "name_backward".
 struct Kernel {
   std::string name;
   std::function<void(Call&)> run;
@@ -133,7 +139,8 @@ struct Kernel {
 
 class Kernels : public std::vector<Kernel> {
  public:
-  // run(T(), call) reads the arguments and calls the kernel, for the T of the call's floats (see is_double).
+  // run(T(), call) reads the arguments and calls the kernel, for the T of the call's floats (see
+  // is_double).
   template <class Run>
   void add(const char* name, Run run) {
     push_back({name, either(run, ""), false});

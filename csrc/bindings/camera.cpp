@@ -38,12 +38,14 @@ Project<T> read_project(Call& call) {
   call.result(packed ? "points [V, 3]" : "points [B, V, 3]", args.points, args.grad_points);
   args.batch = call["B"];
   args.num_vertices = call["V"];
-  args.vertex_batch = call.read(packed ? "vertices [V, 3]" : "vertices [1|B, V, 3]", args.vertices).shape[0];
+  args.vertex_batch =
+      call.read(packed ? "vertices [V, 3]" : "vertices [1|B, V, 3]", args.vertices).shape[0];
   args.camera_each = call.read("camera [1|B, 22]", args.camera).shape[0] == args.batch;
   const Argument& distortion = call.read("distortion? [1|B, 4|5|8]", args.distortion);
   args.distortion_each = args.distortion && distortion.shape[0] == args.batch;
   args.coefficients = args.distortion ? distortion.shape[1] : 0;
-  if (packed) require_starts(args.starts, args.batch, args.num_vertices, args.starts[2 * args.batch + 1]);
+  if (packed)
+    require_starts(args.starts, args.batch, args.num_vertices, args.starts[2 * args.batch + 1]);
   args.perspective = call.flag("perspective");
   args.num_threads = num_threads(call);
   call.gradient("vertices", args.grad_vertices);
@@ -55,10 +57,13 @@ Project<T> read_project(Call& call) {
 }  // namespace
 
 void add_camera(Kernels& kernels) {
-  kernels.add_with_backward("look_at", [](auto zero, Call& call) {
-    const auto args = read_look_at<decltype(zero)>(call);
-    call.backward ? look_at_backward(args) : look_at_forward(args);
-  }, "camera");
+  kernels.add_with_backward(
+      "look_at",
+      [](auto zero, Call& call) {
+        const auto args = read_look_at<decltype(zero)>(call);
+        call.backward ? look_at_backward(args) : look_at_forward(args);
+      },
+      "camera");
   kernels.add_with_backward("project", [](auto zero, Call& call) {
     const auto args = read_project<decltype(zero)>(call);
     call.backward ? project_backward(args) : project_forward(args);

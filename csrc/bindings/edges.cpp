@@ -20,7 +20,8 @@ Resolve<T> read_resolve(Call& call) {
   call.read("image [B, H, W, C]", args.pixels);
   args.batch = call["B"];
   args.channels = call["C"];
-  require(args.channels >= 1, "image must have at least one channel, got " + call("image").shape_text());
+  require(args.channels >= 1,
+          "image must have at least one channel, got " + call("image").shape_text());
   read_background<T>(call, args);
   args.num_threads = num_threads(call);
   call.result("resolved [B, h, w, C]", args.resolved, args.grad_resolved);

@@ -31,16 +31,19 @@ void require_group(const int64_t* layout, Light from, Light to) {
     least = std::min(least, layout[3 * n + 2]);
   }
   for (int64_t n = begin; n < end && least > 0; ++n)
-    require(layout[3 * n + 2] == 1 || layout[3 * n + 2] == most, "parameters of different numbers of lights");
+    require(layout[3 * n + 2] == 1 || layout[3 * n + 2] == most,
+            "parameters of different numbers of lights");
 }
 
 // Every parameter must be inside the array.
 void require_layout(const int64_t* layout, int64_t num_parameters, int64_t batch) {
   for (int64_t n = 0; n < kCount; ++n) {
     const int64_t *l = layout + 3 * n, first = l[0], rows = l[1], lights = l[2];
-    const bool several = n >= static_cast<int64_t>(Light::directional) && n < static_cast<int64_t>(Light::specular);
-    require(lights >= 0 && lights < kMostLights && (several || lights <= 1) && (n > 1 || lights == 1),
-            "impossible number of lights");
+    const bool several =
+        n >= static_cast<int64_t>(Light::directional) && n < static_cast<int64_t>(Light::specular);
+    require(
+        lights >= 0 && lights < kMostLights && (several || lights <= 1) && (n > 1 || lights == 1),
+        "impossible number of lights");
     require(lights == 0 || ((rows == 1 || rows == batch) && first >= 0 &&
                             first + rows * lights * kWidths[n] <= num_parameters),
             "a parameter of lights lies outside the array");
@@ -62,7 +65,8 @@ Lit<T> read_lit(Call& call) {
   call.read("layout [lights, 3]", args.layout);
   call.read("parameters? [P]", args.parameters);
   if (args.parameters) {
-    require(call["lights"] == kCount, "layout must have shape [11, 3], got " + call("layout").shape_text());
+    require(call["lights"] == kCount,
+            "layout must have shape [11, 3], got " + call("layout").shape_text());
     args.num_parameters = call["P"];
     require_layout(args.layout, args.num_parameters, args.at.batch);
   }

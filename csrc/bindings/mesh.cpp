@@ -32,8 +32,10 @@ void require_mask(const T* target, int64_t count) {
   if (low >= T(-0.5) && high <= T(1.5)) return;
   const auto [least, most] = std::minmax_element(target, target + count);
   char text[120];
-  std::snprintf(text, sizeof text, "target must lie in [0, 1], got values from %.4g to %.4g; divide a mask of 0..255 by 255",
-                static_cast<double>(*least), static_cast<double>(*most));
+  std::snprintf(
+      text, sizeof text,
+      "target must lie in [0, 1], got values from %.4g to %.4g; divide a mask of 0..255 by 255",
+      static_cast<double>(*least), static_cast<double>(*most));
   throw std::invalid_argument(text);
 }
 
@@ -76,7 +78,8 @@ Voxelize read_voxelize(Call& call) {
   Voxelize args{};
   args.mesh = read_mesh<float>(call);
   args.size = static_cast<int64_t>(call.number("size"));
-  require(args.size >= 1 && args.size <= 1024, "size must lie in 1..1024, got " + std::to_string(args.size));
+  require(args.size >= 1 && args.size <= 1024,
+          "size must lie in 1..1024, got " + std::to_string(args.size));
   call.let("s", args.size);
   args.touched = call.flag("touched");
   args.num_threads = num_threads(call);
@@ -91,7 +94,8 @@ void add_mesh(Kernels& kernels) {
     const auto args = read_smoothness<decltype(zero)>(call);
     call.backward ? smoothness_backward(args) : smoothness_forward(args);
   });
-  kernels.add_with_backward("soft_iou_loss", [](auto zero, Call& call) { mean_of_iou<decltype(zero)>(call); });
+  kernels.add_with_backward("soft_iou_loss",
+                            [](auto zero, Call& call) { mean_of_iou<decltype(zero)>(call); });
   kernels.add("voxels", [](auto, Call& call) { voxelize(read_voxelize(call)); });
 }
 

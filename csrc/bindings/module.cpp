@@ -1,4 +1,5 @@
-// nmr._C: the kernels as functions of tensors (or NumPy arrays) and numbers, given by name. The only file that knows Python.
+// nmr._C: the kernels as functions of tensors (or NumPy arrays) and numbers, given by name. The
+// only file that knows Python.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
@@ -13,10 +14,14 @@ namespace {
 Type type_of(const py::dtype& dtype) {
   const auto size = dtype.itemsize();
   switch (dtype.kind()) {
-    case 'f': return size == 4 ? Type::float32 : size == 8 ? Type::float64 : Type::other;
-    case 'i': return size == 4 ? Type::int32 : size == 8 ? Type::int64 : Type::other;
-    case 'b': return Type::boolean;
-    default: return Type::other;
+    case 'f':
+      return size == 4 ? Type::float32 : size == 8 ? Type::float64 : Type::other;
+    case 'i':
+      return size == 4 ? Type::int32 : size == 8 ? Type::int64 : Type::other;
+    case 'b':
+      return Type::boolean;
+    default:
+      return Type::other;
   }
 }
 
@@ -24,16 +29,21 @@ Type type_of(const py::dtype& dtype) {
 struct Torch {
   py::handle tensor = of_torch("Tensor");
   std::vector<std::pair<py::handle, Type>> dtypes;
-  py::handle is_cpu = name("is_cpu"), is_contiguous = name("is_contiguous"), is_neg = name("is_neg"),
-             data_ptr = name("data_ptr"), shape = name("shape"), dtype = name("dtype");
+  py::handle is_cpu = name("is_cpu"), is_contiguous = name("is_contiguous"),
+             is_neg = name("is_neg"), data_ptr = name("data_ptr"), shape = name("shape"),
+             dtype = name("dtype");
 
   Torch() {
-    const std::pair<const char*, Type> names[] = {{"float32", Type::float32}, {"float64", Type::float64},
-                                                  {"int32", Type::int32},     {"int64", Type::int64},
+    const std::pair<const char*, Type> names[] = {{"float32", Type::float32},
+                                                  {"float64", Type::float64},
+                                                  {"int32", Type::int32},
+                                                  {"int64", Type::int64},
                                                   {"bool", Type::boolean}};
     for (const auto& [name, type] : names) dtypes.emplace_back(of_torch(name), type);
   }
-  static py::handle of_torch(const char* name) { return py::object(py::module_::import("torch").attr(name)).release(); }
+  static py::handle of_torch(const char* name) {
+    return py::object(py::module_::import("torch").attr(name)).release();
+  }
   static py::handle name(const char* text) { return PyUnicode_InternFromString(text); }
   static const Torch& get() {
     static const Torch* torch = new Torch;
@@ -50,12 +60,14 @@ py::object ask(const py::handle& value, const py::handle& method) {
 // A tensor in host memory. One with gaps is copied; `kept` holds the copy during the call.
 void read_tensor(py::object tensor, Argument& argument, py::list& kept) {
   const Torch& torch = Torch::get();
-  if (!py::getattr(tensor, torch.is_cpu).cast<bool>()) throw py::type_error(argument.name + " must be in host memory");
+  if (!py::getattr(tensor, torch.is_cpu).cast<bool>())
+    throw py::type_error(argument.name + " must be in host memory");
   if (ask(tensor, torch.is_neg).cast<bool>()) tensor = tensor.attr("resolve_neg")();
   if (!ask(tensor, torch.is_contiguous).cast<bool>()) tensor = tensor.attr("contiguous")();
   kept.append(tensor);
   argument.data = reinterpret_cast<void*>(ask(tensor, torch.data_ptr).cast<uintptr_t>());
-  for (const py::handle& size : py::getattr(tensor, torch.shape)) argument.shape.push_back(size.cast<int64_t>());
+  for (const py::handle& size : py::getattr(tensor, torch.shape))
+    argument.shape.push_back(size.cast<int64_t>());
   argument.type = Type::other;
   const py::object dtype = py::getattr(tensor, torch.dtype);
   for (const auto& [known, type] : torch.dtypes)
@@ -104,7 +116,8 @@ void define(py::module_& m, const std::string& name, const Kernel& kernel, bool 
 }  // namespace nmr
 
 PYBIND11_MODULE(_C, m) {
-  m.doc() = "Compiled kernels of nmr. Use the functions of the package nmr, which validate and document.";
+  m.doc() =
+      "Compiled kernels of nmr. Use the functions of the package nmr, which validate and document.";
   m.def("free_scratch", &nmr::ThreadScratch::free_all, py::call_guard<py::gil_scoped_release>(),
         "Frees the memory that threads keep between calls, except that of threads at work.");
   nmr::Kernels kernels;

@@ -19,7 +19,8 @@ void count_clipped(Call& call) {
     return;
   }
   args.mesh = read_mesh<T>(call);
-  require(call["B"] == call["meshes"], "counts must have a row per mesh, got " + counts.shape_text());
+  require(call["B"] == call["meshes"],
+          "counts must have a row per mesh, got " + counts.shape_text());
   clip_count(args);
 }
 
@@ -52,7 +53,8 @@ Rasterize<T> read_rasterize(Call& call) {
   Rasterize<T> args{};
   args.mesh = read_mesh<T>(call);
   call.read("face_index [B, H, W]", args.face_index);
-  args.settings = raster_settings<T>(call, drawn_size(call, "face_index"), call.flag("perspective"));
+  args.settings =
+      raster_settings<T>(call, drawn_size(call, "face_index"), call.flag("perspective"));
   args.num_threads = num_threads(call);
   return args;
 }
@@ -62,7 +64,8 @@ RasterizeLayers<T> read_layers(Call& call) {
   RasterizeLayers<T> args{};
   args.mesh = read_mesh<T>(call);
   call.read("face_index [B, H, W, K]", args.face_index);
-  args.settings = raster_settings<T>(call, drawn_size(call, "face_index"), call.flag("perspective"));
+  args.settings =
+      raster_settings<T>(call, drawn_size(call, "face_index"), call.flag("perspective"));
   args.layers = num_layers(call);
   args.num_threads = num_threads(call);
   return args;
@@ -72,8 +75,8 @@ RasterizeLayers<T> read_layers(Call& call) {
 template <class T>
 void draw_silhouette(Call& call) {
   const Rasterize<T> drawn = read_rasterize<T>(call);
-  SilhouetteForward<T> args{drawn.face_index, drawn.mesh.batch, {}, call.flag("anti_aliasing"), nullptr,
-                            drawn.num_threads};
+  SilhouetteForward<T> args{drawn.face_index,           drawn.mesh.batch, {},
+                            call.flag("anti_aliasing"), nullptr,          drawn.num_threads};
   args.image = image_size(call, args.anti_aliasing);
   call.read("alpha [B, h, w]", args.alpha);
   rasterize(drawn);
@@ -98,9 +101,12 @@ void pull_silhouette(Call& call) {
 
 void add_raster(Kernels& kernels) {
   kernels.add("clip_count", [](auto zero, Call& call) { count_clipped<decltype(zero)>(call); });
-  kernels.add("clip_faces", [](auto zero, Call& call) { clip_faces(read_clip<decltype(zero)>(call)); });
-  kernels.add("rasterize", [](auto zero, Call& call) { rasterize(read_rasterize<decltype(zero)>(call)); });
-  kernels.add("rasterize_layers", [](auto zero, Call& call) { rasterize_layers(read_layers<decltype(zero)>(call)); });
+  kernels.add("clip_faces",
+              [](auto zero, Call& call) { clip_faces(read_clip<decltype(zero)>(call)); });
+  kernels.add("rasterize",
+              [](auto zero, Call& call) { rasterize(read_rasterize<decltype(zero)>(call)); });
+  kernels.add("rasterize_layers",
+              [](auto zero, Call& call) { rasterize_layers(read_layers<decltype(zero)>(call)); });
   kernels.add_with_backward("silhouette", [](auto zero, Call& call) {
     using T = decltype(zero);
     call.backward ? pull_silhouette<T>(call) : draw_silhouette<T>(call);

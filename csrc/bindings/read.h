@@ -12,21 +12,25 @@ constexpr int64_t kLargestRaster = 16384, kMostLayers = 1024;
 
 inline int num_threads(Call& call) { return static_cast<int>(call.number("num_threads")); }
 
-// Throws if an index is outside 0..limit-1. The last two say what it numbers, as singular and plural.
-inline void require_indices(const int64_t* index, int64_t count, int64_t limit, const char* name, const char* singular,
-                            const char* plural) {
+// Throws if an index is outside 0..limit-1. The last two say what it numbers, as singular and
+// plural.
+inline void require_indices(const int64_t* index, int64_t count, int64_t limit, const char* name,
+                            const char* singular, const char* plural) {
   if (are_indices(index, count, limit)) return;
   for (int64_t n = 0; n < count; ++n)
     if (index[n] < 0 || index[n] >= limit)
-      throw std::invalid_argument(std::string(name) + " refer to " + singular + " " + std::to_string(index[n]) +
-                                  ", but a mesh has " + std::to_string(limit) + " " + plural + " (the first is 0)");
+      throw std::invalid_argument(std::string(name) + " refer to " + singular + " " +
+                                  std::to_string(index[n]) + ", but a mesh has " +
+                                  std::to_string(limit) + " " + plural + " (the first is 0)");
 }
 
 // [B + 1, 2]: ascending from (0, 0) to (rows, faces).
 inline void require_starts(const int64_t* starts, int64_t batch, int64_t rows, int64_t faces) {
-  bool valid = starts[0] == 0 && starts[1] == 0 && starts[2 * batch] == rows && starts[2 * batch + 1] == faces;
+  bool valid = starts[0] == 0 && starts[1] == 0 && starts[2 * batch] == rows &&
+               starts[2 * batch + 1] == faces;
   for (int64_t n = 0; valid && n < 2 * batch; ++n) valid = starts[n] <= starts[n + 2];
-  require(valid, "starts must ascend from (0, 0) to (" + std::to_string(rows) + ", " + std::to_string(faces) + ")");
+  require(valid, "starts must ascend from (0, 0) to (" + std::to_string(rows) + ", " +
+                     std::to_string(faces) + ")");
 }
 
 // A batch of meshes, with every index checked.
@@ -35,7 +39,9 @@ MeshBatch<T> read_mesh(Call& call, const std::string& starts = "starts") {
   MeshBatch<T> mesh{};
   const bool packed = call.has(starts);
   call.read(packed ? "vertices [N, 3]" : "vertices [B, V, 3]", mesh.vertices);
-  mesh.faces_per_image = call.read(packed ? "faces [M, 3]" : "faces [F, 3] or [B, F, 3]", mesh.faces).shape.size() == 3;
+  mesh.faces_per_image =
+      call.read(packed ? "faces [M, 3]" : "faces [F, 3] or [B, F, 3]", mesh.faces).shape.size() ==
+      3;
   if (packed) call.read(starts + " [B + 1, 2]", mesh.starts);
   mesh.batch = call["B"];
   mesh.num_vertices = call[packed ? "N" : "V"];
@@ -45,27 +51,31 @@ MeshBatch<T> read_mesh(Call& call, const std::string& starts = "starts") {
   for (int64_t b = 0; b < mesh.batch; ++b) {
     require(mesh.vertex_count(b) < (int64_t(1) << 29), "at most 2^29 vertices per mesh");
     if (b == 0 || packed || mesh.faces_per_image)
-      require_indices(mesh.image_faces(b), 3 * mesh.face_count(b), mesh.vertex_count(b), "faces", "vertex", "vertices");
+      require_indices(mesh.image_faces(b), 3 * mesh.face_count(b), mesh.vertex_count(b), "faces",
+                      "vertex", "vertices");
   }
   return mesh;
 }
 
-// The face index map, or with "[B, H, W, K]" a table of faces; each entry must be -1 or name a face of its image, or a
-// reversed copy of one.
+// The face index map, or with "[B, H, W, K]" a table of faces; each entry must be -1 or name a face
+// of its image, or a reversed copy of one.
 template <class FaceCount>
-void read_face_index(Call& call, const char* text, const int32_t*& field, const FaceCount& face_count, int num_threads) {
+void read_face_index(Call& call, const char* text, const int32_t*& field,
+                     const FaceCount& face_count, int num_threads) {
   const Argument& map = call.read(text, field);
   const int64_t batch = call["B"], entries = batch ? map.count() / batch : 0;
   const int64_t parts = entries / (int64_t(1) << 18) + 1;  // of each image
   parallel_for(batch * parts, num_threads, [&](int64_t n) {
-    const int64_t b = n / parts, k = n % parts, first = k * entries / parts, last = (k + 1) * entries / parts;
+    const int64_t b = n / parts, k = n % parts, first = k * entries / parts,
+                  last = (k + 1) * entries / parts;
     require(are_face_indices(field + b * entries + first, last - first, face_count(b)),
             "the face index map does not belong to these faces");
   });
 }
 
 template <class T>
-void read_face_index(Call& call, const char* text, const int32_t*& field, const MeshBatch<T>& mesh, int num_threads) {
+void read_face_index(Call& call, const char* text, const int32_t*& field, const MeshBatch<T>& mesh,
+                     int num_threads) {
   read_face_index(call, text, field, [&](int64_t b) { return mesh.face_count(b); }, num_threads);
 }
 
@@ -74,7 +84,8 @@ inline Size raster_size(Call& call) { return {call["H"], call["W"]}; }
 // A raster that is drawn: 1 x 1 to 16384 x 16384 pixels.
 inline Size drawn_size(Call& call, const char* name) {
   const Size raster = raster_size(call);
-  require(std::min(raster.height, raster.width) >= 1 && std::max(raster.height, raster.width) <= kLargestRaster,
+  require(std::min(raster.height, raster.width) >= 1 &&
+              std::max(raster.height, raster.width) <= kLargestRaster,
           std::string(name) + " must have H and W in 1..16384, got " + call(name).shape_text());
   return raster;
 }
@@ -89,8 +100,9 @@ inline int64_t num_layers(Call& call) {
 // The image of a raster: half its size with anti-aliasing. From now on h and w are known.
 inline Size image_size(Call& call, bool anti_aliasing) {
   const Size raster = raster_size(call);
-  require(!anti_aliasing || (raster.height % 2 == 0 && raster.width % 2 == 0),
-          "an anti-aliased face index map has an even size, got " + call("face_index").shape_text());
+  require(
+      !anti_aliasing || (raster.height % 2 == 0 && raster.width % 2 == 0),
+      "an anti-aliased face index map has an even size, got " + call("face_index").shape_text());
   const int64_t scale = anti_aliasing ? 2 : 1;
   call.let("h", raster.height / scale);
   call.let("w", raster.width / scale);
@@ -99,15 +111,17 @@ inline Size image_size(Call& call, bool anti_aliasing) {
 
 template <class T>
 RasterSettings<T> raster_settings(Call& call, Size raster, bool perspective) {
-  return {raster, call.flag("fill_back"), static_cast<T>(call.number("near")), static_cast<T>(call.number("far")),
-          perspective};
+  return {raster, call.flag("fill_back"), static_cast<T>(call.number("near")),
+          static_cast<T>(call.number("far")), perspective};
 }
 
 // Face index map and weights of the pixels of F faces, or of M packed ones.
 template <class Args>
 void read_pixels(Call& call, Args& args, int64_t num_faces) {
   const int64_t* starts = args.starts;
-  const auto face_count = [&](int64_t b) { return starts ? starts[2 * b + 3] - starts[2 * b + 1] : num_faces; };
+  const auto face_count = [&](int64_t b) {
+    return starts ? starts[2 * b + 3] - starts[2 * b + 1] : num_faces;
+  };
   args.num_threads = num_threads(call);
   read_face_index(call, "face_index [B, H, W]", args.face_index, face_count, args.num_threads);
   call.read("weights [B, H, W, 3]", args.weights);
@@ -115,29 +129,35 @@ void read_pixels(Call& call, Args& args, int64_t num_faces) {
   args.raster = raster_size(call);
 }
 
-// Values at the corners of faces, and every index among them; `values` and `corners` are the names of these arguments,
-// `channels` a number or a name for the number of values.
+// Values at the corners of faces, and every index among them; `values` and `corners` are the names
+// of these arguments, `channels` a number or a name for the number of values.
 template <class T>
 Interpolate<T> read_interpolate(Call& call, const std::string& values, const std::string& corners,
                                 const std::string& channels) {
   Interpolate<T> args{};
   const bool packed = call.has("starts");
   call.read("starts? [B + 1, 2]", args.starts);
-  args.corners_per_image = call.read(corners + (packed ? " [M, 3]" : " [F, 3] or [B, F, 3]"), args.corners).shape.size() == 3;
+  args.corners_per_image =
+      call.read(corners + (packed ? " [M, 3]" : " [F, 3] or [B, F, 3]"), args.corners)
+          .shape.size() == 3;
   args.num_faces = call[packed ? "M" : "F"];
   read_pixels(call, args, args.num_faces);
-  const auto& shape = call.read(values + (packed ? " [A, " : " [1|B, A, ") + channels + "]", args.attributes).shape;
+  const auto& shape =
+      call.read(values + (packed ? " [A, " : " [1|B, A, ") + channels + "]", args.attributes).shape;
   args.attribute_batch = packed ? 1 : shape[0];
   args.num_attributes = call["A"];
   args.channels = shape.back();
-  require(args.channels >= 1, values + " must have at least one channel, got " + call(values).shape_text());
+  require(args.channels >= 1,
+          values + " must have at least one channel, got " + call(values).shape_text());
   if (packed) require_starts(args.starts, args.batch, args.num_attributes, args.num_faces);
   for (int64_t b = 0; packed && b < args.batch; ++b) {
     const int64_t* s = args.starts + 2 * b;
-    require_indices(args.corners + 3 * s[1], 3 * (s[3] - s[1]), s[2] - s[0], corners.c_str(), "attribute", "attributes");
+    require_indices(args.corners + 3 * s[1], 3 * (s[3] - s[1]), s[2] - s[0], corners.c_str(),
+                    "attribute", "attributes");
   }
   if (!packed)
-    require_indices(args.corners, call(corners).count(), args.num_attributes, corners.c_str(), "attribute", "attributes");
+    require_indices(args.corners, call(corners).count(), args.num_attributes, corners.c_str(),
+                    "attribute", "attributes");
   call.gradient(values, args.grad_attributes);
   call.gradient("weights", args.grad_weights);
   return args;

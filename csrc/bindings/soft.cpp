@@ -10,8 +10,10 @@ SoftSettings<T> read_settings(Call& call, const char* drawn, bool perspective) {
   const double* sigma = nullptr;
   call.read("sigma []", sigma);
   const double reach = *sigma * call.number("reach_per_sigma");
-  require(static_cast<T>(*sigma) > 0 && reach >= 0, "sigma must be positive, and reach not negative");
-  return {raster_settings<T>(call, drawn_size(call, drawn), perspective), static_cast<T>(*sigma), static_cast<T>(reach)};
+  require(static_cast<T>(*sigma) > 0 && reach >= 0,
+          "sigma must be positive, and reach not negative");
+  return {raster_settings<T>(call, drawn_size(call, drawn), perspective), static_cast<T>(*sigma),
+          static_cast<T>(reach)};
 }
 
 template <class T>
@@ -82,7 +84,8 @@ void add_soft(Kernels& kernels) {
     using T = decltype(zero);
     call.backward ? soft_gradient<T>(call) : draw_soft<T>(call);
   });
-  kernels.add("soft_layers", [](auto zero, Call& call) { soft_layers(read_layers<decltype(zero)>(call)); });
+  kernels.add("soft_layers",
+              [](auto zero, Call& call) { soft_layers(read_layers<decltype(zero)>(call)); });
   kernels.add_with_backward("soft_fragments", [](auto zero, Call& call) {
     const auto args = read_soft_fragments<decltype(zero)>(call);
     call.backward ? soft_fragments_backward(args) : soft_fragments_forward(args);

@@ -11,8 +11,8 @@ void require_grids(const int64_t* grids, int64_t count, int64_t num_texels) {
   require(num_texels < kMostTexels, "at most 2^31 texels");
   for (int64_t n = 0; n < count; ++n) {
     const int64_t *g = grids + 3 * n, first = g[0], height = g[1], width = g[2];
-    require(height >= 1 && width >= 1 && height < kMostTexels && width < kMostTexels && first >= 0 &&
-                first + height * width <= num_texels,
+    require(height >= 1 && width >= 1 && height < kMostTexels && width < kMostTexels &&
+                first >= 0 && first + height * width <= num_texels,
             "a level of a texture lies outside the " + std::to_string(num_texels) + " texels");
   }
 }
@@ -22,18 +22,22 @@ template <class Args>
 void read_grids(Call& call, Args& args, int64_t num_texels) {
   args.images = call.read("grids [1|B, L, 3]", args.grids).shape[0];
   args.levels = call["L"];
-  require(args.levels >= 1, "grids must have at least one level, got " + call("grids").shape_text());
+  require(args.levels >= 1,
+          "grids must have at least one level, got " + call("grids").shape_text());
   require_grids(args.grids, args.images * args.levels, num_texels);
 }
 
-// Every level must follow the one before, with half its size. Returns the number of texels of the images themselves.
+// Every level must follow the one before, with half its size. Returns the number of texels of the
+// images themselves.
 int64_t require_pyramid(const int64_t* grids, int64_t images, int64_t levels) {
   int64_t whole = 0;
   for (int64_t i = 0; i < images; ++i) {
     int64_t first = grids[3 * i * levels];
     for (int64_t l = 0; l < levels; ++l) {
       const int64_t *grid = grids + 3 * (i * levels + l), *finer = grid - 3;
-      const auto follows = [&](int axis) { return grid[axis] == std::max<int64_t>(finer[axis] / 2, 1); };
+      const auto follows = [&](int axis) {
+        return grid[axis] == std::max<int64_t>(finer[axis] / 2, 1);
+      };
       require(grid[0] == first && (l == 0 || (follows(1) && follows(2))),
               "every level must follow the one before, with half its size");
       first += grid[1] * grid[2];
@@ -76,7 +80,8 @@ SampleUV<T> read_sample(Call& call) {
   call.read("texels [N, C]", args.texels);
   args.num_texels = call["N"];
   args.channels = call["C"];
-  require(args.channels >= 1, "texels must have at least one channel, got " + call("texels").shape_text());
+  require(args.channels >= 1,
+          "texels must have at least one channel, got " + call("texels").shape_text());
   read_grids(call, args, args.num_texels);
   call.read("level? [B, H, W]", args.level);
   const int wrap = static_cast<int>(call.number("wrap"));
@@ -94,7 +99,8 @@ void add_texture(Kernels& kernels) {
     const auto args = read_mipmaps<decltype(zero)>(call);
     call.backward ? mipmaps_backward(args) : mipmaps_forward(args);
   });
-  kernels.add("uv_levels", [](auto zero, Call& call) { uv_levels(read_levels<decltype(zero)>(call)); });
+  kernels.add("uv_levels",
+              [](auto zero, Call& call) { uv_levels(read_levels<decltype(zero)>(call)); });
   kernels.add_with_backward("sample_uv", [](auto zero, Call& call) {
     const auto args = read_sample<decltype(zero)>(call);
     call.backward ? sample_uv_backward(args) : sample_uv_forward(args);

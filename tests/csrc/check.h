@@ -1,4 +1,5 @@
-// The test harness: TEST(name) { CHECK(...); } registers itself; TEST_REAL(name) runs for T = float and T = double.
+// The test harness: TEST(name) { CHECK(...); } registers itself; TEST_REAL(name) runs for T = float
+// and T = double.
 #pragma once
 
 #include <functional>
@@ -20,7 +21,9 @@ inline std::vector<TestCase>& all_tests() {
 }
 
 struct Registration {
-  Registration(std::string name, std::function<void()> body) { all_tests().push_back({std::move(name), std::move(body)}); }
+  Registration(std::string name, std::function<void()> body) {
+    all_tests().push_back({std::move(name), std::move(body)});
+  }
 };
 
 template <class... Parts>
@@ -50,9 +53,10 @@ template <class... Parts>
 #define CHECK(...) \
   if (!(__VA_ARGS__)) ::nmr::test::fail(__FILE__, __LINE__, "not true: ", #__VA_ARGS__)
 
-#define CHECK_EQUAL(a, b)                                                                                     \
-  do {                                                                                                        \
-    const auto left_ = (a);                                                                                   \
-    const auto right_ = (b);                                                                                  \
-    if (!(left_ == right_)) ::nmr::test::fail(__FILE__, __LINE__, #a " == " #b ": ", left_, " and ", right_); \
+#define CHECK_EQUAL(a, b)                                                               \
+  do {                                                                                  \
+    const auto left_ = (a);                                                             \
+    const auto right_ = (b);                                                            \
+    if (!(left_ == right_))                                                             \
+      ::nmr::test::fail(__FILE__, __LINE__, #a " == " #b ": ", left_, " and ", right_); \
   } while (false)

@@ -1,6 +1,7 @@
-// The fuzz target: bytes -> a scene -> every stage, forward and backward. Beyond what the sanitizers find, it stops at
-// a broken promise, and for some seeds at results that depend on the number of threads, on the other images of the
-// batch, or on packing. Without libFuzzer it runs the inputs of files, one per line in hexadecimal digits:
+// The fuzz target: bytes -> a scene -> every stage, forward and backward. Beyond what the
+// sanitizers find, it stops at a broken promise, and for some seeds at results that depend on the
+// number of threads, on the other images of the batch, or on packing. Without libFuzzer it runs the
+// inputs of files, one per line in hexadecimal digits:
 //   fuzz FILE...
 #include <cmath>
 #include <cstdio>
@@ -34,15 +35,26 @@ struct Bytes {
   }
 };
 
-// One byte for a coordinate on a grid of 1/64 (depth: 1/16), pixel centres and borders among them; or a special value;
-// or raw bits.
+// One byte for a coordinate on a grid of 1/64 (depth: 1/16), pixel centres and borders among them;
+// or a special value; or raw bits.
 template <class T>
 T coordinate(Bytes& bytes, bool is_depth) {
   using Limits = std::numeric_limits<T>;
-  static constexpr T special[] = {Limits::quiet_NaN(), Limits::infinity(),  -Limits::infinity(),   Limits::max(),
-                                  Limits::lowest(),    Limits::denorm_min(), Limits::min(),         -Limits::min(),
-                                  Limits::epsilon(),   1 + Limits::epsilon(), 1 - Limits::epsilon(), T(-0.0),
-                                  T(1e10),             T(-1e20),             T(1e-20)};
+  static constexpr T special[] = {Limits::quiet_NaN(),
+                                  Limits::infinity(),
+                                  -Limits::infinity(),
+                                  Limits::max(),
+                                  Limits::lowest(),
+                                  Limits::denorm_min(),
+                                  Limits::min(),
+                                  -Limits::min(),
+                                  Limits::epsilon(),
+                                  1 + Limits::epsilon(),
+                                  1 - Limits::epsilon(),
+                                  T(-0.0),
+                                  T(1e10),
+                                  T(-1e20),
+                                  T(1e-20)};
   const int byte = bytes.next();
   if (byte < 232) return is_depth ? T(byte - 32) / 16 : T(byte - 116) / 64;
   if (byte < 247) return special[byte - 232];
@@ -50,7 +62,8 @@ T coordinate(Bytes& bytes, bool is_depth) {
   return bytes.bits<T>();
 }
 
-// Mostly tiny: an input should cost microseconds. One of eight is large enough for several blocks of lanes.
+// Mostly tiny: an input should cost microseconds. One of eight is large enough for several blocks
+// of lanes.
 int64_t side(int byte) { return byte < 224 ? 1 + byte % 6 : 7 + byte % 18; }
 
 // Writes the scene over an earlier one, whose storage it uses again.
@@ -102,7 +115,8 @@ void decode(Bytes bytes, Scene<T>& s) {
   const int64_t face_lists = s.faces_per_image ? s.batch : 1;
   for (int64_t list = 0; list < face_lists; ++list)
     for (int64_t m = 0; m < meshes; ++m)
-      for (int64_t n = 0; n < 3 * face_counts[m]; ++n) s.faces.push_back(bytes.next() % vertex_counts[m]);
+      for (int64_t n = 0; n < 3 * face_counts[m]; ++n)
+        s.faces.push_back(bytes.next() % vertex_counts[m]);
   const int64_t rows = packed ? s.num_vertices : s.batch * s.num_vertices;
   for (int64_t n = 0; n < 3 * rows; ++n) s.vertices.push_back(coordinate<T>(bytes, n % 3 == 2));
 #ifdef NMR_FRESH_SCRATCH
@@ -132,7 +146,8 @@ void run(const Bytes& bytes) {
   } else if (seed >= 8 && seed < 12 && scene.batch > 1) {
     run_stages(first_image(scene), 1, other);
     stop_unless_none(depends_on_company(scene, one, other), "depends on the other images");
-  } else if (seed >= 12 && seed < 16 && !scene.packed() && (scene.per_image_values || scene.batch == 1)) {
+  } else if (seed >= 12 && seed < 16 && !scene.packed() &&
+             (scene.per_image_values || scene.batch == 1)) {
     run_stages(packed(scene), 1, other);
     stop_unless_none(depends_on_packing(one, other), "depends on packing");
   }

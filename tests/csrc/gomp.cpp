@@ -1,6 +1,7 @@
-// The part of GCC's OpenMP interface that csrc/parallel.h compiles to, on plain threads and mutexes. ThreadSanitizer does not see
-// the synchronisation inside libgomp, which is not compiled with it, and would report every loop; this it sees. A construct that
-// is not here yet fails to link.
+// The part of GCC's OpenMP interface that csrc/parallel.h compiles to, on plain threads and
+// mutexes. ThreadSanitizer does not see the synchronisation inside libgomp, which is not compiled
+// with it, and would report every loop; this it sees. A construct that is not here yet fails to
+// link.
 #include <deque>
 #include <map>
 #include <mutex>
@@ -69,30 +70,35 @@ bool GOMP_loop_dynamic_next(long* start, long* end) {
   return true;
 }
 
-bool GOMP_loop_nonmonotonic_dynamic_next(long* start, long* end) { return GOMP_loop_dynamic_next(start, end); }
+bool GOMP_loop_nonmonotonic_dynamic_next(long* start, long* end) {
+  return GOMP_loop_dynamic_next(start, end);
+}
 
 bool GOMP_loop_dynamic_start(long first, long last, long step, long chunk, long* start, long* end) {
   {
     const std::lock_guard<std::mutex> lock(place.team->mutex);
-    if (++place.loops > place.team->loops.size()) place.team->loops.push_back({first, last, step, chunk});
+    if (++place.loops > place.team->loops.size())
+      place.team->loops.push_back({first, last, step, chunk});
   }
   return GOMP_loop_dynamic_next(start, end);
 }
 
-bool GOMP_loop_nonmonotonic_dynamic_start(long first, long last, long step, long chunk, long* start, long* end) {
+bool GOMP_loop_nonmonotonic_dynamic_start(long first, long last, long step, long chunk, long* start,
+                                          long* end) {
   return GOMP_loop_dynamic_start(first, last, step, chunk, start, end);
 }
 
 // A region that is one loop (what the compiler makes of it when it optimises).
-void GOMP_parallel_loop_dynamic(void (*body)(void*), void* data, unsigned threads, long first, long last, long step, long chunk,
-                                unsigned) {
+void GOMP_parallel_loop_dynamic(void (*body)(void*), void* data, unsigned threads, long first,
+                                long last, long step, long chunk, unsigned) {
   Team team;
   team.loops.push_back({first, last, step, chunk});
   run(body, data, threads, team);
 }
 
-void GOMP_parallel_loop_nonmonotonic_dynamic(void (*body)(void*), void* data, unsigned threads, long first, long last, long step,
-                                             long chunk, unsigned flags) {
+void GOMP_parallel_loop_nonmonotonic_dynamic(void (*body)(void*), void* data, unsigned threads,
+                                             long first, long last, long step, long chunk,
+                                             unsigned flags) {
   GOMP_parallel_loop_dynamic(body, data, threads, first, last, step, chunk, flags);
 }
 

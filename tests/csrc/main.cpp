@@ -1,4 +1,5 @@
-// Runs the tests whose names contain the first argument (all without one); exit status 1 if one fails.
+// Runs the tests whose names contain the first argument (all without one); exit status 1 if one
+// fails.
 #include <cstdio>
 #include <cstring>
 #include <exception>

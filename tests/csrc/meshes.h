@@ -1,5 +1,5 @@
-// Scenes for the tests: spheres, soups, and the same meshes laid out as a batch, per image, or packed. Nothing here calls a
-// library function whose last bit differs between machines.
+// Scenes for the tests: spheres, soups, and the same meshes laid out as a batch, per image, or
+// packed. Nothing here calls a library function whose last bit differs between machines.
 #pragma once
 
 #include <algorithm>
@@ -19,15 +19,19 @@ struct Mesh {
 // Unit sphere of 20 * 4^subdivisions faces, counter-clockwise from outside in a right-handed frame.
 inline Mesh icosphere(int subdivisions) {
   const double p = (1 + std::sqrt(5.0)) / 2;
-  Mesh mesh{{-1, p, 0, 1, p, 0, -1, -p, 0, 1, -p, 0, 0, -1, p, 0, 1, p, 0, -1, -p, 0, 1, -p, p, 0, -1, p, 0, 1, -p, 0, -1, -p, 0, 1},
-            {0, 11, 5, 0, 5, 1, 0, 1, 7, 0, 7, 10, 0, 10, 11, 1, 5, 9, 5, 11, 4, 11, 10, 2, 10, 7, 6, 7, 1, 8,
-             3, 9, 4, 3, 4, 2, 3, 2, 6, 3, 6, 8, 3, 8, 9, 4, 9, 5, 2, 4, 11, 6, 2, 10, 8, 6, 7, 9, 8, 1}};
+  Mesh mesh{{-1, p,  0,  1, p, 0,  -1, -p, 0,  1, -p, 0, 0,  -1, p,  0,  1, p,
+             0,  -1, -p, 0, 1, -p, p,  0,  -1, p, 0,  1, -p, 0,  -1, -p, 0, 1},
+            {0, 11, 5,  0, 5,  1, 0, 1, 7, 0, 7,  10, 0, 10, 11, 1, 5, 9, 5, 11,
+             4, 11, 10, 2, 10, 7, 6, 7, 1, 8, 3,  9,  4, 3,  4,  2, 3, 2, 6, 3,
+             6, 8,  3,  8, 9,  4, 9, 5, 2, 4, 11, 6,  2, 10, 8,  6, 7, 9, 8, 1}};
   for (int level = 0; level < subdivisions; ++level) {
     std::map<std::pair<int64_t, int64_t>, int64_t> middles;
     const auto middle = [&](int64_t a, int64_t b) {
-      const auto [entry, added] = middles.try_emplace(std::minmax(a, b), static_cast<int64_t>(mesh.vertices.size() / 3));
+      const auto [entry, added] =
+          middles.try_emplace(std::minmax(a, b), static_cast<int64_t>(mesh.vertices.size() / 3));
       if (added)
-        for (int k = 0; k < 3; ++k) mesh.vertices.push_back((mesh.vertices[3 * a + k] + mesh.vertices[3 * b + k]) / 2);
+        for (int k = 0; k < 3; ++k)
+          mesh.vertices.push_back((mesh.vertices[3 * a + k] + mesh.vertices[3 * b + k]) / 2);
       return entry->second;
     };
     std::vector<int64_t> finer;

@@ -18,23 +18,29 @@ struct Run {
 
   const MeshBatch<T> mesh = s.mesh();
   const Size raster = s.raster();
-  const int64_t pixels = s.pixels(), image_pixels = s.batch * s.image.pixels(), rows = s.rows(), C = s.channels;
-  const int64_t seed = static_cast<int64_t>(s.seed), groups = s.packed() || !s.per_image_values ? 1 : s.batch;
+  const int64_t pixels = s.pixels(), image_pixels = s.batch * s.image.pixels(), rows = s.rows(),
+                C = s.channels;
+  const int64_t seed = static_cast<int64_t>(s.seed),
+                groups = s.packed() || !s.per_image_values ? 1 : s.batch;
   const int32_t* face_index = nullptr;
   const T* weights = nullptr;
 
   // Noise for one input of the stages. Upstream gradients have names that begin with "grad".
   T* in(const char* name, int64_t size) {
     using Limits = std::numeric_limits<T>;
-    constexpr T special[] = {Limits::quiet_NaN(), Limits::infinity(), -Limits::infinity(),  Limits::max(),
-                             Limits::lowest(),    T(1e30),            Limits::denorm_min(), T(0)};
+    constexpr T special[] = {Limits::quiet_NaN(),  Limits::infinity(),
+                             -Limits::infinity(),  Limits::max(),
+                             Limits::lowest(),     T(1e30),
+                             Limits::denorm_min(), T(0)};
     std::vector<T>& values = r.inputs.resize(name, size);
     const uint64_t stream = stream_of(name);
     for (int64_t n = 0; n < size; ++n) values[n] = static_cast<T>(noise(stream, n));
     const bool upstream = string_view(name).substr(0, 4) == "grad";
     for (T& x : values)
-      if (upstream && s.hostile_upstream && std::abs(x) < T(1) / 16) x = special[static_cast<int>((x + T(1) / 16) * 64) % 8];
-    if (s.poisoned && string_view(name) == s.poisoned) std::fill_n(values.begin(), size / s.batch, special[0]);
+      if (upstream && s.hostile_upstream && std::abs(x) < T(1) / 16)
+        x = special[static_cast<int>((x + T(1) / 16) * 64) % 8];
+    if (s.poisoned && string_view(name) == s.poisoned)
+      std::fill_n(values.begin(), size / s.batch, special[0]);
     return values.data();
   }
   uint64_t stream_of(const char* name) const {
@@ -53,9 +59,12 @@ struct Run {
   }
 
   // `channels` values at the vertices of the faces, and their gradients.
-  Interpolate<T> interpolate(const T* attributes, int64_t attribute_batch, int64_t channels, T* grad, T* grad_weights) {
-    return {face_index, weights, s.batch, raster, attributes, attribute_batch, s.num_vertices, channels, s.faces.data(),
-            s.num_faces, s.faces_per_image, mesh.starts, nullptr, nullptr, grad, grad_weights, threads};
+  Interpolate<T> interpolate(const T* attributes, int64_t attribute_batch, int64_t channels,
+                             T* grad, T* grad_weights) {
+    return {face_index,        weights,        s.batch,  raster,         attributes,
+            attribute_batch,   s.num_vertices, channels, s.faces.data(), s.num_faces,
+            s.faces_per_image, mesh.starts,    nullptr,  nullptr,        grad,
+            grad_weights,      threads};
   }
 
   void all() {
@@ -82,19 +91,23 @@ struct Run {
     face_index = index;
     rasterize(Rasterize<T>{mesh, settings, index, threads});
     const int64_t layers = 1 + seed % 3;
-    rasterize_layers(RasterizeLayers<T>{mesh, settings, layers, r.template out<int32_t>("layers", layers * pixels), threads});
+    rasterize_layers(RasterizeLayers<T>{
+        mesh, settings, layers, r.template out<int32_t>("layers", layers * pixels), threads});
 
     const T sigma = seed % 7 < 3 ? T(1e-4) : seed % 7 < 5 ? T(1e-2) : T(0.3);
     const SoftSettings<T> soft{settings, sigma, seed % 5 == 0 ? T(100) : T(7) * sigma};
     T* clear = out("clear", pixels);
     soft_forward(SoftForward<T>{mesh, soft, clear, threads});
-    soft_backward(SoftBackward<T>{mesh, soft, clear, in("grad_clear", pixels), out("grad_soft", 3 * rows),
-                                   out("grad_sigma", s.batch), threads});
-    soft_layers(SoftLayers<T>{mesh, soft, layers, r.template out<int32_t>("soft_layers", layers * pixels), threads});
+    soft_backward(SoftBackward<T>{mesh, soft, clear, in("grad_clear", pixels),
+                                  out("grad_soft", 3 * rows), out("grad_sigma", s.batch), threads});
+    soft_layers(SoftLayers<T>{mesh, soft, layers,
+                              r.template out<int32_t>("soft_layers", layers * pixels), threads});
 
     for (int64_t n = 0; n < pixels && s.foreign_face_index; ++n) {
       const double u = (noise(stream_of("face_index"), n) + 1) / 2;
-      index[n] = static_cast<int32_t>(u * static_cast<double>(2 * mesh.face_count(n / raster.pixels()) + 1)) - 1;
+      index[n] = static_cast<int32_t>(
+                     u * static_cast<double>(2 * mesh.face_count(n / raster.pixels()) + 1)) -
+                 1;
     }
     if (s.given_face_index) std::copy_n(s.given_face_index, pixels, index);
   }
@@ -104,17 +117,26 @@ struct Run {
     clip_count(ClipCount<T>{mesh, s.near, counts, threads});
     int64_t* starts = r.template out<int64_t>("clip_starts", 2 * s.batch + 2);
     starts[0] = starts[1] = 0;
-    for (int64_t n = 0; n < 2 * s.batch; ++n) starts[n + 2] = starts[n] + counts[n] + (seed % 4 == 0);  // or room to spare
+    for (int64_t n = 0; n < 2 * s.batch; ++n)
+      starts[n + 2] = starts[n] + counts[n] + (seed % 4 == 0);  // or room to spare
     const int64_t P = starts[2 * s.batch], M = starts[2 * s.batch + 1];
     clip_faces(ClipFaces<T>{mesh, s.near, starts, r.template out<int64_t>("clip_faces", 3 * M),
-                            r.template out<int32_t>("clip_source", M), r.template out<int64_t>("clip_corners", 3 * M),
+                            r.template out<int32_t>("clip_source", M),
+                            r.template out<int64_t>("clip_corners", 3 * M),
                             r.template out<int64_t>("clip_ends", 4 * P), threads});
   }
 
   void silhouettes() {
-    silhouette_forward(SilhouetteForward<T>{face_index, s.batch, s.image, s.anti_aliasing, out("alpha", image_pixels), threads});
-    SilhouetteBackward<T> args{mesh, s.image, s.anti_aliasing, s.eps, face_index, in("grad_alpha", image_pixels),
-                               out("grad_silhouette", 3 * rows), threads};
+    silhouette_forward(SilhouetteForward<T>{face_index, s.batch, s.image, s.anti_aliasing,
+                                            out("alpha", image_pixels), threads});
+    SilhouetteBackward<T> args{mesh,
+                               s.image,
+                               s.anti_aliasing,
+                               s.eps,
+                               face_index,
+                               in("grad_alpha", image_pixels),
+                               out("grad_silhouette", 3 * rows),
+                               threads};
     silhouette_backward(args);
     args.grad_vertices = out("grad_local", 3 * rows);
     local_gradient(args);
@@ -122,43 +144,86 @@ struct Run {
 
   void fragments() {
     T* weights_out = out("weights", 3 * pixels);
-    const Fragments<T> args{mesh, raster, s.far, face_index, weights_out, out("depth", pixels),
-                            in_if(!s.no_grad_weights, "grad_weights", 3 * pixels), in_if(!s.no_grad_depth, "grad_depth", pixels),
-                            out("grad_fragments", 3 * rows), threads, s.perspective};
+    const Fragments<T> args{mesh,
+                            raster,
+                            s.far,
+                            face_index,
+                            weights_out,
+                            out("depth", pixels),
+                            in_if(!s.no_grad_weights, "grad_weights", 3 * pixels),
+                            in_if(!s.no_grad_depth, "grad_depth", pixels),
+                            out("grad_fragments", 3 * rows),
+                            threads,
+                            s.perspective};
     fragments_forward(args);
     fragments_backward(args);
     weights = weights_out;
     // Of a map of one's own, pixels lie inside and outside of their faces.
-    SoftFragments<T> soft{mesh, raster, 1, s.far, s.perspective, face_index, out("soft_weights", 3 * pixels),
-                          out("soft_depth", pixels), out("distances", pixels), in("grad_soft_weights", 3 * pixels),
-                          in("grad_soft_depth", pixels), in("grad_distances", pixels), out("grad_soft_fragments", 3 * rows), threads};
+    SoftFragments<T> soft{mesh,
+                          raster,
+                          1,
+                          s.far,
+                          s.perspective,
+                          face_index,
+                          out("soft_weights", 3 * pixels),
+                          out("soft_depth", pixels),
+                          out("distances", pixels),
+                          in("grad_soft_weights", 3 * pixels),
+                          in("grad_soft_depth", pixels),
+                          in("grad_distances", pixels),
+                          out("grad_soft_fragments", 3 * rows),
+                          threads};
     soft_fragments_forward(soft);
     soft_fragments_backward(soft);
-    const DepthImage<T> image{mesh, s.image, s.anti_aliasing, s.far, face_index, out("depth_image", image_pixels),
-                              in("grad_depth_image", image_pixels), out("grad_depth_vertices", 3 * rows), threads, s.perspective};
+    const DepthImage<T> image{mesh,
+                              s.image,
+                              s.anti_aliasing,
+                              s.far,
+                              face_index,
+                              out("depth_image", image_pixels),
+                              in("grad_depth_image", image_pixels),
+                              out("grad_depth_vertices", 3 * rows),
+                              threads,
+                              s.perspective};
     depth_forward(image);
     depth_backward(image);
   }
 
   void shading() {
-    const int64_t size = groups * s.num_faces * s.texture_size * s.texture_size * s.texture_size * C;
-    const TextureCubes<T> cubes{face_index, weights, s.batch, raster, in("textures", size), groups, s.num_faces, mesh.starts,
-                                s.texture_size, C, s.eps, out("colors", pixels * C), in("grad_colors", pixels * C),
-                                out("grad_textures", size), threads};
+    const int64_t size =
+        groups * s.num_faces * s.texture_size * s.texture_size * s.texture_size * C;
+    const TextureCubes<T> cubes{face_index,
+                                weights,
+                                s.batch,
+                                raster,
+                                in("textures", size),
+                                groups,
+                                s.num_faces,
+                                mesh.starts,
+                                s.texture_size,
+                                C,
+                                s.eps,
+                                out("colors", pixels * C),
+                                in("grad_colors", pixels * C),
+                                out("grad_textures", size),
+                                threads};
     texture_cubes_forward(cubes);
     texture_cubes_backward(cubes);
     const int64_t count = groups * s.num_vertices * C;
-    Interpolate<T> args = interpolate(in("attributes", count), groups, C, out("grad_attributes", count),
-                                      out("grad_value_weights", 3 * pixels));
+    Interpolate<T> args =
+        interpolate(in("attributes", count), groups, C, out("grad_attributes", count),
+                    out("grad_value_weights", 3 * pixels));
     args.values = out("values", pixels * C);
     args.grad_values = in("grad_values", pixels * C);
     interpolate_forward(args);
     interpolate_backward(args);
   }
 
-  // Textures of 1 to 5 texels a side, shared or one for each image, with or without mipmaps; uv in [-1.5, 1.5).
+  // Textures of 1 to 5 texels a side, shared or one for each image, with or without mipmaps; uv in
+  // [-1.5, 1.5).
   void texture_images() {
-    const int64_t images = s.per_image_values && s.batch > 0 ? s.batch : 1, levels = seed % 2 ? 3 : 1;
+    const int64_t images = s.per_image_values && s.batch > 0 ? s.batch : 1,
+                  levels = seed % 2 ? 3 : 1;
     int64_t* grids = r.tables.resize("grids", 3 * images * levels).data();
     int64_t count = 0, whole = 0;
     for (int64_t i = 0; i < images; ++i) {
@@ -172,8 +237,15 @@ struct Run {
       }
     }
     T* pyramid = out("pyramid", count * C);
-    const Mipmaps<T> mipmaps{images, levels, grids, C, in("texels", whole * C), pyramid, in("grad_pyramid", count * C),
-                             out("grad_texels", whole * C), threads};
+    const Mipmaps<T> mipmaps{images,
+                             levels,
+                             grids,
+                             C,
+                             in("texels", whole * C),
+                             pyramid,
+                             in("grad_pyramid", count * C),
+                             out("grad_texels", whole * C),
+                             threads};
     mipmaps_forward(mipmaps);
     mipmaps_backward(mipmaps);
 
@@ -181,11 +253,21 @@ struct Run {
     T* uv = in("uv", size);
     for (int64_t n = 0; n < size; ++n) uv[n] *= T(1.5);
     const Interpolate<T> at =
-        interpolate(uv, groups, 2, out("grad_uv", size), out_if(!s.no_grad_weights, "grad_uv_weights", 3 * pixels));
+        interpolate(uv, groups, 2, out("grad_uv", size),
+                    out_if(!s.no_grad_weights, "grad_uv_weights", 3 * pixels));
     T* level = out("level", pixels);
     uv_levels(UVLevels<T>{at, mesh, grids, images, levels, level});
-    const SampleUV<T> sample{at, pyramid, count, C, grids, images, levels, levels > 1 ? level : nullptr,
-                             static_cast<Wrap>(seed / 4 % 3), out("sampled", pixels * C), in("grad_sampled", pixels * C),
+    const SampleUV<T> sample{at,
+                             pyramid,
+                             count,
+                             C,
+                             grids,
+                             images,
+                             levels,
+                             levels > 1 ? level : nullptr,
+                             static_cast<Wrap>(seed / 4 % 3),
+                             out("sampled", pixels * C),
+                             in("grad_sampled", pixels * C),
                              out("grad_sampled_texels", count * C)};
     sample_uv_forward(sample);
     sample_uv_backward(sample);
@@ -193,46 +275,74 @@ struct Run {
 
   // The same faces in clip space, image by image, and colours blended at their silhouettes.
   void clip_space() {
-    T *rast = out("rast", 4 * pixels), *slopes = out("slopes", 4 * pixels), *blended = out("blended", pixels * C);
-    T *grad_clip = out("grad_clip", 4 * rows), *grad_blended_positions = out("grad_blended_positions", 4 * rows);
+    T *rast = out("rast", 4 * pixels), *slopes = out("slopes", 4 * pixels),
+      *blended = out("blended", pixels * C);
+    T *grad_clip = out("grad_clip", 4 * rows),
+      *grad_blended_positions = out("grad_blended_positions", 4 * rows);
     T* grad_blended_colors = out("grad_blended_colors", pixels * C);
     const T *colors = in("unblended", pixels * C), *grad_rast = in("grad_rast", 4 * pixels);
-    const T *grad_slopes = in_if(!s.no_grad_depth, "grad_slopes", 4 * pixels), *grad = in("grad_blended", pixels * C);
+    const T *grad_slopes = in_if(!s.no_grad_depth, "grad_slopes", 4 * pixels),
+            *grad = in("grad_blended", pixels * C);
     std::vector<T>& positions = r.inputs.resize("positions", 4 * rows);
     for (int64_t n = 0; n < rows; ++n) {
-      const T *v = mesh.vertices + 3 * n, w = s.perspective ? v[2] : T(1), position[] = {v[0] * w, v[1] * w, v[2], w};
+      const T *v = mesh.vertices + 3 * n, w = s.perspective ? v[2] : T(1),
+              position[] = {v[0] * w, v[1] * w, v[2], w};
       std::copy_n(position, 4, positions.data() + 4 * n);
     }
     for (int64_t b = 0; b < s.batch; ++b) {
-      const int64_t first = b * raster.pixels(), vertex = mesh.vertex_start(b), edges = 3 * mesh.face_count(b);
-      std::vector<int64_t>& twins = r.tables.resize("twins", edges);  // of other edges, too: any in range is allowed
+      const int64_t first = b * raster.pixels(), vertex = mesh.vertex_start(b),
+                    edges = 3 * mesh.face_count(b);
+      std::vector<int64_t>& twins =
+          r.tables.resize("twins", edges);  // of other edges, too: any in range is allowed
       for (int64_t n = 0; n < edges; ++n) twins[n] = n % 3 ? n : (5 * n + seed) % edges;
-      const ClipMesh<T> clip{positions.data() + 4 * vertex, 1, mesh.vertex_count(b), mesh.image_faces(b),
-                             mesh.face_count(b), face_index + first, 1, raster, threads};
-      const ClipWeights<T> args{clip, rast + 4 * first, slopes + 4 * first, grad_rast + 4 * first,
-                                grad_slopes ? grad_slopes + 4 * first : nullptr, grad_clip + 4 * vertex};
+      const ClipMesh<T> clip{positions.data() + 4 * vertex,
+                             1,
+                             mesh.vertex_count(b),
+                             mesh.image_faces(b),
+                             mesh.face_count(b),
+                             face_index + first,
+                             1,
+                             raster,
+                             threads};
+      const ClipWeights<T> args{clip,
+                                rast + 4 * first,
+                                slopes + 4 * first,
+                                grad_rast + 4 * first,
+                                grad_slopes ? grad_slopes + 4 * first : nullptr,
+                                grad_clip + 4 * vertex};
       clip_weights_forward(args);
       clip_weights_backward(args);
-      const Antialias<T> blend{clip, rast + 4 * first, twins.data(), C, colors + C * first, blended + C * first,
-                               grad + C * first, grad_blended_colors + C * first, grad_blended_positions + 4 * vertex};
+      const Antialias<T> blend{clip,
+                               rast + 4 * first,
+                               twins.data(),
+                               C,
+                               colors + C * first,
+                               blended + C * first,
+                               grad + C * first,
+                               grad_blended_colors + C * first,
+                               grad_blended_positions + 4 * vertex};
       antialias_forward(blend);
       antialias_backward(blend);
     }
   }
 
-  // Up to two directional and two point lights, shared or one set for each image, with or without highlights; or the
-  // normals themselves.
+  // Up to two directional and two point lights, shared or one set for each image, with or without
+  // highlights; or the normals themselves.
   void lights() {
     const bool smooth = seed & 1;
     const int64_t count = smooth ? rows : s.packed() ? s.num_faces : s.batch * s.num_faces;
     T* unit = out("normals", 3 * count);
-    const Normals<T> normals{mesh, smooth, unit, in("grad_normals", 3 * count), out("grad_normals_vertices", 3 * rows), threads};
+    const Normals<T> normals{
+        mesh,   smooth, unit, in("grad_normals", 3 * count), out("grad_normals_vertices", 3 * rows),
+        threads};
     normals_forward(normals);
     normals_backward(normals);
 
-    constexpr int64_t kKinds = static_cast<int64_t>(Light::count), kWidths[kKinds] = {1, 3, 1, 3, 3, 1, 3, 3, 1, 1, 1};
+    constexpr int64_t kKinds = static_cast<int64_t>(Light::count),
+                      kWidths[kKinds] = {1, 3, 1, 3, 3, 1, 3, 3, 1, 1, 1};
     const int64_t directional = seed / 2 % 3, points = seed / 8 % 3, highlights = seed / 32 % 2;
-    const int64_t number[kKinds] = {1, 1, directional, 1, directional, points, 1, points, 1, highlights, highlights};
+    const int64_t number[kKinds] = {1, 1,      directional, 1,          directional, points,
+                                    1, points, 1,           highlights, highlights};
     int64_t *layout = r.tables.resize("layout", 3 * kKinds).data(), num_parameters = 0;
     for (int64_t n = 0; n < kKinds; ++n) {
       layout[3 * n] = num_parameters;
@@ -241,7 +351,8 @@ struct Run {
       num_parameters += layout[3 * n + 1] * number[n] * kWidths[n];
     }
     T *parameters = in("lights", num_parameters), *viewer = in("viewer", 5 * s.batch);
-    for (int64_t n = 0; n < kKinds; ++n)  // those of the first image do not depend on the size of the batch
+    for (int64_t n = 0; n < kKinds;
+         ++n)  // those of the first image do not depend on the size of the batch
       for (int64_t k = 0; k < layout[3 * n + 1] * number[n] * kWidths[n]; ++k) {
         const T x = static_cast<T>(noise(stream_of("lights"), 1000 * n + k));
         parameters[layout[3 * n] + k] = T(1) / 4 + x * x;
@@ -252,7 +363,8 @@ struct Run {
     }
     const bool lit = seed % 8 != 6, colored = lit && seed % 5 != 0;
     Lit<T> args{};
-    args.at = interpolate(s.vertices.data(), s.batch, 3, out("grad_lit_vertices", 3 * rows), out("grad_lit_weights", 3 * pixels));
+    args.at = interpolate(s.vertices.data(), s.batch, 3, out("grad_lit_vertices", 3 * rows),
+                          out("grad_lit_weights", 3 * pixels));
     args.normals = unit;
     args.normal_batch = s.packed() ? 0 : s.batch;
     args.smooth = smooth;
@@ -276,13 +388,34 @@ struct Run {
     const int64_t size = image_pixels * C, backgrounds = s.per_image_values ? s.batch : 1;
     const T *image = in("image", pixels * C), *grad = in("grad_resolved", size);
     const T* background = in_if(s.fill_back, "background", backgrounds * C);
-    EdgesBackward<T> edges{mesh, s.image, s.anti_aliasing, s.eps, face_index, image, C, background, backgrounds, grad,
-                           out("grad_edges", 3 * rows), threads, s.perspective};
+    EdgesBackward<T> edges{mesh,
+                           s.image,
+                           s.anti_aliasing,
+                           s.eps,
+                           face_index,
+                           image,
+                           C,
+                           background,
+                           backgrounds,
+                           grad,
+                           out("grad_edges", 3 * rows),
+                           threads,
+                           s.perspective};
     edges_backward(edges);
     edges.grad_vertices = out("grad_local_edges", 3 * rows);
     local_edges_backward(edges);
-    const Resolve<T> resolve{s.batch, s.image, s.anti_aliasing, C, face_index, image, background, backgrounds,
-                             out("resolved", size), grad, out("grad_image", pixels * C), out("grad_background", s.batch * C),
+    const Resolve<T> resolve{s.batch,
+                             s.image,
+                             s.anti_aliasing,
+                             C,
+                             face_index,
+                             image,
+                             background,
+                             backgrounds,
+                             out("resolved", size),
+                             grad,
+                             out("grad_image", pixels * C),
+                             out("grad_background", s.batch * C),
                              threads};
     resolve_forward(resolve);
     resolve_backward(resolve);
@@ -291,48 +424,90 @@ struct Run {
   // A camera per image: nearly the identity, three units back.
   void camera() {
     const bool distorted = s.distorted && s.perspective, placed = !s.distorted;
-    const int64_t B = s.batch, D = seed % 4 == 1 ? 4 : seed % 4 == 2 ? 8 : 5;  // coefficients of the distortion
+    const int64_t B = s.batch, D = seed % 4 == 1   ? 4
+                                   : seed % 4 == 2 ? 8
+                                                   : 5;  // coefficients of the distortion
     T *camera = in("camera", kCamera * B), *distortion = in("distortion", D * B);
     for (int64_t b = 0; b < B; ++b) {
       T* row = camera + kCamera * b;
       for (int64_t n = 0; n < 12; ++n) row[n] = row[n] / 8 + T(n % 5 == 0) + T(n == 11 ? 2 : 0);
-      for (int64_t n = 0; n < 6; ++n) row[kIntrinsics + n] = row[kIntrinsics + n] / 8 + T(n % 4 == 0);
+      for (int64_t n = 0; n < 6; ++n)
+        row[kIntrinsics + n] = row[kIntrinsics + n] / 8 + T(n % 4 == 0);
       for (int64_t n = 0; n < 3 && !placed; ++n) row[kOrigin + n] = 0;
       row[kExtent] = placed ? T(0.25) + row[kExtent] * row[kExtent] : T(1);
     }
     for (int64_t n = 0; n < D * B; ++n) distortion[n] /= 16;
-    const Project<T> args{s.vertices.data(), mesh.starts, B, B, s.num_vertices, camera, true, distorted ? distortion : nullptr, true, D,
-                          s.perspective, out("points", 3 * rows), in("grad_points", 3 * rows), out("grad_world", 3 * rows),
-                          out("grad_camera", kCamera * B), out_if(distorted, "grad_distortion", D * B), threads};
+    const Project<T> args{s.vertices.data(),
+                          mesh.starts,
+                          B,
+                          B,
+                          s.num_vertices,
+                          camera,
+                          true,
+                          distorted ? distortion : nullptr,
+                          true,
+                          D,
+                          s.perspective,
+                          out("points", 3 * rows),
+                          in("grad_points", 3 * rows),
+                          out("grad_world", 3 * rows),
+                          out("grad_camera", kCamera * B),
+                          out_if(distorted, "grad_distortion", D * B),
+                          threads};
     project_forward(args);
     project_backward(args);
   }
 
-  // Directions from the vertices, with whatever they hold; a camera for each pair of them, at the origin.
+  // Directions from the vertices, with whatever they hold; a camera for each pair of them, at the
+  // origin.
   void poses() {
     const int64_t count = rows / 2;
     const std::vector<double> points(s.vertices.begin(), s.vertices.begin() + 3 * rows);
     const double eye[3] = {}, view = 30;
     std::vector<double> grads(6 * count);
-    const LookAt<T> args{count, eye, points.data(), points.data() + 3 * count, &view, false, true, true, false, true,
-                         false, s.perspective, out("pose", kCamera * count), in("grad_pose", kCamera * count), nullptr,
-                         grads.data(), grads.data() + 3 * count, nullptr};
+    const LookAt<T> args{count,
+                         eye,
+                         points.data(),
+                         points.data() + 3 * count,
+                         &view,
+                         false,
+                         true,
+                         true,
+                         false,
+                         true,
+                         false,
+                         s.perspective,
+                         out("pose", kCamera * count),
+                         in("grad_pose", kCamera * count),
+                         nullptr,
+                         grads.data(),
+                         grads.data() + 3 * count,
+                         nullptr};
     look_at_forward(args);
     look_at_backward(args);
     std::copy_n(grads.data(), 3 * count, out("grad_forward", 3 * count));
     std::copy_n(grads.data() + 3 * count, 3 * count, out("grad_up", 3 * count));
   }
 
-  // The edges are made up: corners of consecutive faces of the first mesh. Packed vertices count as one mesh.
+  // The edges are made up: corners of consecutive faces of the first mesh. Packed vertices count as
+  // one mesh.
   void smoothness() {
-    const int64_t num_edges = s.batch > 0 ? mesh.face_count(0) : 0, batch = s.packed() ? 1 : s.batch;
+    const int64_t num_edges = s.batch > 0 ? mesh.face_count(0) : 0,
+                  batch = s.packed() ? 1 : s.batch;
     int64_t* edges = r.tables.resize("edges", 4 * num_edges).data();
     for (int64_t f = 0; f < num_edges; ++f) {
       std::copy_n(s.faces.data() + 3 * f, 3, edges + 4 * f);
       edges[4 * f + 3] = s.faces[3 * ((f + 1) % num_edges) + 1];
     }
-    const Smoothness<T> args{s.vertices.data(), edges, batch, s.num_vertices, num_edges, out("loss", batch), in("grad_loss", batch),
-                             out("grad_loss_vertices", 3 * rows), threads};
+    const Smoothness<T> args{s.vertices.data(),
+                             edges,
+                             batch,
+                             s.num_vertices,
+                             num_edges,
+                             out("loss", batch),
+                             in("grad_loss", batch),
+                             out("grad_loss_vertices", 3 * rows),
+                             threads};
     smoothness_forward(args);
     smoothness_backward(args);
   }
@@ -342,20 +517,31 @@ struct Run {
     T* target = in("target", pixels);
     for (int64_t n = 0; n < pixels; ++n) target[n] = std::abs(target[n]);
     double* areas = r.areas.resize("areas", 2 * s.batch).data();
-    const SoftIou<T> args{r.get("clear").data(), target, s.batch, raster.pixels(), areas, out("iou", s.batch), in("grad_iou", s.batch),
-                          out("grad_prediction", pixels), out("grad_target", pixels), threads};
+    const SoftIou<T> args{r.get("clear").data(),
+                          target,
+                          s.batch,
+                          raster.pixels(),
+                          areas,
+                          out("iou", s.batch),
+                          in("grad_iou", s.batch),
+                          out("grad_prediction", pixels),
+                          out("grad_target", pixels),
+                          threads};
     soft_iou_forward(args);
     soft_iou_backward(args);
   }
 
   void voxels() {
     static thread_local Arrays<float> memory;
-    std::vector<float>& vertices = memory.resize("vertices", static_cast<int64_t>(s.vertices.size()));
+    std::vector<float>& vertices =
+        memory.resize("vertices", static_cast<int64_t>(s.vertices.size()));
     std::copy(s.vertices.begin(), s.vertices.end(), vertices.begin());
-    const MeshBatch<float> batch{vertices.data(), s.faces.data(), s.batch, s.num_vertices, s.num_faces, s.faces_per_image, mesh.starts};
+    const MeshBatch<float> batch{vertices.data(), s.faces.data(),    s.batch,    s.num_vertices,
+                                 s.num_faces,     s.faces_per_image, mesh.starts};
     for (const bool touched : {false, true}) {
       const int64_t cells = s.grid_size * s.grid_size * s.grid_size;
-      unsigned char* filled = r.template out<unsigned char>(touched ? "touched" : "voxels", s.batch * cells);
+      unsigned char* filled =
+          r.template out<unsigned char>(touched ? "touched" : "voxels", s.batch * cells);
       voxelize(Voxelize{batch, s.grid_size, touched, reinterpret_cast<bool*>(filled), threads});
     }
   }
@@ -366,8 +552,8 @@ bool all_finite(const std::vector<T>& values) {
   return std::all_of(values.begin(), values.end(), [](T x) { return std::isfinite(x); });
 }
 
-// Every coordinate is a multiple of 1/256 within +-16, and no depth is nearer to 0 than that: areas and depths are far
-// from underflow and overflow, so that every derivative is finite.
+// Every coordinate is a multiple of 1/256 within +-16, and no depth is nearer to 0 than that: areas
+// and depths are far from underflow and overflow, so that every derivative is finite.
 template <class T>
 bool is_tame(const Scene<T>& scene) {
   for (size_t n = 0; n < scene.vertices.size(); ++n) {
@@ -384,13 +570,15 @@ bool same(const Number* a, const Number* b, size_t size) {
   if (size == 0 || std::memcmp(a, b, size * sizeof(Number)) == 0) return true;
   if constexpr (std::is_floating_point_v<Number>) {
     for (size_t n = 0; n < size; ++n)
-      if (std::memcmp(a + n, b + n, sizeof(Number)) != 0 && !(std::isnan(a[n]) && std::isnan(b[n]))) return false;
+      if (std::memcmp(a + n, b + n, sizeof(Number)) != 0 && !(std::isnan(a[n]) && std::isnan(b[n])))
+        return false;
     return true;
   }
   return false;
 }
 
-// The name of the first result of which the first numbers, as many as `share(name, size in a, size in b)`, differ; or "".
+// The name of the first result of which the first numbers, as many as `share(name, size in a, size
+// in b)`, differ; or "".
 template <class T, class Share>
 const char* compare(const Results<T>& a, const Results<T>& b, const Share& share) {
   const char* different = "";
@@ -398,10 +586,15 @@ const char* compare(const Results<T>& a, const Results<T>& b, const Share& share
     for (size_t n = 0; n < these.arrays.size(); ++n) {
       const auto &x = these.arrays[n].values, &y = others.arrays[n].values;
       const size_t size = share(string_view(these.arrays[n].name), x.size(), y.size());
-      if (!*different && (size == kDifferent || !same(x.data(), y.data(), size))) different = these.arrays[n].name;
+      if (!*different && (size == kDifferent || !same(x.data(), y.data(), size)))
+        different = these.arrays[n].name;
     }
   };
-  std::apply([&](const auto&... these) { (list(these, std::get<std::decay_t<decltype(these)>>(b.lists)), ...); }, a.lists);
+  std::apply(
+      [&](const auto&... these) {
+        (list(these, std::get<std::decay_t<decltype(these)>>(b.lists)), ...);
+      },
+      a.lists);
   return different;
 }
 
@@ -429,7 +622,8 @@ Scene<T> packed(const Scene<T>& scene) {
     result.add_start();
     result.num_vertices += scene.num_vertices;
     result.num_faces += scene.num_faces;
-    result.faces.insert(result.faces.end(), mesh.image_faces(b), mesh.image_faces(b) + 3 * scene.num_faces);
+    result.faces.insert(result.faces.end(), mesh.image_faces(b),
+                        mesh.image_faces(b) + 3 * scene.num_faces);
   }
   result.add_start();
   return result;
@@ -450,17 +644,19 @@ Scene<T> first_image(const Scene<T>& scene) {
 
 template <class T>
 const char* first_difference(const Results<T>& a, const Results<T>& b) {
-  return compare(a, b, [](string_view, size_t size_a, size_t size_b) { return if_equal(size_a, size_b); });
+  return compare(
+      a, b, [](string_view, size_t size_a, size_t size_b) { return if_equal(size_a, size_b); });
 }
 
 template <class T>
-const char* depends_on_company(const Scene<T>& scene, const Results<T>& together, const Results<T>& alone) {
+const char* depends_on_company(const Scene<T>& scene, const Results<T>& together,
+                               const Results<T>& alone) {
   return compare(together, alone, [&](string_view name, size_t, size_t size) {
-    const bool summed =
-        is_one_of(name, {"pose", "grad_forward", "grad_up", "grad_lights"}) ||
-        (scene.packed() && is_one_of(name, {"loss", "grad_loss_vertices"})) ||
-        (!scene.per_image_values && name == "grad_sampled_texels") ||
-        (!scene.per_image_values && !scene.packed() && is_one_of(name, {"grad_textures", "grad_attributes", "grad_uv"}));
+    const bool summed = is_one_of(name, {"pose", "grad_forward", "grad_up", "grad_lights"}) ||
+                        (scene.packed() && is_one_of(name, {"loss", "grad_loss_vertices"})) ||
+                        (!scene.per_image_values && name == "grad_sampled_texels") ||
+                        (!scene.per_image_values && !scene.packed() &&
+                         is_one_of(name, {"grad_textures", "grad_attributes", "grad_uv"}));
     return summed ? 0 : size;
   });
 }
@@ -478,7 +674,8 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   const auto check = [&broken](bool holds, const char* sentence) {
     if (!holds && !*broken) broken = sentence;
   };
-  const auto check_all = [&](std::initializer_list<const char*> names, const auto& holds, const char* sentence) {
+  const auto check_all = [&](std::initializer_list<const char*> names, const auto& holds,
+                             const char* sentence) {
     for (const char* name : names)
       for (T x : r.get(name)) check(holds(x), sentence);
   };
@@ -486,84 +683,117 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   const Size raster = scene.raster(), image = scene.image;
   const int64_t H = raster.height, W = raster.width;
   const bool foreign = scene.foreign_face_index;
-  const std::vector<int32_t>&face_index = r.template get<int32_t>("face_index"), &layers = r.template get<int32_t>("layers");
+  const std::vector<int32_t>&face_index = r.template get<int32_t>("face_index"),
+        &layers = r.template get<int32_t>("layers");
 
   for (size_t n = 0; n < face_index.size(); ++n) {
-    const int64_t b = static_cast<int64_t>(n) / raster.pixels(), x = static_cast<int64_t>(n) % W, y = static_cast<int64_t>(n) / W % H;
+    const int64_t b = static_cast<int64_t>(n) / raster.pixels(), x = static_cast<int64_t>(n) % W,
+                  y = static_cast<int64_t>(n) / W % H;
     const int64_t F = mesh.face_count(b), id = face_index[n];
-    check(id >= -1 && id < (scene.fill_back || foreign ? 2 * F : F), "face_index names a face of its image, or -1");
+    check(id >= -1 && id < (scene.fill_back || foreign ? 2 * F : F),
+          "face_index names a face of its image, or -1");
     if (id < 0 || foreign || *broken) continue;
-    const T centre[2] = {static_cast<T>(2 * x + 1 - W) / static_cast<T>(W), static_cast<T>(H - 1 - 2 * y) / static_cast<T>(H)};
+    const T centre[2] = {static_cast<T>(2 * x + 1 - W) / static_cast<T>(W),
+                         static_cast<T>(H - 1 - 2 * y) / static_cast<T>(H)};
     bool below[2] = {false, false}, above[2] = {false, false};
     for (int k = 0; k < 3; ++k) {
       const T* v = mesh.image_vertices(b) + 3 * mesh.image_faces(b)[3 * (id % F) + k];
-      check(std::isfinite(v[0]) && std::isfinite(v[1]) && !std::isnan(v[2]), "a face that is not finite is not drawn");
-      for (int axis = 0; axis < 2; ++axis) below[axis] |= v[axis] <= centre[axis], above[axis] |= v[axis] >= centre[axis];
+      check(std::isfinite(v[0]) && std::isfinite(v[1]) && !std::isnan(v[2]),
+            "a face that is not finite is not drawn");
+      for (int axis = 0; axis < 2; ++axis)
+        below[axis] |= v[axis] <= centre[axis], above[axis] |= v[axis] >= centre[axis];
     }
-    check(below[0] && below[1] && above[0] && above[1], "a face covers no centre outside its bounding box");
+    check(below[0] && below[1] && above[0] && above[1],
+          "a face covers no centre outside its bounding box");
   }
   const std::vector<T>& alpha = r.get("alpha");
   for (int64_t n = 0; n < scene.batch * image.pixels(); ++n) {
-    const int64_t step = scene.anti_aliasing ? 2 : 1, b = n / image.pixels(), y = n / image.width % image.height, x = n % image.width;
+    const int64_t step = scene.anti_aliasing ? 2 : 1, b = n / image.pixels(),
+                  y = n / image.width % image.height, x = n % image.width;
     int covered = 0;
     for (int64_t k = 0; k < step * step; ++k)
-      covered += face_index[b * raster.pixels() + (step * y + k / step) * W + step * x + k % step] >= 0;
+      covered +=
+          face_index[b * raster.pixels() + (step * y + k / step) * W + step * x + k % step] >= 0;
     check(alpha[n] == T(covered) / T(step * step), "alpha is the covered share of a pixel");
   }
   const size_t count = face_index.empty() ? 0 : layers.size() / face_index.size();
   const std::vector<int32_t>& around = r.template get<int32_t>("soft_layers");
   for (size_t n = 0; n < around.size(); ++n) {
-    const int64_t id = around[n], F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
-    check(id >= -1 && id < (scene.fill_back ? 2 * F : F), "a soft layer names a face of its image, or -1");
-    if (n % count > 0) check(id < 0 || (around[n - 1] >= 0 && around[n - 1] != id), "soft layers are different faces, then -1");
+    const int64_t id = around[n],
+                  F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
+    check(id >= -1 && id < (scene.fill_back ? 2 * F : F),
+          "a soft layer names a face of its image, or -1");
+    if (n % count > 0)
+      check(id < 0 || (around[n - 1] >= 0 && around[n - 1] != id),
+            "soft layers are different faces, then -1");
   }
   for (size_t n = 0; n < layers.size(); ++n) {
-    const int64_t id = layers[n], F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
-    check(id >= -1 && id < (scene.fill_back ? 2 * F : F), "a layer names a face of its image, or -1");
-    if (n % count > 0) check(id < 0 || (layers[n - 1] >= 0 && layers[n - 1] != id), "layers are different faces, then -1");
-    if (n % count == 0 && !foreign) check(id == face_index[n / count], "the first layer is the face index map");
+    const int64_t id = layers[n],
+                  F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
+    check(id >= -1 && id < (scene.fill_back ? 2 * F : F),
+          "a layer names a face of its image, or -1");
+    if (n % count > 0)
+      check(id < 0 || (layers[n - 1] >= 0 && layers[n - 1] != id),
+            "layers are different faces, then -1");
+    if (n % count == 0 && !foreign)
+      check(id == face_index[n / count], "the first layer is the face index map");
   }
 
-  const std::vector<int64_t>&starts = r.template get<int64_t>("clip_starts"), &corners = r.template get<int64_t>("clip_corners"),
-                            &clip_faces = r.template get<int64_t>("clip_faces"), &ends = r.template get<int64_t>("clip_ends");
+  const std::vector<int64_t>&starts = r.template get<int64_t>("clip_starts"),
+        &corners = r.template get<int64_t>("clip_corners"),
+        &clip_faces = r.template get<int64_t>("clip_faces"),
+        &ends = r.template get<int64_t>("clip_ends");
   const std::vector<int32_t>& sources = r.template get<int32_t>("clip_source");
   for (int64_t b = 0; b < scene.batch; ++b) {
-    const int64_t V = mesh.vertex_count(b), F = mesh.face_count(b), first = mesh.vertex_start(b), P = starts[2 * b + 2] - starts[2 * b];
+    const int64_t V = mesh.vertex_count(b), F = mesh.face_count(b), first = mesh.vertex_start(b),
+                  P = starts[2 * b + 2] - starts[2 * b];
     for (int64_t f = starts[2 * b + 1]; f < starts[2 * b + 3]; ++f) {
       const int64_t source = sources[f];
       check(source >= 0 && source < std::max<int64_t>(F, 1), "a drawn face is part of a face");
       for (int64_t n = 3 * f; n < 3 * f + 3; ++n) {
         const int64_t v = clip_faces[n];
-        check(V == 0 || (v >= 0 && v < V + P), "a corner of a drawn face is a vertex or a new vertex");
-        check(corners[n] >= 0 && corners[n] < 3 + std::max<int64_t>(P, 1), "a corner of a drawn face lies on its face");
+        check(V == 0 || (v >= 0 && v < V + P),
+              "a corner of a drawn face is a vertex or a new vertex");
+        check(corners[n] >= 0 && corners[n] < 3 + std::max<int64_t>(P, 1),
+              "a corner of a drawn face lies on its face");
       }
     }
     for (int64_t n = 4 * starts[2 * b]; n < 4 * starts[2 * b + 2] && F > 0; ++n) {
       const int64_t end = ends[n];
-      check(n % 4 < 2 ? end >= first && end < first + V : end >= 0 && end <= 2, "a new vertex lies between two corners");
+      check(n % 4 < 2 ? end >= first && end < first + V : end >= 0 && end <= 2,
+            "a new vertex lies between two corners");
     }
   }
 
   check_all({"clear"}, [](T x) { return x >= 0 && x <= 1; }, "a soft silhouette lies in [0, 1]");
-  check_all({"normals"}, [](T x) { return std::abs(x) <= T(1.00001); }, "a normal has the length 1 or 0");
+  check_all(
+      {"normals"}, [](T x) { return std::abs(x) <= T(1.00001); }, "a normal has the length 1 or 0");
   check_all({"level"}, [](T x) { return x >= 0 && x <= 2; }, "a mipmap level is one that there is");
   for (const char* name : {"voxels", "touched"})
-    for (unsigned char cell : r.template get<unsigned char>(name)) check(cell <= 1, "a cell is filled or empty");
-  const std::vector<T>&points = r.get("points"), &pose = r.get("pose"), &depth = r.get("depth"), &weights = r.get("weights");
+    for (unsigned char cell : r.template get<unsigned char>(name))
+      check(cell <= 1, "a cell is filled or empty");
+  const std::vector<T>&points = r.get("points"), &pose = r.get("pose"), &depth = r.get("depth"),
+        &weights = r.get("weights");
   for (size_t n = 0; n < points.size(); ++n)
-    check(n % 3 == 2 ? std::isfinite(points[n]) : !std::isnan(points[n]), "a projected vertex has a depth and a place, or is at infinity");
+    check(n % 3 == 2 ? std::isfinite(points[n]) : !std::isnan(points[n]),
+          "a projected vertex has a depth and a place, or is at infinity");
   for (size_t n = 0; n < pose.size(); ++n)
-    check(n % kCamera >= kIntrinsics || (std::isfinite(pose[n]) == std::isfinite(pose[n - n % kCamera]) && !std::isinf(pose[n])),
+    check(n % kCamera >= kIntrinsics ||
+              (std::isfinite(pose[n]) == std::isfinite(pose[n - n % kCamera]) &&
+               !std::isinf(pose[n])),
           "a pose is finite or all NaN");
-  for (const char* name : {"grad_silhouette", "grad_local", "grad_edges", "grad_local_edges", "grad_soft"}) {
+  for (const char* name :
+       {"grad_silhouette", "grad_local", "grad_edges", "grad_local_edges", "grad_soft"}) {
     const std::vector<T>& grad = r.get(name);
-    for (size_t n = 2; n < grad.size(); n += 3) check(grad[n] == 0, "the gradients of silhouettes and edges have no z");
+    for (size_t n = 2; n < grad.size(); n += 3)
+      check(grad[n] == 0, "the gradients of silhouettes and edges have no z");
   }
   for (const char* name : {"weights", "values", "colors", "sampled", "lit", "rast", "slopes"}) {
     const std::vector<T>& values = r.get(name);
     const size_t channels = depth.empty() ? 1 : values.size() / depth.size();
     for (size_t n = 0; n < values.size(); ++n)
-      check(face_index[n / channels] >= 0 || values[n] == 0, "the background's weights and colours are 0");
+      check(face_index[n / channels] >= 0 || values[n] == 0,
+            "the background's weights and colours are 0");
   }
   const bool tame = !foreign && is_tame(scene);
   for (size_t n = 0; n < depth.size(); ++n) {
@@ -572,16 +802,18 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     } else if (tame) {
       const T* w = weights.data() + 3 * n;
       check(std::abs(w[0] + w[1] + w[2] - 1) <= T(1e-4), "the weights of a covered pixel sum to 1");
-      check(depth[n] > scene.near * T(0.99) && depth[n] < scene.far * T(1.01), "a covered pixel's depth lies between near and far");
+      check(depth[n] > scene.near * T(0.99) && depth[n] < scene.far * T(1.01),
+            "a covered pixel's depth lies between near and far");
     }
   }
   if (scene.hostile_upstream) return broken;
 
   const auto finite = [](T x) { return std::isfinite(x); };
-  check_all({"grad_local", "grad_world", "grad_camera", "grad_distortion",
-             "grad_soft", "grad_sigma", "grad_forward", "grad_up", "iou", "grad_prediction", "grad_target"},
+  check_all({"grad_local", "grad_world", "grad_camera", "grad_distortion", "grad_soft",
+             "grad_sigma", "grad_forward", "grad_up", "iou", "grad_prediction", "grad_target"},
             finite, "a gradient is finite");
-  if (!foreign) check_all({"grad_silhouette", "grad_edges"}, finite, "a gradient of edges is finite");
+  if (!foreign)
+    check_all({"grad_silhouette", "grad_edges"}, finite, "a gradient of edges is finite");
   if (!tame) return broken;
   for (const auto& array : std::get<Arrays<T>>(r.lists).arrays)
     if (!is_one_of(array.name, {"points", "pose"})) check(all_finite(array.values), array.name);

@@ -1,5 +1,5 @@
-// A batch of meshes with everything the stages ask for, and one call that runs them all. Shared by the tests, the fuzz
-// target and the instruction count.
+// A batch of meshes with everything the stages ask for, and one call that runs them all. Shared by
+// the tests, the fuzz target and the instruction count.
 #pragma once
 
 #include <cstdint>
@@ -24,7 +24,8 @@ inline double noise(uint64_t seed, uint64_t index) {
 
 template <class T>
 struct Scene {
-  int64_t batch = 0, num_vertices = 0, num_faces = 0;  // as in MeshBatch: packed, the sums over all meshes
+  int64_t batch = 0, num_vertices = 0,
+          num_faces = 0;  // as in MeshBatch: packed, the sums over all meshes
   bool faces_per_image = false;
   std::vector<T> vertices;
   std::vector<int64_t> faces;
@@ -34,14 +35,17 @@ struct Scene {
   bool anti_aliasing = true, fill_back = true;
   T near = T(0.1), far = T(100), eps = T(1e-4);
   int64_t channels = 3, texture_size = 2, grid_size = 4;
-  bool per_image_values = false;              // textures and attributes of each image, not shared
-  bool perspective = true, distorted = true;  // the camera; undistorted ones have an origin and an extent
-  bool no_grad_weights = false, no_grad_depth = false;  // optional upstream gradients and results of a backward stage
-  bool foreign_face_index = false;                // backward stages get a made-up face index map: any in range is allowed
-  const int32_t* given_face_index = nullptr;      // or this one
-  bool hostile_upstream = false;                  // NaN, infinities and huge numbers among the upstream gradients
-  const char* poisoned = nullptr;                 // the upstream gradient that is NaN in the first image
-  uint64_t seed = 1;                              // of textures, attributes, cameras and upstream gradients
+  bool per_image_values = false;  // textures and attributes of each image, not shared
+  bool perspective = true,
+       distorted = true;  // the camera; undistorted ones have an origin and an extent
+  bool no_grad_weights = false,
+       no_grad_depth = false;  // optional upstream gradients and results of a backward stage
+  bool foreign_face_index =
+      false;  // backward stages get a made-up face index map: any in range is allowed
+  const int32_t* given_face_index = nullptr;  // or this one
+  bool hostile_upstream = false;   // NaN, infinities and huge numbers among the upstream gradients
+  const char* poisoned = nullptr;  // the upstream gradient that is NaN in the first image
+  uint64_t seed = 1;               // of textures, attributes, cameras and upstream gradients
 
   bool packed() const { return !starts.empty(); }
   Size raster() const { return raster_of(image, anti_aliasing); }
@@ -57,8 +61,8 @@ struct Scene {
   }
 };
 
-// Arrays by name. An array keeps its storage from scene to scene, but in sanitizer builds has exactly the size asked
-// for, so that accesses beyond it are seen.
+// Arrays by name. An array keeps its storage from scene to scene, but in sanitizer builds has
+// exactly the size asked for, so that accesses beyond it are seen.
 template <class Number>
 struct Arrays {
   struct Array {
@@ -99,14 +103,17 @@ struct Results {
   template <class Number = T>
   Number* out(const char* name, int64_t size) {
     using Limits = std::numeric_limits<Number>;
-    constexpr Number kUnwritten = Limits::has_quiet_NaN ? Limits::quiet_NaN() : Limits::is_signed ? Limits::min() : Limits::max();
+    constexpr Number kUnwritten = Limits::has_quiet_NaN ? Limits::quiet_NaN()
+                                  : Limits::is_signed   ? Limits::min()
+                                                        : Limits::max();
     std::vector<Number>& values = std::get<Arrays<Number>>(lists).resize(name, size);
     values.assign(size, kUnwritten);
     return values.data();
   }
 };
 
-// Runs every stage of csrc, forward and backward. Earlier results are overwritten, their storage used again.
+// Runs every stage of csrc, forward and backward. Earlier results are overwritten, their storage
+// used again.
 template <class T>
 void run_stages(const Scene<T>& scene, int num_threads, Results<T>& results);
 
@@ -130,9 +137,11 @@ Scene<T> first_image(const Scene<T>& scene);
 template <class T>
 const char* first_difference(const Results<T>& a, const Results<T>& b);
 
-// Whether the results of first_image(scene) are the beginning of the batch's. Sums over the batch are not compared.
+// Whether the results of first_image(scene) are the beginning of the batch's. Sums over the batch
+// are not compared.
 template <class T>
-const char* depends_on_company(const Scene<T>& scene, const Results<T>& together, const Results<T>& alone);
+const char* depends_on_company(const Scene<T>& scene, const Results<T>& together,
+                               const Results<T>& alone);
 
 // A packed batch is one mesh to the smoothness loss, which is not compared.
 template <class T>

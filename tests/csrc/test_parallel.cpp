@@ -52,9 +52,9 @@ TEST(a_caller_that_waited_in_vain_works_alone_for_a_while) {
     guard.record_wait(OversubscriptionGuard::now() - waited, worked, stopped);
     return guard.allows_threads();
   };
-  CHECK(!wants(20 * ms, 0, 0));                // the other thread had no core to begin on
-  CHECK(!wants(20 * ms, 30 * ms, 15 * ms));    // it lost its core
-  CHECK(wants(20 * ms, 1000 * ms, 0));         // it had a longer iteration
+  CHECK(!wants(20 * ms, 0, 0));              // the other thread had no core to begin on
+  CHECK(!wants(20 * ms, 30 * ms, 15 * ms));  // it lost its core
+  CHECK(wants(20 * ms, 1000 * ms, 0));       // it had a longer iteration
   CHECK(wants(0, 0, 0));
 }
 
@@ -83,17 +83,21 @@ TEST(scratch_beyond_the_limit_is_freed_after_the_outermost_loop) {
   ThreadScratch::free_all();
   const size_t limit = ThreadScratch::kLimit / sizeof(double);
   for (int threads : {1, 3}) {
-    parallel_for(6, threads, [&](int64_t) { reserve(thread_scratch<Counted>().values, limit / 4); });
+    parallel_for(6, threads,
+                 [&](int64_t) { reserve(thread_scratch<Counted>().values, limit / 4); });
     CHECK(Counted::alive >= 1 && Counted::alive <= threads);
     parallel_for(1, 1, [&](int64_t) {
       double* values = reserve(thread_scratch<Counted>().values, 2 * limit);
       values[0] = 7;
-      parallel_for(threads, threads, [](int64_t) { thread_scratch<Counted>(); });  // a loop within frees nothing
+      parallel_for(threads, threads,
+                   [](int64_t) { thread_scratch<Counted>(); });  // a loop within frees nothing
       CHECK_EQUAL(values[0], 7);
       CHECK_EQUAL(&thread_scratch<Counted>().values[0], values);
     });
-    parallel_for(6, threads, [&](int64_t) { reserve(thread_scratch<Counted>().values, 2 * limit); });
-    CHECK(Counted::alive < threads);  // a thread that had no part in this loop keeps a quarter of the limit
+    parallel_for(6, threads,
+                 [&](int64_t) { reserve(thread_scratch<Counted>().values, 2 * limit); });
+    CHECK(Counted::alive <
+          threads);  // a thread that had no part in this loop keeps a quarter of the limit
   }
 }
 

@@ -1,4 +1,5 @@
-// The face index map, to the last pixel, against the definition of docs/conventions.md: every face at every pixel.
+// The face index map, to the last pixel, against the definition of docs/conventions.md: every face
+// at every pixel.
 #include <algorithm>
 #include <cmath>
 
@@ -18,7 +19,8 @@ struct SlowFace {
     const int64_t F = mesh.face_count(b);
     bool usable = true;
     for (int k = 0; k < 3; ++k) {
-      const T* v = mesh.image_vertices(b) + 3 * mesh.image_faces(b)[3 * (id % F) + (id < F ? k : 2 - k)];
+      const T* v =
+          mesh.image_vertices(b) + 3 * mesh.image_faces(b)[3 * (id % F) + (id < F ? k : 2 - k)];
       x[k] = v[0], y[k] = v[1], z[k] = v[2];
       usable = usable && std::isfinite(v[0]) && std::isfinite(v[1]) && !std::isnan(v[2]);
     }
@@ -29,9 +31,11 @@ struct SlowFace {
 
   // Depth at a pixel, row 0 at the bottom; infinite outside the face.
   T depth(int64_t column, int64_t row, Size raster, bool perspective) const {
-    const T H = T(raster.height), W = T(raster.width), px = (2 * T(column) + 1 - W) / W, py = (2 * T(row) + 1 - H) / H;
-    bool inside = drawn && px >= std::min({x[0], x[1], x[2]}) && px <= std::max({x[0], x[1], x[2]}) &&
-                  py >= std::min({y[0], y[1], y[2]}) && py <= std::max({y[0], y[1], y[2]});
+    const T H = T(raster.height), W = T(raster.width), px = (2 * T(column) + 1 - W) / W,
+            py = (2 * T(row) + 1 - H) / H;
+    bool inside = drawn && px >= std::min({x[0], x[1], x[2]}) &&
+                  px <= std::max({x[0], x[1], x[2]}) && py >= std::min({y[0], y[1], y[2]}) &&
+                  py <= std::max({y[0], y[1], y[2]});
     for (int a = 0; a < 3 && inside; ++a) {
       const int b = (a + 1) % 3;
       inside = !((py - y[a]) * (x[b] - x[a]) < (px - x[a]) * (y[b] - y[a]));
@@ -42,7 +46,8 @@ struct SlowFace {
     const T det = X[2] * (Y[0] - Y[1]) + X[0] * (Y[1] - Y[2]) + X[1] * (Y[2] - Y[0]);
     for (int k = 0; k < 3; ++k) {
       const int a = (k + 1) % 3, b = (k + 2) % 3;
-      const T w = (Y[a] - Y[b]) / det * T(column) + (X[b] - X[a]) / det * T(row) + (X[a] * Y[b] - X[b] * Y[a]) / det;
+      const T w = (Y[a] - Y[b]) / det * T(column) + (X[b] - X[a]) / det * T(row) +
+                  (X[a] * Y[b] - X[b] * Y[a]) / det;
       weights[k] = w > 0 ? std::min(w, T(1)) : T(0);
     }
     const T sum = weights[0] + weights[1] + weights[2];
@@ -59,14 +64,19 @@ void check_rasterize_as_it_is(const Scene<T>& scene) {
   const MeshBatch<T> mesh = scene.mesh();
   const Size raster = scene.raster();
   std::vector<int32_t> face_index(scene.pixels(), -7), expected(scene.pixels(), -1);
-  rasterize(Rasterize<T>{mesh, {raster, scene.fill_back, scene.near, scene.far, scene.perspective}, face_index.data(), 2});
+  rasterize(Rasterize<T>{mesh,
+                         {raster, scene.fill_back, scene.near, scene.far, scene.perspective},
+                         face_index.data(),
+                         2});
   for (int64_t b = 0; b < scene.batch; ++b) {
     std::vector<T> nearest(raster.pixels(), scene.far);
     for (int64_t id = 0; id < mesh.face_count(b) * (scene.fill_back ? 2 : 1); ++id) {
       const SlowFace<T> face(mesh, b, id);
       for (int64_t n = 0; n < raster.pixels(); ++n) {
-        const T depth = face.depth(n % raster.width, raster.height - 1 - n / raster.width, raster, scene.perspective);
-        if (!(depth > scene.near && depth < nearest[n])) continue;  // of equally near faces the first wins
+        const T depth = face.depth(n % raster.width, raster.height - 1 - n / raster.width, raster,
+                                   scene.perspective);
+        if (!(depth > scene.near && depth < nearest[n]))
+          continue;  // of equally near faces the first wins
         nearest[n] = depth;
         expected[b * raster.pixels() + n] = static_cast<int32_t>(id);
       }
@@ -84,7 +94,8 @@ void check_rasterize(Scene<T> scene) {
   }
 }
 
-constexpr Size kRasters[] = {{1, 1}, {2, 2}, {7, 7}, {24, 24}, {33, 64}, {1, 9}, {9, 1}, {40, 7}, {130, 24}, {12, 90}};
+constexpr Size kRasters[] = {{1, 1}, {2, 2}, {7, 7},  {24, 24},  {33, 64},
+                             {1, 9}, {9, 1}, {40, 7}, {130, 24}, {12, 90}};
 
 template <class T>
 void check_mesh(const Mesh& mesh, bool fill_back, bool cut) {
@@ -123,15 +134,17 @@ TEST_REAL(rasterize_edges_are_inclusive) {
   }
 }
 
-// Faces on one plane of the scene, but for some units in the last place of their depths: only the published rounding
-// tells which is nearer, bounds must not. And faces that are equally near.
+// Faces on one plane of the scene, but for some units in the last place of their depths: only the
+// published rounding tells which is nearer, bounds must not. And faces that are equally near.
 TEST_REAL(rasterize_of_almost_equally_near_faces_is_exact) {
   for (uint64_t seed = 0; seed < 60; ++seed) {
     Mesh mesh = soup(15, seed);
     for (size_t n = 0; n < mesh.vertices.size(); n += 3) {
-      const double q = 0.4 + 0.02 * static_cast<double>(seed % 5) * mesh.vertices[n] - 0.03 * mesh.vertices[n + 1];
+      const double q = 0.4 + 0.02 * static_cast<double>(seed % 5) * mesh.vertices[n] -
+                       0.03 * mesh.vertices[n + 1];
       const double z = seed % 2 ? 1 / q : 2 + q;  // one plane with perspective, or without
-      mesh.vertices[n + 2] = z * (1 + static_cast<double>(n * (seed + 1) % 7) * std::numeric_limits<T>::epsilon());
+      mesh.vertices[n + 2] =
+          z * (1 + static_cast<double>(n * (seed + 1) % 7) * std::numeric_limits<T>::epsilon());
     }
     Scene<T> scene = single<T>(mesh);
     for (const Size image : {Size{24, 24}, Size{6, 45}, Size{45, 6}}) {

@@ -1,5 +1,6 @@
-// Properties of every stage: its results do not depend on threads, company, packing, the order of faces or earlier
-// calls; float agrees with double; gradients that are not finite are seen; hostile inputs keep what broken_promise lists.
+// Properties of every stage: its results do not depend on threads, company, packing, the order of
+// faces or earlier calls; float agrees with double; gradients that are not finite are seen; hostile
+// inputs keep what broken_promise lists.
 #include <algorithm>
 #include <cmath>
 
@@ -11,7 +12,8 @@
 namespace nmr::test {
 namespace {
 
-constexpr double kInf = std::numeric_limits<double>::infinity(), kNaN = std::numeric_limits<double>::quiet_NaN();
+constexpr double kInf = std::numeric_limits<double>::infinity(),
+                 kNaN = std::numeric_limits<double>::quiet_NaN();
 constexpr int kMeshes = 17;  // more than any stage works on together
 
 std::vector<Mesh> meshes() {
@@ -22,8 +24,9 @@ std::vector<Mesh> meshes() {
 
 template <class T>
 std::vector<Scene<T>> scenes() {
-  std::vector<Scene<T>> all{stack<T>(meshes(), true), stack<T>(meshes(), false),
-                            pack<T>({sphere(1, 1), Mesh{}, soup(9, 2), sphere(2, 3), soup(1, 4), Mesh{}})};
+  std::vector<Scene<T>> all{
+      stack<T>(meshes(), true), stack<T>(meshes(), false),
+      pack<T>({sphere(1, 1), Mesh{}, soup(9, 2), sphere(2, 3), soup(1, 4), Mesh{}})};
   all.push_back(all[0]);
   all.push_back(single<T>(sphere(2, 6)));  // a raster that is worked on in blocks
   const Size images[] = {{5, 11}, {12, 7}, {8, 9}, {19, 6}, {75, 150}};
@@ -88,10 +91,13 @@ TEST_REAL(an_image_does_not_depend_on_its_company) {
     Scene<T> one = stack<T>({meshes()[b]}, true);
     one.image = scene.image;
     const Results<T> alone = run_stages(one, 1);
-    CHECK(alone.template get<int32_t>("face_index") == share(together.template get<int32_t>("face_index"), b, kMeshes));
+    CHECK(alone.template get<int32_t>("face_index") ==
+          share(together.template get<int32_t>("face_index"), b, kMeshes));
     for (const char* name : {"voxels", "touched"})
-      CHECK(alone.template get<unsigned char>(name) == share(together.template get<unsigned char>(name), b, kMeshes));
-    for (const char* name : {"alpha", "clear", "weights", "depth", "depth_image", "colors", "values", "normals", "loss"})
+      CHECK(alone.template get<unsigned char>(name) ==
+            share(together.template get<unsigned char>(name), b, kMeshes));
+    for (const char* name : {"alpha", "clear", "weights", "depth", "depth_image", "colors",
+                             "values", "normals", "loss"})
       CHECK(alone.get(name) == share(together.get(name), b, kMeshes));
   }
 }
@@ -108,7 +114,8 @@ TEST_REAL(packed_meshes_give_what_stacked_ones_give) {
 TEST_REAL(the_order_of_faces_changes_nothing) {
   const Mesh mesh = soup(20, 5);
   Mesh turned = mesh;
-  for (size_t n = 0; n < turned.faces.size(); ++n) turned.faces[n] = mesh.faces[3 * ((7 * (n / 3) + 3) % 20) + n % 3];
+  for (size_t n = 0; n < turned.faces.size(); ++n)
+    turned.faces[n] = mesh.faces[3 * ((7 * (n / 3) + 3) % 20) + n % 3];
   Scene<T> scene = single<T>(mesh), other = single<T>(turned);
   scene.image = other.image = {24, 31};
   const Results<T> a = run_stages(scene, 1), b = run_stages(other, 1);
@@ -117,23 +124,30 @@ TEST_REAL(the_order_of_faces_changes_nothing) {
     for (int32_t& id : renamed) id = id < 0 ? id : (id / 20) * 20 + (7 * (id % 20) + 3) % 20;
     CHECK(renamed == a.template get<int32_t>(name));
   }
-  for (const char* name : {"voxels", "touched"}) CHECK(a.template get<unsigned char>(name) == b.template get<unsigned char>(name));
-  for (const char* name : {"alpha", "weights", "depth", "depth_image", "values"}) CHECK(a.get(name) == b.get(name));
-  for (const char* name : {"clear", "grad_soft", "grad_silhouette", "grad_local", "grad_edges", "grad_fragments", "grad_depth_vertices",
-                           "grad_soft_fragments"})
+  for (const char* name : {"voxels", "touched"})
+    CHECK(a.template get<unsigned char>(name) == b.template get<unsigned char>(name));
+  for (const char* name : {"alpha", "weights", "depth", "depth_image", "values"})
+    CHECK(a.get(name) == b.get(name));
+  for (const char* name : {"clear", "grad_soft", "grad_silhouette", "grad_local", "grad_edges",
+                           "grad_fragments", "grad_depth_vertices", "grad_soft_fragments"})
     CHECK(relative_difference(a.get(name), b.get(name)) < (sizeof(T) == 4 ? 1e-4 : 1e-12));
 }
 
-// With one face index map for both. Thresholds and signs that rounding changes move the gradients of a few pixels.
+// With one face index map for both. Thresholds and signs that rounding changes move the gradients
+// of a few pixels.
 TEST(float_agrees_with_double) {
   for (const Scene<float>& scene : scenes<float>()) {
     const Results<float> single = run_stages(scene, 1);
     Scene<double> wide;
     wide.vertices.assign(scene.vertices.begin(), scene.vertices.end());
-    wide.faces = scene.faces, wide.starts = scene.starts, wide.batch = scene.batch, wide.num_vertices = scene.num_vertices;
-    wide.num_faces = scene.num_faces, wide.faces_per_image = scene.faces_per_image, wide.image = scene.image, wide.seed = scene.seed;
-    wide.anti_aliasing = scene.anti_aliasing, wide.fill_back = scene.fill_back, wide.channels = scene.channels;
-    wide.per_image_values = scene.per_image_values, wide.perspective = scene.perspective, wide.distorted = scene.distorted;
+    wide.faces = scene.faces, wide.starts = scene.starts, wide.batch = scene.batch,
+    wide.num_vertices = scene.num_vertices;
+    wide.num_faces = scene.num_faces, wide.faces_per_image = scene.faces_per_image,
+    wide.image = scene.image, wide.seed = scene.seed;
+    wide.anti_aliasing = scene.anti_aliasing, wide.fill_back = scene.fill_back,
+    wide.channels = scene.channels;
+    wide.per_image_values = scene.per_image_values, wide.perspective = scene.perspective,
+    wide.distorted = scene.distorted;
     wide.near = scene.near, wide.far = scene.far, wide.eps = scene.eps;
     wide.given_face_index = single.get<int32_t>("face_index").data();
     const Results<double> twice = run_stages(wide, 1);
@@ -144,7 +158,8 @@ TEST(float_agrees_with_double) {
   }
 }
 
-// Gradient scalers look for gradients that are not finite: they must not vanish, nor spoil other images.
+// Gradient scalers look for gradients that are not finite: they must not vanish, nor spoil other
+// images.
 TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
   const std::pair<const char*, std::vector<const char*>> cases[] = {
       {"grad_alpha", {"grad_silhouette", "grad_local"}},
@@ -161,7 +176,8 @@ TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
       {"grad_slopes", {"grad_clip"}},
       {"grad_blended", {"grad_blended_colors", "grad_blended_positions"}},
       {"grad_normals", {"grad_normals_vertices"}},
-      {"grad_lit", {"grad_lit_colors", "grad_lit_normals", "grad_lit_vertices", "grad_lit_weights"}},
+      {"grad_lit",
+       {"grad_lit_colors", "grad_lit_normals", "grad_lit_vertices", "grad_lit_weights"}},
       {"grad_resolved", {"grad_edges", "grad_local_edges", "grad_image", "grad_background"}},
       {"grad_points", {"grad_world", "grad_camera", "grad_distortion"}},
       {"grad_pose", {"grad_forward", "grad_up"}},
@@ -177,19 +193,27 @@ TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
     scene.poisoned = upstream;
     const Results<T> spoiled = run_stages(scene, 2);
     for (const auto& array : std::get<0>(healthy.lists).arrays) {
-      const bool reached = std::count_if(gradients.begin(), gradients.end(), [&](const char* name) { return std::string(name) == array.name; });
+      const bool reached = std::count_if(gradients.begin(), gradients.end(), [&](const char* name) {
+        return std::string(name) == array.name;
+      });
       const std::vector<T>& values = spoiled.get(array.name);
-      const bool seen = std::any_of(values.begin(), values.end(), [](T x) { return std::isnan(x); });
-      if (seen != reached && std::string(array.name) != "grad_lights") fail(__FILE__, __LINE__, upstream, " in ", array.name, ": ", seen);
+      const bool seen =
+          std::any_of(values.begin(), values.end(), [](T x) { return std::isnan(x); });
+      if (seen != reached && std::string(array.name) != "grad_lights")
+        fail(__FILE__, __LINE__, upstream, " in ", array.name, ": ", seen);
       // The textures of images differ in size; lights are not sorted by image.
-      if (std::string(array.name) == "grad_sampled_texels" || std::string(array.name) == "grad_texels" || std::string(array.name) == "grad_lights") continue;
+      if (std::string(array.name) == "grad_sampled_texels" ||
+          std::string(array.name) == "grad_texels" || std::string(array.name) == "grad_lights")
+        continue;
       for (int64_t b = 1; b < scene.batch; ++b)
-        if (share(values, b, scene.batch) != share(array.values, b, scene.batch)) fail(__FILE__, __LINE__, upstream, " spoils ", array.name);
+        if (share(values, b, scene.batch) != share(array.values, b, scene.batch))
+          fail(__FILE__, __LINE__, upstream, " spoils ", array.name);
     }
   }
 }
 
-// Uneven sizes one after the other: scratch that is kept between calls must not leak from one into another.
+// Uneven sizes one after the other: scratch that is kept between calls must not leak from one into
+// another.
 TEST_REAL(earlier_calls_do_not_show) {
   std::vector<Results<T>> first;
   const auto scene = [](int n) {
@@ -205,8 +229,9 @@ TEST_REAL(earlier_calls_do_not_show) {
 TEST_REAL(special_values_in_every_coordinate) {
   using Limits = std::numeric_limits<T>;
   const Mesh fine = triangle({-0.9, -0.8, 2, 0.9, -0.7, 3, 0.1, 0.9, 4});
-  for (double special : {kNaN, kInf, -kInf, double(Limits::max()), -double(Limits::max()), double(Limits::denorm_min()),
-                         double(Limits::min()), 0.0, -0.0, 1e10, -1e30, 1e30})
+  for (double special :
+       {kNaN, kInf, -kInf, double(Limits::max()), -double(Limits::max()),
+        double(Limits::denorm_min()), double(Limits::min()), 0.0, -0.0, 1e10, -1e30, 1e30})
     for (int n = 0; n < 9; ++n) {
       Mesh mesh = fine;
       mesh.vertices[n] = special;
@@ -218,18 +243,19 @@ TEST_REAL(special_values_in_every_coordinate) {
 
 TEST_REAL(strange_meshes) {
   for (const std::vector<double>& corners : std::vector<std::vector<double>>{
-           {-0.9, -0.9, 1, 0, 0, 1, 0.9, 0.9, 1},                // collinear
-           {-0.9, -0.3, 1, 0.3, 0.1, 1, 0.6, 0.2, 1},            // collinear to rounding
-           {-0.9, 0, 1, 0.9, 0, 1, 0.9, 1e-7, 1},                // a sliver
-           {-1e-30, 0, 1, 1e-30, 0, 1, 0, 1e-30, 1},             // an area that underflows
-           {-1e18, -1e18, 1, 1e18, -1e18, 1, 0, 1e18, 1},        // one that is huge
-           {-1e30, -1e30, 1, 1e30, -1e30, 1, 0, 1e30, 1},        // one that overflows
-           {-0.9, -0.9, -1, 0.9, -0.9, -2, 0, 0.9, -3},          // behind the camera
-           {-0.9, -0.9, -1, 0.9, -0.9, 2, 0, 0.9, 3},            // half behind it
-           {-0.9, -0.9, 0, 0.9, -0.9, 0, 0, 0.9, 0},             // in its plane
-           {5, 5, 1, 6, 5, 1, 5, 6, 1},                          // off the screen
-           {-1.01, -0.5, 1, 0.5, -0.5, 1, -1.02, 0.5, 1},        // just over the border
-           {-0.9, -0.9, 1e18, 0.9, -0.9, 2e19, 0, 0.9, 1e20}}) {  // depths whose square overflows in float
+           {-0.9, -0.9, 1, 0, 0, 1, 0.9, 0.9, 1},          // collinear
+           {-0.9, -0.3, 1, 0.3, 0.1, 1, 0.6, 0.2, 1},      // collinear to rounding
+           {-0.9, 0, 1, 0.9, 0, 1, 0.9, 1e-7, 1},          // a sliver
+           {-1e-30, 0, 1, 1e-30, 0, 1, 0, 1e-30, 1},       // an area that underflows
+           {-1e18, -1e18, 1, 1e18, -1e18, 1, 0, 1e18, 1},  // one that is huge
+           {-1e30, -1e30, 1, 1e30, -1e30, 1, 0, 1e30, 1},  // one that overflows
+           {-0.9, -0.9, -1, 0.9, -0.9, -2, 0, 0.9, -3},    // behind the camera
+           {-0.9, -0.9, -1, 0.9, -0.9, 2, 0, 0.9, 3},      // half behind it
+           {-0.9, -0.9, 0, 0.9, -0.9, 0, 0, 0.9, 0},       // in its plane
+           {5, 5, 1, 6, 5, 1, 5, 6, 1},                    // off the screen
+           {-1.01, -0.5, 1, 0.5, -0.5, 1, -1.02, 0.5, 1},  // just over the border
+           {-0.9, -0.9, 1e18, 0.9, -0.9, 2e19, 0, 0.9,
+            1e20}}) {  // depths whose square overflows in float
     check_survives(single<T>(triangle(corners)));
     check_survives(single<T>(Mesh{corners, {0, 0, 0, 0, 0, 1, 1, 2, 1}}));  // repeated vertices
   }
@@ -246,18 +272,25 @@ TEST_REAL(strange_meshes) {
 
 TEST_REAL(strange_settings) {
   Scene<T> scene = single<T>(sphere(1, 1));
-  for (auto [near, far] : {std::pair{0.0, 100.0}, {-5.0, 100.0}, {3.0, 2.0}, {0.1, kInf}, {kNaN, kNaN}, {0.1, 1e-30}}) {
+  for (auto [near, far] : {std::pair{0.0, 100.0},
+                           {-5.0, 100.0},
+                           {3.0, 2.0},
+                           {0.1, kInf},
+                           {kNaN, kNaN},
+                           {0.1, 1e-30}}) {
     scene.near = static_cast<T>(near);
     scene.far = static_cast<T>(far);
     const Results<T> one = run_stages(scene, 1);
     CHECK_NONE(first_difference(one, run_stages(scene, 3)));
-    for (int32_t id : one.template get<int32_t>("face_index")) CHECK(id >= -1 && id < 2 * scene.num_faces);
+    for (int32_t id : one.template get<int32_t>("face_index"))
+      CHECK(id >= -1 && id < 2 * scene.num_faces);
   }
 }
 
 TEST_REAL(face_indices_that_no_rasterizer_made) {
   for (uint64_t seed = 0; seed < 4; ++seed) {
-    Scene<T> scene = seed % 2 ? stack<T>({soup(5, seed), soup(5, seed + 1)}, true) : pack<T>({soup(5, seed), Mesh{}, sphere(1, seed)});
+    Scene<T> scene = seed % 2 ? stack<T>({soup(5, seed), soup(5, seed + 1)}, true)
+                              : pack<T>({soup(5, seed), Mesh{}, sphere(1, seed)});
     scene.seed = seed;
     scene.foreign_face_index = true;
     if (seed % 3 == 0) scene.vertices[seed % 9] = T(seed % 2 ? kNaN : -kInf);
