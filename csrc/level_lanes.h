@@ -10,8 +10,6 @@ struct Halves {
   V low, high;
 };
 
-#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
-
 #if defined(__AVX512F__) && !NMR_AVX2
 constexpr int64_t kRegisterBytes = 64;
 #elif defined(__AVX2__) || NMR_AVX2
@@ -25,49 +23,11 @@ template <class E, int64_t N, bool fits = N * static_cast<int64_t>(sizeof(E)) <=
 struct LaneType {
   typedef E Type __attribute__((vector_size(N * sizeof(E))));
 };
-template <class V, class E>
-NMR_INLINE V splat_register(E x) {
-  return x - V{};
-}
-template <class To, class V>
-NMR_INLINE To convert_register(V v) {
-  return __builtin_convertvector(v, To);
-}
-
-#else
-
-// One value, for compilers without vector types.
-template <class E>
-struct One {
-  E value;
-};
-template <class E, int64_t N, bool fits = N == 1>
-struct LaneType {
-  using Type = One<E>;
-};
-template <class V, class E>
-NMR_INLINE V splat_register(E x) {
-  return {x};
-}
-template <class To, class V>
-NMR_INLINE To convert_register(V v) {
-  return {static_cast<decltype(To::value)>(v.value)};
-}
-
-#endif
-
 template <class E, int64_t N>
 struct LaneType<E, N, false> {
   using Type = Halves<typename LaneType<E, N / 2>::Type>;
 };
 
-#if defined(__clang__)
-typedef long long Mask64;  // result of comparing vectors of double
-#else
-typedef int64_t Mask64;
-#endif
-template <class T>
-using MaskElement = std::conditional_t<sizeof(T) == 8, Mask64, int32_t>;
 template <class T>
 using Lanes = typename LaneType<T, kLanes>::Type;
 using Lanes32 = Lanes<int32_t>;
@@ -77,29 +37,12 @@ struct IsHalves : std::false_type {};
 template <class V>
 struct IsHalves<Halves<V>> : std::true_type {};
 
-#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
-#define NMR_ONE_OPERATOR(op)
-#define NMR_ONE_COMPARISON(op)
-#else
-#define NMR_ONE_OPERATOR(op)                          \
-  template <class E>                                  \
-  NMR_INLINE One<E> operator op(One<E> a, One<E> b) { \
-    return {static_cast<E>(a.value op b.value)};      \
-  }
-#define NMR_ONE_COMPARISON(op)                                     \
-  template <class E>                                               \
-  NMR_INLINE One<MaskElement<E>> operator op(One<E> a, One<E> b) { \
-    return {a.value op b.value ? -1 : 0};                          \
-  }
-#endif
 #define NMR_LANE_OPERATOR(op)                                  \
-  NMR_ONE_OPERATOR(op)                                         \
   template <class V>                                           \
   NMR_INLINE Halves<V> operator op(Halves<V> a, Halves<V> b) { \
     return {a.low op b.low, a.high op b.high};                 \
   }
 #define NMR_LANE_COMPARISON(op)                                                \
-  NMR_ONE_COMPARISON(op)                                                       \
   template <class V>                                                           \
   NMR_INLINE auto operator op(Halves<V> a, Halves<V> b) {                      \
     return Halves<decltype(a.low op b.low)>{a.low op b.low, a.high op b.high}; \
@@ -117,8 +60,6 @@ NMR_LANE_COMPARISON(>=)
 NMR_LANE_COMPARISON(==)
 #undef NMR_LANE_OPERATOR
 #undef NMR_LANE_COMPARISON
-#undef NMR_ONE_OPERATOR
-#undef NMR_ONE_COMPARISON
 
 // What a comparison gives: all bits of a lane are set or none.
 template <class T>
@@ -142,7 +83,7 @@ NMR_INLINE V splat_as(E x) {
     const auto half = splat_as<decltype(V::low)>(x);
     return {half, half};
   } else {
-    return splat_register<V>(x);
+    return x - V{};
   }
 }
 template <class T>
@@ -162,11 +103,7 @@ NMR_INLINE V select(M mask, V yes, V no) {
   if constexpr (IsHalves<V>::value)
     return {select(mask.low, yes.low, no.low), select(mask.high, yes.high, no.high)};
   else
-#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
     return mask ? yes : no;
-#else
-    return mask.value ? yes : no;
-#endif
 }
 
 // The values if the mask is set, else +0, for NaN as well.
@@ -175,11 +112,7 @@ NMR_INLINE V keep(M mask, V v) {
   if constexpr (IsHalves<V>::value)
     return {keep(mask.low, v.low), keep(mask.high, v.high)};
   else
-#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
     return (V)(mask & (M)v);
-#else
-    return mask.value ? v : V{0};
-#endif
 }
 
 // a < b ? a : b and a > b ? a : b, as one instruction if the processor has it.
@@ -215,17 +148,12 @@ template <class M>
 NMR_INLINE M without(M a, M b) {
   if constexpr (IsHalves<M>::value)
     return {without(a.low, b.low), without(a.high, b.high)};
-  else
-#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
-  {
+  else {
 #if defined(__AVX2__) || NMR_AVX2
     if constexpr (sizeof(M) == 32) return (M)_mm256_andnot_si256((__m256i)b, (__m256i)a);
 #endif
     return a & ~b;
   }
-#else
-    return {a.value & ~b.value};
-#endif
 }
 
 // |x|
@@ -276,7 +204,7 @@ NMR_INLINE To convert_lanes(V v) {
     std::memcpy(&result, half, sizeof result);
     return result;
   } else {
-    return convert_register<To>(v);
+    return __builtin_convertvector(v, To);
   }
 }
 template <class T>
@@ -303,11 +231,7 @@ constexpr int lane_count() {
   if constexpr (IsHalves<V>::value)
     return 2 * lane_count<decltype(V::low)>();
   else
-#if defined(__GNUC__) && !defined(NMR_NO_VECTOR_TYPES)
     return sizeof(V) / sizeof(std::declval<V>()[0]);
-#else
-    return 1;
-#endif
 }
 
 // Bit k is set if lane k of the mask is.
@@ -316,9 +240,6 @@ NMR_INLINE uint32_t lane_bits(M mask) {
   if constexpr (IsHalves<M>::value) {
     return lane_bits(mask.low) | lane_bits(mask.high) << lane_count<decltype(mask.low)>();
   } else {
-#if !defined(__GNUC__) || defined(NMR_NO_VECTOR_TYPES)
-    return mask.value & 1;
-#else
     [[maybe_unused]] constexpr size_t bytes = sizeof mask, lane_bytes = bytes / lane_count<M>();
 #if defined(__AVX2__) || NMR_AVX2
     if constexpr (bytes == 32 && lane_bytes == 4) return _mm256_movemask_ps((__m256)mask);
@@ -331,7 +252,6 @@ NMR_INLINE uint32_t lane_bits(M mask) {
     uint32_t bits = 0;
     for (int k = 0; k < lane_count<M>(); ++k) bits |= static_cast<uint32_t>(mask[k] & 1) << k;
     return bits;
-#endif
   }
 }
 
@@ -396,7 +316,7 @@ NMR_INLINE Lanes<T> floor_lanes(Lanes<T> x) {
   return select(rounded > x, rounded - splat(T(1)), rounded);
 }
 
-#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+#if defined(__SSE2__)
 // Swaps rows and columns of four values, in each group of four lanes.
 NMR_INLINE void transpose_quads(__m128 (&q)[4]) { _MM_TRANSPOSE4_PS(q[0], q[1], q[2], q[3]); }
 #if defined(__AVX2__) || NMR_AVX2
@@ -418,7 +338,7 @@ NMR_INLINE void transpose_quads(__m256d (&q)[4]) {
 // Four numbers of four or eight bytes per lane: column[c] gets row[k][c] in lane k.
 template <class T>
 NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4]) {
-#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+#if defined(__SSE2__)
   if constexpr (sizeof(T) == 4) {
     const auto quad = [&](int64_t k) {
       return _mm_loadu_ps(reinterpret_cast<const float*>(row[k]));
@@ -465,7 +385,7 @@ NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4])
 // The other way round: row k of rows, [8, 4], gets lane k of the columns.
 template <class T>
 NMR_INLINE void store_quads(const Lanes<T> (&column)[4], T (&rows)[kLanes][4]) {
-#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+#if defined(__SSE2__)
   if constexpr (std::is_same_v<T, float>) {
 #if defined(__AVX2__) || NMR_AVX2
     __m256 q[4];
@@ -542,7 +462,7 @@ struct LaneArray {
 // + 7)).
 template <class T>
 NMR_INLINE void add_lane_sums(Lanes<T> p, Lanes<T> q, T* sums) {
-#if defined(__SSE2__) && !defined(NMR_NO_VECTOR_TYPES)
+#if defined(__SSE2__)
   if constexpr (std::is_same_v<T, float>) {
     __m128 low[2], high[2];
     if constexpr (IsHalves<Lanes<T>>::value) {

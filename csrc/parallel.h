@@ -25,26 +25,12 @@
 #define NMR_LEVELS 0
 #endif
 
-#if defined(__GNUC__)
 #define NMR_INLINE inline __attribute__((always_inline))
-#elif defined(_MSC_VER)
-#define NMR_INLINE __forceinline
-#else
-#define NMR_INLINE inline
-#endif
 
 namespace nmr {
 
 // Number of the lowest bit that is set; bits must not be 0.
-NMR_INLINE int64_t lowest_bit(uint64_t bits) {
-#if defined(__GNUC__)
-  return __builtin_ctzll(bits);
-#else
-  int64_t n = 0;
-  while (!(bits >> n & 1)) ++n;
-  return n;
-#endif
-}
+NMR_INLINE int64_t lowest_bit(uint64_t bits) { return __builtin_ctzll(bits); }
 
 // The highest level of this processor that inner loops are compiled for (levels.h): 4 for
 // x86-64-v4, 3 for v3, else 1.

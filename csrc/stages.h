@@ -27,9 +27,9 @@ inline Size raster_of(Size image, bool anti_aliasing) {
 // depth.
 template <class T>
 struct MeshBatch {
-  const T* vertices;     // [B, V, 3], or packed [N, 3]
-  const int64_t* faces;  // [F, 3] shared, [B, F, 3], or packed [M, 3]; vertex numbers count from
-                         // the mesh's own first vertex
+  const T* vertices;      // [B, V, 3], or packed [N, 3]
+  const int64_t* faces;   // [F, 3] shared, [B, F, 3], or packed [M, 3]; vertex numbers count from
+                          // the mesh's own first vertex
   int64_t batch;          // B
   int64_t num_vertices;   // V (packed: N)
   int64_t num_faces;      // F (packed: M)
@@ -318,8 +318,8 @@ struct Interpolate {
   int64_t num_attributes;   // N
   int64_t channels;         // C
   const int64_t* corners;   // [F, 3] shared, [B, F, 3], or packed [M, 3]: rows of attributes,
-                           // counted from the mesh's first
-  int64_t num_faces;  // F (packed: M)
+                            // counted from the mesh's first
+  int64_t num_faces;        // F (packed: M)
   bool corners_per_image;
   const int64_t*
       starts;  // packed: [B + 1, 2], first attribute row and first face of each mesh; else nullptr
@@ -466,8 +466,8 @@ enum class Light : int {
 // 1, and c = point point_color / (1 + falloff |position - x|^2).
 template <class T>
 struct Lit {
-  Interpolate<T> at;  // attributes: vertices in world space, 3 channels, corners: the faces;
-                      // grad_attributes, grad_weights
+  Interpolate<T> at;     // attributes: vertices in world space, 3 channels, corners: the faces;
+                         // grad_attributes, grad_weights
   const T* normals;      // [B or 1, F, 3], packed [M, 3]; smooth: like the vertices
   int64_t normal_batch;  // 1 or B when not packed
   bool smooth;  // normals of vertices, interpolated: sum of b_k n_k, divided by its length or 1e-5

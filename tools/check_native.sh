@@ -70,7 +70,7 @@ check_count-base() { count x86-64 "$@"; }
 
 check_variants() { # on x86-64
     local variant name compiler flags run first=
-    for variant in g++ "g++ -DNMR_NO_VECTOR_TYPES" "g++ -DNMR_MULTIVERSION" "g++ -march=x86-64-v3" "g++ -march=x86-64-v4" \
+    for variant in g++ "g++ -DNMR_MULTIVERSION" "g++ -march=x86-64-v3" "g++ -march=x86-64-v4" \
         clang++ "clang++ -march=x86-64-v3" "clang++ -march=x86-64-v4" aarch64-linux-gnu-g++; do
         read -r compiler flags <<<"$variant"
         name=${variant//[ =]/_} run=()

@@ -16,6 +16,7 @@ setup test
 step "Style"
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
+.venv/bin/clang-format --dry-run --Werror csrc/*.{cpp,h} csrc/bindings/* tests/csrc/*.{cpp,h}
 step "Tests"
 check_room "${TMPDIR:-/tmp}" $room
 # The script pytest, not python -m pytest, which would import the source folder in place of the installed package.
