@@ -1,9 +1,9 @@
-"""Reads glTF 2.0, as JSON (.gltf) or binary (.glb): the triangles of the default scene in their rest pose."""
+"""Reads glTF 2.0, as JSON (.gltf) or binary (.glb): the triangles of the default scene, not animated."""
 
 import base64
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import unquote
 
@@ -35,12 +35,23 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
             raise ValueError(f"it needs the extension {name}, which is not supported; save it without")
     accessors = _Accessors(tree, binary, read_other)
     vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
-    for number, matrix in _placed_meshes(tree):
-        for primitive in tree["meshes"][number]["primitives"]:
+    places = _places(tree)
+    for node, place in [(tree["nodes"][number], place) for number, place in places.items()]:
+        mesh = tree["meshes"][_index(node["mesh"])] if "mesh" in node else {"primitives": []}
+        weights = node.get("weights", mesh.get("weights", []))
+        for primitive in mesh["primitives"]:
             if primitive.get("mode", 4) < 4 or "POSITION" not in primitive["attributes"]:
                 continue
             _refuse(primitive)
             points = accessors.read(primitive["attributes"]["POSITION"])
+            for weight, target in zip(weights, primitive.get("targets", []), strict=False):
+                if weight and "POSITION" in target:
+                    points = points + weight * accessors.read(target["POSITION"])
+            if "skin" in node:
+                skin = tree["skins"][_index(node["skin"])]
+                points = _skinned(points, primitive["attributes"], skin, accessors, places)
+            else:
+                points = points @ place[:3, :3].T + place[:3, 3]
             indices = np.arange(len(points))
             if "indices" in primitive:
                 indices = accessors.read(primitive["indices"])[:, 0].astype(np.int64)
@@ -48,7 +59,7 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
                 raise ValueError(f"a face refers to vertex {indices.max()}, but its mesh has {len(points)}")
             used, indices = np.unique(indices, return_inverse=True)  # primitives may share one large array
             faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
-            vertices.append(points[used] @ matrix[:3, :3].T + matrix[:3, 3])
+            vertices.append(points[used])
             total += len(used)
     return np.concatenate(vertices), np.concatenate(faces)
 
@@ -141,25 +152,43 @@ def _index(number: int) -> int:
     return number
 
 
-def _placed_meshes(tree: dict[str, Any]) -> Iterator[tuple[int, np.ndarray]]:
-    """Each mesh of the default scene (of all nodes, if there is no scene), and its matrix [4, 4]."""
+def _places(tree: dict[str, Any]) -> dict[int, np.ndarray]:
+    """The matrix [4, 4] of each node of the default scene (of all nodes, if there is no scene)."""
     nodes = tree.get("nodes", [])
     children = {child for node in nodes for child in node.get("children", [])}
     roots = [number for number in range(len(nodes)) if number not in children]
     if tree.get("scenes"):
         roots = tree["scenes"][_index(tree.get("scene", 0))].get("nodes", [])
-    waiting, seen = [(number, np.eye(4)) for number in reversed(roots)], set()
+    waiting, places = [(number, np.eye(4)) for number in reversed(roots)], {}
     while waiting:
         number, parent = waiting.pop()
-        if number in seen:
+        if number in places:
             raise ValueError(f"node {number} has several parents")
-        seen.add(number)
         node = nodes[_index(number)]
         _refuse(node)
-        matrix = parent @ _matrix(node)
-        if "mesh" in node:
-            yield _index(node["mesh"]), matrix
-        waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+        places[number] = parent @ _matrix(node)
+        waiting += [(child, places[number]) for child in reversed(node.get("children", []))]
+    return places
+
+
+def _skinned(
+    points: np.ndarray,
+    attributes: dict[str, int],
+    skin: dict[str, Any],
+    accessors: _Accessors,
+    places: dict[int, np.ndarray],
+) -> np.ndarray:
+    """Points [N, 3] where the joints of their skin put them; the place of the mesh itself has no effect."""
+    joints = np.stack([places[number] for number in skin["joints"]])
+    if "inverseBindMatrices" in skin:
+        joints = joints @ accessors.read(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    moved = np.zeros_like(points)
+    for which in (name for name in attributes if name.startswith("JOINTS_")):
+        weights = accessors.read(attributes[which.replace("JOINTS", "WEIGHTS")])
+        for joint, weight in zip(accessors.read(attributes[which]).T, weights.T, strict=True):
+            matrices = joints[joint]
+            moved += weight[:, None] * ((matrices[:, :3, :3] @ points[:, :, None])[:, :, 0] + matrices[:, :3, 3])
+    return moved
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

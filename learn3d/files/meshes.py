@@ -44,13 +44,16 @@ def read_off(content: bytes) -> Triangles:
     """Read an OFF file, also with colours, normals or texture coordinates behind the corners."""
     lines = [line for line in re.sub(rb"#[^\r\n]*", b"", content).splitlines() if line.strip()]
     head, *counts = lines[0].split() if lines else [b""]
-    if not re.fullmatch(rb"(ST)?C?N?OFF", head.removeprefix(b"\xef\xbb\xbf")) or b"BINARY" in counts:
+    head = head.removeprefix(b"\xef\xbb\xbf")
+    if not re.fullmatch(rb"(ST)?C?N?OFF", head) or b"BINARY" in counts:
         raise ValueError("it does not begin with OFF (or COFF, NOFF, STOFF), as a text file does")
     first = 1
     if not counts:
         first, counts = 2, lines[1].split()
     num_vertices, num_faces = int(counts[0]), int(counts[1])
     rows = lines[first : first + num_vertices + num_faces]
+    if len(rows) < num_vertices + num_faces and head == b"OFF":
+        rows = _off_rows(b" ".join(lines).split()[4:], num_vertices, num_faces)
     if len(rows) < num_vertices + num_faces:
         raise EOFError(f"it has {len(rows)} lines; its header promises {num_vertices} corners and {num_faces} faces")
     vertices = np.array([line.split()[:3] for line in rows[:num_vertices]], np.float64).reshape(-1, 3)
@@ -60,6 +63,18 @@ def read_off(content: bytes) -> Triangles:
         sizes.append(int(size))
         corners += [int(word) for word in words[: sizes[-1]]]
     return _cut(vertices, np.array(corners, np.int64), np.array(sizes, np.int64))
+
+
+def _off_rows(words: list[bytes], num_vertices: int, num_faces: int) -> list[bytes]:
+    """The words of a plain OFF file as rows of a corner or a face, as far as they go."""
+    at, rows = 0, []
+    while len(rows) < num_vertices + num_faces and at < len(words):
+        size = 3 if len(rows) < num_vertices else 1 + int(words[at])
+        if at + size > len(words):
+            break
+        rows.append(b" ".join(words[at : at + size]))
+        at += size
+    return rows
 
 
 def read_ply(content: bytes) -> Triangles:

@@ -129,9 +129,11 @@ def _finish(worker: _Worker, calls: list[Call]) -> list[Any]:
         status = worker.end()
     if len(calls) > 1:
         return [next(read_all([[call]]))[0] for call in calls]
-    slow = f"takes more than {calls[0].seconds:g} seconds of processor time"
-    fault = slow if status == -signal.SIGPROF else f"crashed its process (status {status})"
-    return [DamagedFile(calls[0].path, f"reading it {fault}; expected {calls[0].wanted}. {FETCH_AGAIN}")]
+    fault, advice = f"crashed its process (status {status})", FETCH_AGAIN
+    if status == -signal.SIGPROF:
+        fault = f"takes more than {calls[0].seconds:g} seconds of processor time"
+        advice = "Make a smaller file of it, or leave it out"
+    return [DamagedFile(calls[0].path, f"reading it {fault}; expected {calls[0].wanted}. {advice}")]
 
 
 _workers: set[_Worker] = set()  # all living workers

@@ -6,16 +6,17 @@ MESHES=2000 in the environment makes more of them than the usual few.
 from __future__ import annotations
 
 import base64
-import importlib.util
 import json
 import os
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from learn3d.files import formats
 from learn3d.files.formats import read_mesh
 from learn3d.files.reading import FETCH_AGAIN, DamagedFile
 
@@ -197,7 +198,8 @@ def write_trimesh(path: Path, parts: Parts, rng: np.random.Generator) -> None:
 
 
 def write_dae(path: Path, parts: Parts, rng: np.random.Generator) -> None:
-    collada = pytest.importorskip("collada")
+    import collada
+
     document = collada.Collada()
     nodes = []
     for k, (vertices, polygons) in enumerate(parts):
@@ -320,8 +322,52 @@ def test_meshes_that_are_refused(tmp_path: Path, name: str) -> None:
     assert FETCH_AGAIN not in str(error.value)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("collada") is not None, reason="pycollada is installed")
-def test_a_missing_package_is_named(tmp_path: Path) -> None:
-    (tmp_path / "a.dae").write_text("<COLLADA/>")
-    with pytest.raises(DamagedFile, match="run `pip install pycollada`"):
-        read_mesh(tmp_path / "a.dae")
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "collada", None)
+    path = tmp_path / "a.dae"
+    path.write_text("<COLLADA/>")
+    with path.open("rb") as file, pytest.raises(ValueError, match="run `pip install pycollada`"):
+        formats._triangles(path, file)
+
+
+def test_off_files_need_no_lines(tmp_path: Path) -> None:
+    (tmp_path / "a.off").write_text("OFF 4 2 0 0 0 0 1 0 0 1 1 0\n0 1 0 3 0 1 2\n3 0 2 3")
+    mesh = read_mesh(tmp_path / "a.off")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert mesh.vertices[2].tolist() == [1, 1, 0]
+
+
+def test_skins_and_morph_targets_move_corners(tmp_path: Path) -> None:
+    """Joint 0 is moved by 5 in x. Joint 1 is at y = 2, scaled by 2, and was bound there unscaled."""
+    corners = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    arrays = {
+        "POSITION": corners,
+        "JOINTS_0": np.uint8([[0, 1, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]]),
+        "WEIGHTS_0": np.float32([[0.5, 0.5, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]]),
+        "target": np.float32([[0, 0, 0], [0, 0, 4], [0, 0, 0]]),
+        "inverse": np.stack([np.eye(4), [[1, 0, 0, 0], [0, 1, 0, -2], [0, 0, 1, 0], [0, 0, 0, 1]]]),
+    }
+    arrays["inverse"] = arrays["inverse"].swapaxes(1, 2).astype(np.float32).reshape(2, 16)
+    content, views, accessors = b"", [], []
+    for values in arrays.values():
+        kind = {3: "VEC3", 4: "VEC4", 16: "MAT4"}[values.shape[1]]
+        component = 5121 if values.dtype == np.uint8 else 5126
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": values.nbytes})
+        accessors.append({"bufferView": len(accessors), "componentType": component, "count": len(values), "type": kind})
+        content += values.tobytes()
+    primitive = {"attributes": {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}, "targets": [{"POSITION": 3}]}
+    tree = {
+        "buffers": [{"byteLength": len(content), "uri": f"data:;base64,{base64.b64encode(content).decode()}"}],
+        "bufferViews": views,
+        "accessors": accessors,
+        "meshes": [{"primitives": [primitive], "weights": [0.5]}],
+        "skins": [{"joints": [1, 2], "inverseBindMatrices": 4}],
+        "nodes": [
+            {"mesh": 0, "skin": 0, "translation": [100, 0, 0]},  # has no effect
+            {"translation": [5, 0, 0]},
+            {"translation": [0, 2, 0], "scale": [2, 2, 2]},
+        ],
+    }
+    (tmp_path / "a.gltf").write_text(gltf(**tree))
+    found = read_mesh(tmp_path / "a.gltf").vertices
+    assert found == pytest.approx(np.array([[2.5, -1, 0], [6, 0, 2], [0, 0, 0]]))

@@ -32,7 +32,7 @@ def path(tmp_path: Path) -> Path:
         (strange.crash, "crashed"),
         (strange.eat, "memory"),
         (strange.fail, "a strange word"),
-        (strange.spin, "processor time"),
+        (strange.spin, "processor time; expected a spoon. Make a smaller file"),
     ],
 )
 def test_what_goes_wrong_is_one_sentence_and_the_next_file_is_read(path: Path, function: object, said: str) -> None:
