@@ -152,7 +152,7 @@ class Reconstruct(OnDataset):
     output: Path
     """Folder for the results: a mesh, a turntable GIF and a PNG strip of each image."""
     category: str | None = None
-    """Category of the object in the image files (if not given: recognized), or of the data set (if not given: the run's)."""
+    """Category of the object in the image files (default: recognized), or of the data set (default: the run's)."""
     guesses: Count = 1
     """Largest number of different shapes for each image file, the best first; a model without templates makes one."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
