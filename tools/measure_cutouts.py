@@ -1,6 +1,6 @@
 """Measures how well objects are cut out of photographs with walls, floors and shadows.
 
-python tools/measure_cutouts.py --images 40 --seed 1 --sheet cutouts.png
+python tools/measure_cutouts.py --images 40 --seed 2 --sheet cutouts.png
 """
 
 from collections.abc import Iterator
@@ -177,7 +177,7 @@ def iou(found: np.ndarray, mask: np.ndarray) -> float:
     return float(((found > 127) & mask).sum() / ((found > 127) | mask).sum())
 
 
-def main(images: int = 40, seed: int = 1, sheet: Path | None = None) -> None:
+def main(images: int = 40, seed: int = 2, sheet: Path | None = None) -> None:
     """Print the share of outlines with an IoU above 0.85, found without a hand and with a box.
 
     The objects are generated, before drawn rooms and photographs out of scikit-image and scikit-learn.

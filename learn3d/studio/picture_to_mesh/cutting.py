@@ -4,7 +4,7 @@ import functools
 import importlib.util
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from skimage.color import rgb2lab
 from skimage.filters import threshold_otsu
+from skimage.segmentation import felzenszwalb
 
 from learn3d.data.masks import keep_object, mask_box
 
@@ -39,6 +40,9 @@ _TOUCHED = 0.03  # share of a side of the picture, from which the object touches
 _PREFERRED = 0.05  # by which GrabCut from the whole region must be judged better
 _FILLED = 0.75  # share of its box, below which an object in a given box is not the whole one
 _PROBABLE = -0.6  # mark of an object that is probably the right one
+_RECTANGLE, _UNLIKELY = 0.9, 0.3  # share of its box that an upright rectangle fills; by which its mark is worse
+_FRAME, _FRAME_FILL = 0.05, 0.7  # least areas of a picture on the wall, over those of the mask and of its own box
+_FRAME_WIDTH = 5  # pixels
 _OFF_CENTRE = 0.6  # weight of the distance from the centre against the judgement
 _PARTS, _PART = 3, 0.1  # parts that may be the object, and their least area over that of the largest
 _RAGGED = 600  # squared length of an outline over its area, in pixels; a thin-legged chair has 200
@@ -244,16 +248,31 @@ def _extent(inside: np.ndarray) -> int:
     return np.count_nonzero(inside.any(axis=0)) * np.count_nonzero(inside.any(axis=1))
 
 
+def _without_frames(patches: np.ndarray, inside: np.ndarray) -> Iterator[np.ndarray]:
+    """A mask, bool [H, W], without each upright rectangle among the numbered patches of one colour [H, W].
+
+    It may be a picture or a window that the object touches or covers in part.
+    """
+    for number, box in enumerate(ndimage.find_objects(patches), 1):
+        part = (patches[box] == number) & inside[box]
+        if np.count_nonzero(part) > max(_FRAME * np.count_nonzero(inside), _FRAME_FILL * part.size):
+            rest = inside & ~ndimage.binary_dilation(patches == number, iterations=_FRAME_WIDTH)
+            yield _only_object(rest)
+
+
 def _choose(colors: np.ndarray, region: np.ndarray, whole: np.ndarray, judge: Judge | None) -> np.ndarray:
     """The most probable object, bool [H, W], in a region: `whole`, or a part that is unlike the background.
 
     If none is probable, it is looked for once more beside these parts.
     """
+    patches = felzenszwalb(colors, scale=100, min_size=50) + 1
     masks, marks = [whole], [_mark(colors, whole, judge) - _PREFERRED]
     for _ in range(2):
         for part in _parts(_separate(colors, region)):
-            masks.append(_only_object(_separate(colors, _around(part))))
-            marks.append(_mark(colors, masks[-1], judge))
+            mask = _only_object(_separate(colors, _around(part)))
+            for candidate in (mask, *_without_frames(patches, mask)):
+                masks.append(candidate)
+                marks.append(_mark(colors, candidate, judge))
             region = region & ~_around(part)
         if max(marks) > _PROBABLE or not region.any():
             break
@@ -265,7 +284,8 @@ def _mark(colors: np.ndarray, inside: np.ndarray, judge: Judge | None) -> float:
     if not inside.any():
         return -math.inf
     mark = judge(colors, 255 * inside.astype(np.uint8)) if judge else float(inside.mean())
-    return mark - _OFF_CENTRE * _offset(inside)
+    is_rectangle = np.count_nonzero(inside) > _RECTANGLE * _extent(inside)
+    return mark - _OFF_CENTRE * _offset(inside) - _UNLIKELY * is_rectangle
 
 
 def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.ndarray:

@@ -119,7 +119,7 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(page, box) -> None:
     assert (added != first).any(axis=2)[: len(first) // 5].any(), "an outline around the stroke"
     removed = drag("Remove", (0.05, 0.1), (0.25, 0.1))
     assert np.abs(removed - first).mean() < np.abs(added - first).mean()
-    assert np.abs(drag("Box", (0.2, 0.2), (0.8, 0.8)) - first).mean() < 2
+    assert np.abs(drag("Box", (0.2, 0.2), (0.8, 0.8)) - first).mean() < 3, "at most a pixel"
 
 
 def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(page, box, tmp_path) -> None:

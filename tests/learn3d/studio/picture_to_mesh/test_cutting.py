@@ -171,3 +171,17 @@ def test_rembg_is_used_if_installed_and_says_so(room, finished_run, tmp_path: Pa
     status, _, said = command(*words)
     assert status == 1 and "rembg does not cut the object out (no route to host); give a box or a mask" in said
     cutting._rembg_session.cache_clear()
+
+
+def test_a_picture_on_the_wall_is_left_out_though_the_object_touches_it(room) -> None:
+    pytest.importorskip("cv2", reason="needs the extra photos")
+    colors, inside = room
+    colors = colors.copy()
+    colors[80:141, 170:240] = np.where(inside[80:141, 170:240, None], colors[80:141, 170:240], (60, 110, 70))
+
+    def judge(seen: np.ndarray, mask: np.ndarray) -> float:
+        """A stand-in for a model that knows this table."""
+        table = Image.fromarray(255 * inside.astype(np.uint8)).resize(mask.shape[::-1])
+        return overlap(mask, np.asarray(table) > 127) - 1
+
+    assert overlap(find_outline(colors, judge=judge).mask, inside) > 0.9
