@@ -98,6 +98,20 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
         assert sent[-1] == {"error": "No object was found. Draw a box around it, or paint it with Add."}
 
 
+def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> None:
+    colors = np.full((100, 120, 3), 200, np.uint8)
+    colors[40:48] = (150, 30, 30)  # from side to side
+    unknown = np.full((100, 120), 255, np.uint8)
+    sent: list[dict] = []
+    models = {"my run": load_model(finished_run)}
+    pictures.make_meshes(models, pictures.Picture(colors, unknown), sent.append)
+    shown, error = sent
+    assert shown["how"] == "as all that differs from the plain background"
+    assert np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)).sum() == 8 * 120
+    asked = "Is this the object? Its outline touches 2 sides of the picture. Draw a box around it (Box)."
+    assert error == {"error": asked}
+
+
 def test_the_side_of_the_input_is_found() -> None:
     mesh = make_shape("chair", np.random.default_rng(6))
     vertices, faces = torch.from_numpy(mesh.vertices @ mesh_to_object("y", "z").T).float(), torch.from_numpy(mesh.faces)
