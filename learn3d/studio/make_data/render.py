@@ -66,13 +66,17 @@ def report_files(category: str) -> tuple[str, str]:
 def make_dataset(config: DatasetConfig) -> DatasetReport:
     """Make the data set that `config` describes, and return a report. Unusable meshes are skipped.
 
-    Writes the layout's files (see `writers`) for every split that is not empty, `{synset}_card.json`
-    (settings, splits, skipped meshes) and `{synset}_contact.png` (see `sheets.LEGEND`). All files get their final names
-    together, after the last one is complete.
+    Writes the layout's files (see `writers`) for every split that is not empty,
+    `{synset}_card.json` (settings, splits, skipped meshes) and `{synset}_contact.png` (see
+    `sheets.LEGEND`). All files get their final names together, after the last one is complete.
 
-    Raises ValueError (no usable mesh), FileExistsError (the folder has files of the category and `overwrite` is False).
+    Raises ValueError (no usable mesh), FileExistsError (the folder has files of the category and
+    `overwrite` is False).
     """
-    items, writer = [item for of_split in split_items(config).values() for item in of_split], WRITERS[config.layout]
+    items, writer = (
+        [item for of_split in split_items(config).values() for item in of_split],
+        WRITERS[config.layout],
+    )
     paths = [*writer.paths(config.category), *report_files(config.category)]
     there = [path for path in paths if (config.output / path).exists()]
     if there and not config.overwrite:
@@ -91,11 +95,15 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
 
 
 def render_meshes(
-    config: DatasetConfig, items: Iterable[Item], made: list[dict], rows: dict[str, list[list[np.ndarray]]]
+    config: DatasetConfig,
+    items: Iterable[Item],
+    made: list[dict],
+    rows: dict[str, list[list[np.ndarray]]],
 ) -> Iterator[RenderedObject]:
     """Render the objects of each mesh, and add its entry of `DatasetReport.meshes` to `made`.
 
-    rows: rows of the contact sheet by split; the first objects of these splits are added, up to `ROWS` of each.
+    rows: rows of the contact sheet by split; the first objects of these splits are added, up to
+    `ROWS` of each.
     """
     for item in items:
         mesh, objects = {"name": item.file, "split": item.split}, []
@@ -103,7 +111,10 @@ def render_meshes(
             raw = check(item.read())
             objects = [_render(config, raw, item, copy) for copy in range(item.copies)]
             mesh["objects"] = [rendered.name for rendered in objects]
-        except (ValueError, MissingFile) as error:  # a damaged or invisible mesh must not end the whole data set
+        except (
+            ValueError,
+            MissingFile,
+        ) as error:  # a damaged or invisible mesh must not end the whole data set
             mesh["reason"] = getattr(error, "message", str(error))
         made.append(mesh)
         if objects and item.split in rows and len(rows[item.split]) < ROWS:
@@ -115,7 +126,8 @@ def render_meshes(
 def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> RenderedObject:
     """Scale, place, colour and render copy `copy` of a mesh; copy 0 keeps its proportions.
 
-    Random values depend on `config.seed`, `item.number` and `copy` alone. Raises ValueError if all views are empty.
+    Random values depend on `config.seed`, `item.number` and `copy` alone. Raises ValueError if
+    all views are empty.
     """
     writer, rng = WRITERS[config.layout], np.random.default_rng([config.seed, 1, item.number, copy])
     scale = rng.uniform(*SCALE_RANGE, size=3)
@@ -129,7 +141,10 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
     lights = studio_lights((writer.turn @ KEY_LIGHT).tolist())
     if writer.natural:
         color, lights = natural_look(placed, mesh.faces, rng)
-    vertices, faces = torch.as_tensor(placed, dtype=torch.float32).contiguous(), torch.from_numpy(mesh.faces)
+    vertices, faces = (
+        torch.as_tensor(placed, dtype=torch.float32).contiguous(),
+        torch.from_numpy(mesh.faces),
+    )
     rgb, alpha = photograph(vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights)
     if not alpha.any():
         raise ValueError("no view shows it: its faces have no area, or are smaller than a pixel")
@@ -141,9 +156,10 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
 def make_shards(config: DatasetConfig) -> int:
     """Make the data set that `config` describes as shards in `output/SYNSET/SPLIT`, each by a worker.
 
-    A shard depends on the settings and its meshes alone, so those of a killed call are kept. The report has the same
-    files as that of `make_dataset`. Returns the exit status: 0, 1 if a shard failed (the next call tries it again), 130
-    after a signal. Raises ValueError (no usable mesh, shards of other settings in the folder) and OSError.
+    A shard depends on the settings and its meshes alone, so those of a killed call are kept. The
+    report has the same files as that of `make_dataset`. Returns the exit status: 0, 1 if a shard
+    failed (the next call tries it again), 130 after a signal. Raises ValueError (no usable mesh,
+    shards of other settings in the folder) and OSError.
     """
     folder, splits = config.output / synset_of(config.category), split_items(config)
     _check_settings(config, folder, splits)
@@ -163,7 +179,12 @@ def make_shards(config: DatasetConfig) -> int:
     rows = {split: [] for split in report.counts}
     for split in rows:
         count = sum(path.parent.name == split for path in tasks)
-        finish_set(folder / split, config.layout, count, WRITERS[config.layout].join([], config.category, split))
+        finish_set(
+            folder / split,
+            config.layout,
+            count,
+            WRITERS[config.layout].join([], config.category, split),
+        )
         list(render_meshes(config, splits[split][:ROWS], [], rows))
     with publishing(config.output, report_files(config.category)) as temporary:
         report.write(temporary, rows)
@@ -182,7 +203,11 @@ def make_shard(config: DatasetConfig, path: Path, number: int, items: Sequence[I
             objects.append(item)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path.with_suffix(LIST), made, sync=True)
-        write_shard(path.parent, number, WRITERS[config.layout].join(objects, config.category, items[0].split))
+        write_shard(
+            path.parent,
+            number,
+            WRITERS[config.layout].join(objects, config.category, items[0].split),
+        )
     print(f"{path.parent.name} {number}: {len(objects)} objects", flush=True)
     return True
 

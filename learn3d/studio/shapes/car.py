@@ -10,10 +10,11 @@ from .parts import Part, bar, box, crossbar, join, loft, revolve, slab, wing
 
 TYRE = 0.22  # width of the wheels
 
-# The weight of each kind, the smallest and largest measures. length, width, height, wheel (radius) and clearance (of
-# the floor over the ground) are in metres. bonnet and screen (lengths), roof (its end) and window (end of the rear
-# window, start of the boot or bed) are shares of the length. belt: height of the shoulder line under the windows, share
-# of the height. lean: inward lean of the side windows per height.
+# The weight of each kind, the smallest and largest measures. length, width, height, wheel
+# (radius) and clearance (of the floor over the ground) are in metres. bonnet and screen
+# (lengths), roof (its end) and window (end of the rear window, start of the boot or bed) are
+# shares of the length. belt: height of the shoulder line under the windows, share of the height.
+# lean: inward lean of the side windows per height.
 _FIELDS = "length width height wheel clearance bonnet screen roof window belt lean".split()
 _KINDS = {
     "sedan":     (2.5, ( 4.2,  1.70,  1.38,  0.30,  0.14,  0.25,  0.14, 0.66,  0.80, 0.56, 0.20),
@@ -111,7 +112,8 @@ def _hull(body: SimpleNamespace) -> Part:
     line = rounded_path(side_view, 0.12, 2)
     line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
 
-    # The distances of the cross-sections from the front bumper [S]: at every corner, arch and end of the bed.
+    # The distances of the cross-sections from the front bumper [S]: at every corner, arch and end
+    # of the bed.
     arch = body.wheel + 0.055  # radius of the wheel arches
     around_axle = arch * np.append([-1.02, 1.02], 0.999 * np.cos(np.linspace(0, np.pi, 8)))
     ends = [end + side for end in bed for side in (-0.015, 0.015)]
@@ -139,7 +141,8 @@ def _hull(body: SimpleNamespace) -> Part:
     bottom = np.full_like(s, belt - 0.38)  # of the bed
     hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))  # the wheel arch seen from the bed
 
-    # The right half of each cross-section: points (x, y) from the middle of the floor outwards and up to the middle.
+    # The right half of each cross-section: points (x, y) from the middle of the floor outwards
+    # and up to the middle.
     zero = np.zeros_like(s)
     lower_x = [zero, inner, inner, 0.95 * width, width, 0.97 * width]
     lower_y = [floor, floor, cut, cut, middle, shoulder]

@@ -354,7 +354,8 @@ def shell_chair(
     ease = ease**2 * (3 - 2 * ease)
     span = 0.5 * width * (1 - waist * ease) * (1 - np.clip((t - 0.75) / 0.25, 0, 1) ** 3 * top)
     span = span * (1 - 0.25 * np.clip(1 - t / 0.15, 0, 1) ** 2)
-    # The rims of the seat are lifted and those of the back pulled forward; at the hip `wings` turns them into arms.
+    # The rims of the seat are lifted and those of the back pulled forward; at the hip `wings`
+    # turns them into arms.
     hip = np.exp(-(((t - 0.5) / 0.25) ** 2))
     lift = (curl * np.abs(across) ** 2.5 + wings * hip * np.abs(across) ** 3) * (1 - 0.7 * ease)
     pull = (curl + wings * hip) * np.abs(across) ** 2.5 * ease

@@ -18,8 +18,9 @@ from .draw import Point, ellipse, inset, points, rectangle
 CIRCLE = ellipse(2.0, 2.0, 8)
 X, Y, Z = np.eye(3)
 
-# Thin bars get extra rings: a voxelizer that casts rays on a 32^3 grid misses bars between two grid lines, but it also
-# marks the cell of every vertex. Both lengths are in units of the longest side of the shape.
+# Thin bars get extra rings: a voxelizer that casts rays on a 32^3 grid misses bars between two
+# grid lines, but it also marks the cell of every vertex. Both lengths are in units of the longest
+# side of the shape.
 THIN = 0.06  # diameter below which a bar is thin
 STEP = 0.031  # largest distance of its rings
 

@@ -33,7 +33,8 @@ from learn3d.terminal import note, plain
 UNIT = 1e-4  # length of 1 in the stored int16 coordinates, which reach 3.3; objects reach 1
 #: Maps row vectors of the object frame to the page's axes, with z up (y is up in mesh files).
 _TO_PAGE = mesh_to_object() @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-#: Okabe and Ito's colours, safe for every kind of colour vision, darker ones first, without the faint yellow.
+#: Okabe and Ito's colours, safe for every kind of colour vision, darker ones first, without the
+#: faint yellow.
 COLORS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 #: Titles of curves. Other curves have the name under which they are logged.
 TITLES = {
@@ -60,7 +61,8 @@ _NOT_CURVES = {"hollow", "seconds"}
 SECTOR_DEG = 15
 POINTS = 500  # the most points of a curve: every n-th is drawn of a longer one
 MOST_SHOWN = 100  # images with shapes; each takes some 60 kB
-#: All curves of a run: by split ("train", "val") and name, the value at each step, in the order of the steps.
+#: All curves of a run: by split ("train", "val") and name, the value at each step, in the order
+#: of the steps.
 Log = dict[tuple[str, str], dict[int, float]]
 
 

@@ -58,14 +58,16 @@ _SHARED_NAMES = (
     "lambda_smooth_end",
 )
 _SHARED = _SCHEDULE | _SYMMETRY | {name: getattr(_PLUS, name) for name in _SHARED_NAMES}
-#: Networks, smoothness and schedule of the table of supervision, whose methods encode as many images as Plus.
+#: Networks, smoothness and schedule of the table of supervision, whose methods encode as many
+#: images as Plus.
 _SUPERVISION = _SCHEDULE | _SYMMETRY | {"encoder": "conv-light", "generator": "sphere", "clamp_to_cube": True}
 _SUPERVISION |= {"lambda_smooth": 3e-4, "augment": ("colors",)}
 _SMALL: dict[str, Any] = {"small_batches_of": _PROPOSED}
 #: Widths of the view bins in azimuth and elevation, in degrees.
 BINS = ("60x60", "30x30", "20x20", "20x15", "15x20", "15x15", "10x10")
 
-#: By name. Without the confusion loss the discriminator has no effect on the encoder, so its own loss is off, too.
+#: By name. Without the confusion loss the discriminator has no effect on the encoder, so its own
+#: loss is off, too.
 VARIANTS: dict[str, Variant] = {
     "proposed": Variant(_PROPOSED),
     "vanilla": Variant(_VANILLA),

@@ -11,27 +11,39 @@ from nmr.obj import triangulate
 def read_ac3d(text: str, skip: Callable[[str], object]) -> list[RawMesh]:
     """Objects of an AC3D text with at least one polygon, placed by the `loc` and `rot` of their ancestors.
 
-    Skips lines (surface types 1 and 2), and objects with a name that `skip` accepts, with their children. Frame of
-    FlightGear's models: nose towards -x, y up, left wing towards +z. Raises ValueError if the text is not AC3D or
-    incomplete.
+    Skips lines (surface types 1 and 2), and objects with a name that `skip` accepts, with their
+    children. Frame of FlightGear's models: nose towards -x, y up, left wing towards +z. Raises
+    ValueError if the text is not AC3D or incomplete.
     """
     lines = (line for line in map(str.strip, text.splitlines()) if line)  # some exporters add blank lines
     if not next(lines, "").startswith("AC3D"):
         raise ValueError("not an AC3D file: it does not start with AC3D")
     try:
         return list(_read_objects(lines, 1, np.eye(3), np.zeros(3), skip))
-    except (RuntimeError, LookupError) as error:  # a generator turns StopIteration into a RuntimeError
+    except (
+        RuntimeError,
+        LookupError,
+    ) as error:  # a generator turns StopIteration into a RuntimeError
         raise ValueError("the AC3D file ends in the middle of an object") from error
 
 
 def _read_objects(
-    lines: Iterator[str], count: int, rotation: np.ndarray, translation: np.ndarray, skip: Callable[[str], object]
+    lines: Iterator[str],
+    count: int,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    skip: Callable[[str], object],
 ) -> Iterator[RawMesh]:
     """The next `count` objects with their children. The parent's frame is v @ rotation [3, 3] + translation [3]."""
     for _ in range(count):
         if not any(line.startswith("OBJECT") for line in lines):
             return
-        fields, rows, polygons, key = {"name": "", "rot": "1 0 0 0 1 0 0 0 1", "loc": "0 0 0"}, [], [], ""
+        fields, rows, polygons, key = (
+            {"name": "", "rot": "1 0 0 0 1 0 0 0 1", "loc": "0 0 0"},
+            [],
+            [],
+            "",
+        )
         while key != "kids":
             key, _, value = next(lines).partition(" ")
             fields[key] = value
@@ -48,6 +60,12 @@ def _read_objects(
         children = list(_read_objects(lines, int(value), turn, shift, skip))
         if not skip(fields["name"].strip('"')):
             if polygons:
-                vertices, corners = np.array(rows, np.float64).reshape(-1, 3) @ turn + shift, np.concatenate(polygons)
-                yield RawMesh(vertices, corners[triangulate(vertices, corners, np.array([*map(len, polygons)]))])
+                vertices, corners = (
+                    np.array(rows, np.float64).reshape(-1, 3) @ turn + shift,
+                    np.concatenate(polygons),
+                )
+                yield RawMesh(
+                    vertices,
+                    corners[triangulate(vertices, corners, np.array([*map(len, polygons)]))],
+                )
             yield from children

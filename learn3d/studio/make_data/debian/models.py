@@ -1,8 +1,8 @@
 """Real meshes from Debian packages: chairs, tables, cabinets, sofas, lamps (Sweet Home 3D) and airplanes (FlightGear).
 
-`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the origin, longest side
-1. OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the packages' copyright files. The same
-packages give the same bytes.
+`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the
+origin, of length 1. OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the
+packages' copyright files. The same packages give the same bytes.
 """
 
 import csv
@@ -29,8 +29,9 @@ CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side of the grids that are compared to find duplicates
 MAX_SAMPLES = 2_000_000  # surface points in memory at a time
 DUPLICATE_IOU = 0.85  # two models whose surface grids have a larger IoU are duplicates
+# Columns of index.csv. In a watertight mesh each edge belongs to exactly two faces.
 INDEX = ("category", "file", "title", "author", "licence", "package", "version", "source")
-INDEX += ("vertices", "faces", "watertight")  # columns of index.csv; watertight: each edge belongs to exactly two faces
+INDEX += ("vertices", "faces", "watertight")
 
 
 @dataclass
@@ -50,9 +51,9 @@ class Report:
 def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Report:
     """Write the meshes into the folder `output`, which appears when it is complete.
 
-    packages_dir: folder of the .deb files, into which missing ones are downloaded (default: a temporary folder). The
-    report lists unreadable models and duplicates. Raises ValueError if the output exists, or if a package is missing or
-    damaged.
+    packages_dir: folder of the .deb files, into which missing ones are downloaded (default: a
+    temporary folder). The report lists unreadable models and duplicates. Raises ValueError if the
+    output exists, or if a package is missing or damaged.
     """
     output, report = output.resolve(), Report()
     if output.exists():
@@ -119,8 +120,8 @@ def _write_model(
 ) -> dict[str, object]:
     """Write a mesh, add its grids to `kept`, and return its columns of index.csv.
 
-    kept: name -> [surface grid, surface grid stretched to a cube] of the category's meshes. Raises ValueError if the
-    mesh is a near-duplicate of a kept one.
+    kept: name -> [surface grid, surface grid stretched to a cube] of the category's meshes.
+    Raises ValueError if the mesh is a near-duplicate of a kept one.
     """
     stretched = mesh.vertices / np.ptp(mesh.vertices, axis=0)
     surface = [surface_grid(vertices, mesh.faces, GRID) for vertices in (mesh.vertices, stretched)]
@@ -135,15 +136,20 @@ def _write_model(
     kept[name] = surface
     (folder / facts["category"]).mkdir(exist_ok=True)
     (folder / f"{name}.ply").write_bytes(mesh.export(file_type="ply"))
-    size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "watertight": mesh.is_watertight}
+    size = {
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        "watertight": mesh.is_watertight,
+    }
     return {"file": f"{name}.ply"} | size
 
 
 def clean_mesh(raw: RawMesh) -> trimesh.Trimesh:
     """The mesh welded, its bounding box centred at the origin, its longest side 1.
 
-    Merges vertices closer than about 1e-5 of the longest side. Removes faces without area, repeated faces (of either
-    winding) and unused vertices. Raises ValueError if the mesh is flat or empty, or a coordinate is not finite.
+    Merges vertices closer than about 1e-5 of the longest side. Removes faces without area,
+    repeated faces (of either winding) and unused vertices. Raises ValueError if the mesh is flat
+    or empty, or a coordinate is not finite.
     """
     raw = check(raw)
     mesh = trimesh.Trimesh(fit_to_box(raw.vertices), raw.faces, process=False)

@@ -1,7 +1,7 @@
 """What is taken from Debian's packages: furniture from Sweet Home 3D's catalogues, airplanes from FlightGear's models.
 
-A catalogue (.sh3f) is a zip archive with a properties file (name#N, model#N, modelRotation#N, ...) and one OBJ per
-model. AI aircraft are AC3D files (.ac) with XML files beside them.
+A catalogue (.sh3f) is a zip archive with a properties file (name#N, model#N, modelRotation#N,
+...) and one OBJ per model. AI aircraft are AC3D files (.ac) with XML files beside them.
 """
 
 import io
@@ -20,14 +20,21 @@ from learn3d.files.formats import RawMesh
 from learn3d.studio.make_data.debian.formats import read_ac3d
 from nmr.obj import read_obj
 
-#: Facts about a model of a package, which are columns of index.csv, with `stem`, the file name to use without suffix;
-#: and a function that reads it (y up, front +z), or raises ValueError.
+#: Facts about a model of a package, which are columns of index.csv, with `stem`, the file name to
+#: use without suffix; and a function that reads it (y up, front +z), or raises ValueError.
 Model = tuple[dict[str, str], Callable[[], RawMesh]]
 
-# The first pattern found in an entry's English name, in lower case, gives its category; None skips the entry.
+# The first pattern found in an entry's English name, in lower case, gives its category; None
+# skips the entry.
 FURNITURE_RULES: tuple[tuple[str, str | None], ...] = (
-    (r"\b(switch|racket|bat|fan|freezer|wheelchair|ottoman|swinging|opened|skylight|tablet|flashlight)\b", None),
-    (r"\b(knife|towel|clothes|hat|cd|wine|speech) .*\b(stand|rack|unit)\b|washbasin|changing table|extension", None),
+    (
+        r"\b(switch|racket|bat|fan|freezer|wheelchair|ottoman|swinging|opened|skylight|tablet|flashlight)\b",
+        None,
+    ),
+    (
+        r"\b(knife|towel|clothes|hat|cd|wine|speech) .*\b(stand|rack|unit)\b|washbasin|changing table|extension",
+        None,
+    ),
     (r"candle|artwork", None),
     (r"\b(lamp|lantern|chandelier|lamppost|(light|lights|spotlight|strip)$)", "lamp"),
     (r"\b(sofa|couch|settee)\b", "sofa"),
@@ -35,10 +42,14 @@ FURNITURE_RULES: tuple[tuple[str, str | None], ...] = (
     (r"\b(bedside table|night ?stand|tv stand)\b", "cabinet"),
     (r"\b(table|desk|workbench)\b", "table"),
     (r"\b(corner |cube )?shelf( (cherry|maple))?$", None),  # a board on the wall
-    (r"\b(cabinet|cupboard|wardrobe|bookcase|dresser|sideboard|locker|commode|chest|closet)\b", "cabinet"),
+    (
+        r"\b(cabinet|cupboard|wardrobe|bookcase|dresser|sideboard|locker|commode|chest|closet)\b",
+        "cabinet",
+    ),
     (r"\b(drawers?|shelves|bookshelves|shelving|shelf|rack)\b", "cabinet"),
 )
-# Models with misleading names: two bedside ends of beds, a bathroom with its basin, two boards on a wall.
+# Models with misleading names: two bedside ends of beds, a bathroom with its basin, two boards on
+# a wall.
 SKIPPED_MODELS = ("comodinoSinistro", "comodinoSinistroCiliegio", "bathroomFurniture", "shelving")
 SKIPPED_SECTIONS = ("Characters", "Doors and windows", "Staircases", "Vehicles")
 
@@ -47,7 +58,10 @@ def furniture_category(name: str, section: str = "") -> str | None:
     """Category of a catalogue entry from its English name and its section; None if the entry is skipped."""
     if section in SKIPPED_SECTIONS:
         return None
-    return next((category for pattern, category in FURNITURE_RULES if re.search(pattern, name.lower())), None)
+    return next(
+        (category for pattern, category in FURNITURE_RULES if re.search(pattern, name.lower())),
+        None,
+    )
 
 
 def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
@@ -63,7 +77,8 @@ def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
 def place_furniture(vertices: np.ndarray, entry: Mapping[str, str]) -> np.ndarray:
     """Vertices [V, 3] turned by the entry's modelRotation (nine numbers by rows, p' = R p) and stretched to its box.
 
-    The box is width x height x depth along x, y, z, as Sweet Home 3D draws it: y up, the front towards +z.
+    The box is width x height x depth along x, y, z, as Sweet Home 3D draws it: y up, the front
+    towards +z.
     """
     if "modelRotation" in entry:
         vertices = vertices @ np.array(entry["modelRotation"].split(), dtype=np.float64).reshape(3, 3).T
@@ -123,9 +138,10 @@ DETACHED = 2e-3  # distance, over the longest side, at which a quadrilateral is 
 def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:
     """Leave out propeller discs and detached quadrilaterals, whose textures are pictures of motion, light or vapour.
 
-    A disc, or the square with its texture, is a part with a round or square outline that is wider than MIN_DISC. Its
-    depth along the flight direction x is below 3 % of its diameter. A detached quadrilateral is a part of one or two
-    triangles farther than DETACHED from all others, except from its own reverse side.
+    A disc, or the square with its texture, is a part with a round or square outline that is wider
+    than MIN_DISC. Its depth along the flight direction x is below 3 % of its diameter. A detached
+    quadrilateral is a part of one or two triangles farther than DETACHED from all others, except
+    from its own reverse side.
     """
     corners = [part.vertices[np.unique(part.faces)] for part in parts]
     size = np.ptp(np.concatenate(corners), axis=0).max()

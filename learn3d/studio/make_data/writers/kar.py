@@ -23,10 +23,10 @@ KAR_HALF_FOV_DEG = 14.9314  # 60 mm lens, 32 mm sensor
 def _write_kar(objects: Iterable[RenderedObject], category: str, root: Path, output: Path) -> None:
     """Write a folder of renderings and a voxel grid for each object, and `splits.json` for all categories.
 
-    `depth_{i}.png` has 0 .. 240 over 1.8 units around the object's centre (nearer is darker), and 255 for background.
-    `camera_{i}.mat` has K [3, 3] in pixels, extrinsic [3, 4], and its rotation as quat (w, x, y, z). extrinsic takes
-    ShapeNet's coordinates (right-handed, y up, front x) to x right, y down, z away. The published code reads neither
-    extrinsic nor quat.
+    `depth_{i}.png` has 0 .. 240 over 1.8 units around the object's centre (nearer is darker), and
+    255 for background. `camera_{i}.mat` has K [3, 3] in pixels, extrinsic [3, 4], and its
+    rotation as quat (w, x, y, z). extrinsic takes ShapeNet's coordinates (right-handed, y up,
+    front x) to x right, y down, z away. The published code reads neither extrinsic nor quat.
     """
     renders, volumes = (root / path for path in KAR.paths(category))
     size, lists = KAR.image_size, {split: [] for split in SPLITS}
@@ -60,7 +60,10 @@ def _write_mat(path: Path, **arrays: np.ndarray) -> None:
 
 #: The distances of Kar's own files are not published; here objects fill about as much of the image.
 KAR = Writer(
-    paths=lambda category: (f"renders/{synset_of(category)}", f"voxels/modelVoxels32/{synset_of(category)}"),
+    paths=lambda category: (
+        f"renders/{synset_of(category)}",
+        f"voxels/modelVoxels32/{synset_of(category)}",
+    ),
     write=_write_kar,
     views=functools.partial(random_views, (-20.0, 40.0), KAR_HALF_FOV_DEG),
     image_size=224,

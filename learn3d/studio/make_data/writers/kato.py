@@ -73,5 +73,8 @@ def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -
 
 #: See `learn3d.data.readers.around`.
 AROUND = Writer(
-    join=_join_around, default_views=12, views=functools.partial(random_views, (-10.0, 60.0), (7.0, 20.0)), natural=True
+    join=_join_around,
+    default_views=12,
+    views=functools.partial(random_views, (-10.0, 60.0), (7.0, 20.0)),
+    natural=True,
 )

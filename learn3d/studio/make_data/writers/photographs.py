@@ -34,7 +34,10 @@ def _write_pascal3d(objects: Iterable[RenderedObject], category: str, folder: Pa
     for item in objects:
         for rgba, rotation in zip(item.rgba(), item.poses.rotation.numpy(), strict=True):
             row = _photograph(rgba, item.rng)
-            row |= {"rotation_matrices": rotation * np.float32([[-1], [1], [1]]), "voxels": item.voxels}
+            row |= {
+                "rotation_matrices": rotation * np.float32([[-1], [1], [1]]),
+                "voxels": item.voxels,
+            }
             (val_rows if item.split == "val" else rows).append(row)
     if len(rows) == 1:
         raise ValueError("the layout pascal3d needs two pictures or more for training; give more meshes or views")
@@ -77,9 +80,10 @@ def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndar
     return {"images": np.asarray(photo), "images_ref": reference, "bounding_boxes": box}
 
 
-#: All rotations are proper (determinant 1), so the object frame is right-handed: x to the front, y up, z to the left as
-#: seen from the front. Objects are symmetric about z = 0, as the symmetric generator requires. Half the diagonal of the
-#: bounding box is 1, so that a rotated object stays in [-1, 1].
+#: All rotations are proper (determinant 1), so the object frame is right-handed: x to the front,
+#: y up, z to the left as seen from the front. Objects are symmetric about z = 0, as the symmetric
+#: generator requires. Half the diagonal of the bounding box is 1, so that a rotated object stays
+#: in [-1, 1].
 PASCAL3D = Writer(
     paths=lambda category: tuple(f"{pascal3d.class_name(category)}_{n}.npz" for n in ("train", "imagenet", "val")),
     write=_write_pascal3d,

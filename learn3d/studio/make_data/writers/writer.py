@@ -12,9 +12,11 @@ from learn3d.data.conventions import IMAGE_SIZE, KATO, NUM_VIEWS, VoxelConventio
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import LookAtPoses, Poses
 
-#: Takes the object frame to ShapeNet's coordinates (right-handed, y up, front x): [3, 3], determinant -1.
+#: Takes the object frame to ShapeNet's coordinates (right-handed, y up, front x): [3, 3],
+#: determinant -1.
 WORLD_FROM_OBJECT = mesh_to_object("y", "x").T
-#: Range of camera distances, as multiples of the smallest one at which the image holds the whole bounding sphere.
+#: Range of camera distances, as multiples of the smallest one at which the image holds the whole
+#: bounding sphere.
 RELATIVE_DISTANCES = (1.02, 1.25)
 
 
@@ -55,12 +57,14 @@ class Writer:
 
     #: Files and folders of a category alone, relative to the data set's folder.
     paths: Callable[[str], tuple[str, ...]] = lambda category: ()
-    #: write(objects, category, temporary, folder) writes train, val and test of a category into `temporary`; then
-    #: `paths` and `shared` are moved to `folder`, that of the data set. None if the layout exists as shards only.
+    #: write(objects, category, temporary, folder) writes train, val and test of a category into
+    #: `temporary`; then `paths` and `shared` are moved to `folder`, that of the data set. None if
+    #: the layout exists as shards only.
     write: Callable[[Iterable[RenderedObject], str, Path, Path], None] | None = None
     #: Joins objects of a category and a split for a shard. None if the layout has no shards.
     join: Callable[[Sequence[RenderedObject], str, str], ViewDataset] | None = None
-    #: Draws the given number of cameras for the placed vertices [V, 3]. None if all objects have Kato's 24 views.
+    #: Draws the given number of cameras for the placed vertices [V, 3]. None if all objects have
+    #: Kato's 24 views.
     views: Callable[[np.ndarray, int, np.random.Generator], Poses] | None = None
     image_size: int = IMAGE_SIZE
     default_views: int = NUM_VIEWS  # per object
@@ -82,7 +86,10 @@ def random_views(
     rng: np.random.Generator,
 ) -> LookAtPoses:
     """Draw `count` cameras with any azimuth whose images hold the whole bounding sphere of vertices [V, 3] around 0."""
-    azimuth_deg, elevation_deg = uniform(rng, (-180.0, 180.0), count), uniform(rng, elevations_deg, count)
+    azimuth_deg, elevation_deg = (
+        uniform(rng, (-180.0, 180.0), count),
+        uniform(rng, elevations_deg, count),
+    )
     half_fov_deg = half_fovs_deg if isinstance(half_fovs_deg, float) else uniform(rng, half_fovs_deg, count)
     least = np.linalg.norm(vertices, axis=1).max() / np.sin(np.deg2rad(np.float64(half_fov_deg)))
     distance = np.round(least * rng.uniform(*RELATIVE_DISTANCES, count), 4).astype(np.float32)

@@ -55,7 +55,14 @@ def test_every_format_round_trips_through_the_reader(tmp_path, folder):
     assert report.counts == {"train": 6} and not report.skipped
     dataset, images = load(tmp_path / "data")
     names = json.loads((tmp_path / "data" / "03001627_card.json").read_text())["splits"]["train"]
-    assert sorted(names) == ["box0.obj", "box1.off", "box2.ply", "box3.stl", "box4.glb", "more/torus.PLY"]
+    assert sorted(names) == [
+        "box0.obj",
+        "box1.off",
+        "box2.ply",
+        "box3.stl",
+        "box4.glb",
+        "more/torus.PLY",
+    ]
     for number, name in enumerate(names):
         vertices, faces = placed(folder / name)
         own = dataset.convention.voxelize(vertices, faces)[0]
@@ -112,7 +119,11 @@ def test_meshes_and_shapes_may_be_mixed_and_only_meshes_get_copies(tmp_path, fol
 
 def test_split_is_test_then_val_then_train_of_one_permutation():
     order = np.random.default_rng(0).permutation(116)
-    for test, val, sizes in ((0.2, 0.0, [23, 0, 93]), (7, 0.1, [7, 12, 97]), (0.01, 0, [4, 0, 112])):
+    for test, val, sizes in (
+        (0.2, 0.0, [23, 0, 93]),
+        (7, 0.1, [7, 12, 97]),
+        (0.01, 0, [4, 0, 112]),
+    ):
         splits = meshes.split_objects(116, test, val, 0)
         assert [len(splits[s]) for s in ("test", "val", "train")] == sizes
         np.testing.assert_array_equal(np.concatenate([splits[s] for s in ("test", "val", "train")]), order)
@@ -136,7 +147,10 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
         ({"out": "bad/a.obj"}, "a.obj"),
         ({"layout": "kato", "views": 12}, "views is always 24 in the layout kato, got 12"),
         ({"layout": "pascal3d", "test": 0.5}, "test is always 0"),
-        ({"procedural": 1, "source": None, "layout": "pascal3d", "views": 1, "test": None}, "two pictures or more"),
+        (
+            {"procedural": 1, "source": None, "layout": "pascal3d", "views": 1, "test": None},
+            "two pictures or more",
+        ),
         ({"layout": "kar", "shards": True}, "make the data set without --shards, and convert it"),
         ({"workers": Workers(2)}, "add --shards"),
     ],
@@ -153,7 +167,15 @@ def test_settings_and_folders_that_are_refused(tmp_path, folder, settings, messa
 
 
 def test_command_line(tmp_path, folder, monkeypatch, capsys):
-    command = ["make-dataset", "--output", str(tmp_path / "data"), "--category", "chair", "--source", str(folder)]
+    command = [
+        "make-dataset",
+        "--output",
+        str(tmp_path / "data"),
+        "--category",
+        "chair",
+        "--source",
+        str(folder),
+    ]
     monkeypatch.setattr("sys.argv", ["learn3d", *command])
     assert main() == 0 and "6 meshes used" in capsys.readouterr().out
     assert main() == 1 and capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
@@ -200,7 +222,16 @@ def test_categories_share_a_folder_and_are_replaced_one_by_one(tmp_path, folder)
 
 
 def test_names_of_objects_are_fit_for_files_and_differ_by_more_than_case() -> None:
-    paths = ("a.obj", "a_2.obj", "A!.obj", "-a.obj", "b/c d.ply", "..ply.ply", "!.stl", "x" * 300 + ".off")
+    paths = (
+        "a.obj",
+        "a_2.obj",
+        "A!.obj",
+        "-a.obj",
+        "b/c d.ply",
+        "..ply.ply",
+        "!.stl",
+        "x" * 300 + ".off",
+    )
     names = meshes.object_names(paths)
     assert names == ["a", "a_2", "A_3", "a_4", "b_c_d", "ply", "mesh", "x" * 80]
 
@@ -269,7 +300,11 @@ TRIANGLE, FACE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1,
         (TRIANGLE, FACE + 1, r"refer to vertices 1 \.\. 3"),
         (TRIANGLE, FACE - 1, "refer to vertices -1"),
         (np.where(TRIANGLE > 0, np.inf, TRIANGLE), FACE, "extent"),
-        (TRIANGLE, np.broadcast_to(FACE, (meshes.MAX_FACES + 1, 3)), "1000001 faces, the limit is 1000000"),
+        (
+            TRIANGLE,
+            np.broadcast_to(FACE, (meshes.MAX_FACES + 1, 3)),
+            "1000001 faces, the limit is 1000000",
+        ),
     ],
 )
 def test_arrays_that_are_refused(vertices: np.ndarray, faces: np.ndarray, message: str) -> None:

@@ -1,7 +1,8 @@
 """Layouts against their descriptions: masks and voxels are those of the TRUE mesh under the numbers in the files.
 
-Nothing here goes through our readers: `data/test_round_trip.py` compares what these read with the meshes. If the
-description is in right-handed world coordinates, so is the test: cameras are OpenCV's.
+Nothing here goes through our readers: `data/test_round_trip.py` compares what these read with the
+meshes. If the description is in right-handed world coordinates, so is the test: cameras are
+OpenCV's.
 """
 
 from __future__ import annotations
@@ -97,7 +98,11 @@ def views(layout: str, radius: float, count: int, seed: int) -> Poses:
 def test_kar(tmp_path, folder):
     make(tmp_path, folder, "kar", test=1, val=1, views=3)
     splits = json.loads((tmp_path / "splits.json").read_text())[SYNSET]
-    assert splits["name"] == "chair" and [len(splits[s]) for s in ("train", "val", "test")] == [3, 1, 1]
+    assert splits["name"] == "chair" and [len(splits[s]) for s in ("train", "val", "test")] == [
+        3,
+        1,
+        1,
+    ]
     (name,) = splits["test"]
     mesh, faces = true_mesh(folder, name)
     vertices, root = in_object_frame(mesh), tmp_path / "renders" / SYNSET / name
@@ -127,7 +132,10 @@ def test_kar(tmp_path, folder):
 
 def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
     rng = np.random.default_rng(0)
-    color, alpha = rng.integers(0, 256, (2, 8, 8, 3)), rng.choice([0, 64, 128, 191, 255], (2, 8, 8)).astype(np.uint8)
+    color, alpha = (
+        rng.integers(0, 256, (2, 8, 8, 3)),
+        rng.choice([0, 64, 128, 191, 255], (2, 8, 8)).astype(np.uint8),
+    )
     share = alpha[..., None] / 255
     rgb = np.rint(color * share + 255 * (1 - share)).astype(np.uint8)
     item = RenderedObject("a", "train", None, None, None, rgb, alpha, None, rng)
@@ -163,7 +171,10 @@ def test_ranges_and_decimals():
         (kar, (-180, 180), (-20, 40)),
         (photos, (-180, 180), (-10, 50)),
     ):
-        for values, (low, high) in ((poses.azimuth_deg, azimuths), (poses.elevation_deg, elevations)):
+        for values, (low, high) in (
+            (poses.azimuth_deg, azimuths),
+            (poses.elevation_deg, elevations),
+        ):
             assert low <= values.min() and values.max() <= high
             spread = torch.histc(values, 8, low, high) / len(values)  # uniform
             assert (spread - 1 / 8).abs().max() < 0.03

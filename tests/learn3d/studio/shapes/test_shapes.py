@@ -115,9 +115,15 @@ def _grid() -> np.ndarray:
         (parts.ellipsoid((2, 4, 6), sides=48, stacks=48), 8 * np.pi),
         (bar((0, 0, 0), (0, 0, 5), 0.5, 0.2), 0.5),
         (parts.tube([(0, 0, 0), (2, 0, 0), (2, 2, 0)], 0.5, SQUARE), 0.04 * 4),
-        (parts.tube([(1, 1, 0), (-1, 1, 0), (-1, -1, 0), (1, -1, 0)], 0.5, SQUARE, closed=True), 0.32),
+        (
+            parts.tube([(1, 1, 0), (-1, 1, 0), (-1, -1, 0), (1, -1, 0)], 0.5, SQUARE, closed=True),
+            0.32,
+        ),
         (parts.sheet(_grid(), 0.1), 0.1 * 6 * 1.026),
-        (parts.wing([(-1, 0, 0, 1, 0.1), (1, 0, 0, 1, 0.1)]), 2 * 0.0695),  # the profile has 14 corners
+        (
+            parts.wing([(-1, 0, 0, 1, 0.1), (1, 0, 0, 1, 0.1)]),
+            2 * 0.0695,
+        ),  # the profile has 14 corners
     ],
     ids=lambda value: None if isinstance(value, float) else "",
 )

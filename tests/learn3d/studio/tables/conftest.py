@@ -19,7 +19,12 @@ def request_for(tmp_path: Path) -> Callable[..., Request]:
     """A request for a table with two methods on one category, with changes."""
 
     def make(table: str = "kato", **changes: object) -> Request:
-        given = {"category": "airplane", "methods": ("vanilla", "proposed"), "iterations": 6, "batch_size": 4}
+        given = {
+            "category": "airplane",
+            "methods": ("vanilla", "proposed"),
+            "iterations": 6,
+            "batch_size": 4,
+        }
         return Request(table, tmp_path / "data", tmp_path / "out", **(given | changes))
 
     return make

@@ -91,7 +91,10 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set, poses) -> No
 @pytest.mark.parametrize("truth", [False, True])
 def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth) -> None:
     samples, methods = torch.tensor([3, 40]), {"large": Ellipsoids(), "small": GridEllipsoids(0.5)}
-    runs, batch = [TrainedModel(name, method, tiny_set) for name, method in methods.items()], tiny_set.batch(samples)
+    runs, batch = (
+        [TrainedModel(name, method, tiny_set) for name, method in methods.items()],
+        tiny_set.batch(samples),
+    )
     grid = comparison_grid(runs, samples, truth=truth)
     shown = [method.decode(method.encode(batch.images)).surfaces() for method in methods.values()]
     if truth:
@@ -119,7 +122,10 @@ def test_the_truth_must_be_known(tiny_set) -> None:
 @pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
 def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_set, method) -> None:
     samples = torch.tensor([3, 30, 60])
-    strip, batch = interpolate(TrainedModel("a", method, tiny_set), samples), tiny_set.batch(samples)
+    strip, batch = (
+        interpolate(TrainedModel("a", method, tiny_set), samples),
+        tiny_set.batch(samples),
+    )
     assert strip.shape[0] == 3 * STEP + MARGIN
     codes = method.encode(batch.images)
     way = torch.stack([torch.lerp(codes[k // 4], codes[min(2, k // 4 + 1)], k % 4 / 4) for k in range(9)])
@@ -170,7 +176,10 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set,
     points = np.random.default_rng(0).normal(size=(72, 2)).astype(np.float32)
     monkeypatch.setattr(tsne, "embed", lambda codes: points)
     runs, wheel = (
-        [TrainedModel("$\\bad$", Ellipsoids(), tiny_set), TrainedModel("b", Ellipsoids(), tiny_set)],
+        [
+            TrainedModel("$\\bad$", Ellipsoids(), tiny_set),
+            TrainedModel("b", Ellipsoids(), tiny_set),
+        ],
         tsne.cyclic_colors(),
     )
     scatter = tsne.draw_tsne(runs).axes[0].collections[0]
@@ -235,8 +244,14 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
         (("grid", "--runs", tmp_path / "nowhere"), "nowhere"),
         (("grid", "--runs", finished_run, "--labels", "a", "b"), "there are 1 runs but 2 labels"),
         (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),
-        (("tsne", "--runs", finished_run, "--category", "lamp"), "03636649_test_images.npz: is missing"),
-        (("grid", "--runs", finished_run, "--output", f"{__file__}/grid.png"), "give another --output"),
+        (
+            ("tsne", "--runs", finished_run, "--category", "lamp"),
+            "03636649_test_images.npz: is missing",
+        ),
+        (
+            ("grid", "--runs", finished_run, "--output", f"{__file__}/grid.png"),
+            "give another --output",
+        ),
     ):
         code, out, err = call(arguments[0], *output, *arguments[1:])
         assert (code, out) == (1, ""), arguments
@@ -245,7 +260,10 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
 
 
 def test_other_data_are_shown_without_the_poses_of_the_training(tiny_config, tiny_set, tmp_path, monkeypatch) -> None:
-    configs, loaded = {name: tiny_config(tmp_path, poses=tmp_path / name) for name in ("a", "b")}, []
+    configs, loaded = (
+        {name: tiny_config(tmp_path, poses=tmp_path / name) for name in ("a", "b")},
+        [],
+    )
     monkeypatch.setattr(checkpoint, "load_method", lambda path, which: (Ellipsoids(), configs[path.name], None))
     monkeypatch.setattr(checkpoint, "load_dataset", lambda *_, poses=None, **__: loaded.append(poses) or tiny_set)
     paths = [tmp_path / "a", tmp_path / "b"]
@@ -265,4 +283,7 @@ def test_runs_are_called_by_what_tells_them_apart(tiny_config, tmp_path) -> None
     assert name_runs([proposed, chair], paths, ["x", "y"]) == ["x", "y"]
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "best.safetensors").touch()
-    assert name_runs([proposed, free], [tmp_path / "a" / "best.safetensors", tmp_path / "b"]) == ["a/best", "b"]
+    assert name_runs([proposed, free], [tmp_path / "a" / "best.safetensors", tmp_path / "b"]) == [
+        "a/best",
+        "b",
+    ]

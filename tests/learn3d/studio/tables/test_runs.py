@@ -25,7 +25,12 @@ from learn3d.runs.checkpoint import Progress
 from learn3d.runs.run import Summary
 from learn3d.studio.poses.estimate import PoseOptions
 from learn3d.studio.tables import experiment
-from learn3d.studio.tables.experiment import find_conflict, read_results, run_experiment, train_and_test
+from learn3d.studio.tables.experiment import (
+    find_conflict,
+    read_results,
+    run_experiment,
+    train_and_test,
+)
 from learn3d.studio.tables.plan import Request, name_run, plan_runs, variant_of
 from learn3d.studio.tables.tables import BINS, TABLES, VARIANTS
 from learn3d.tasks import Workers
@@ -37,7 +42,11 @@ def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
     run = next(run for run in runs if name_run(run) == "chair/without-adversarial-seed1")
     assert run.output == tmp_path / "out" / "runs" / "chair" / "without-adversarial-seed1"
     settings = run.settings
-    assert (settings.lambda_adversarial, settings.lambda_classification, settings.lambda_prior) == (0, 0, 1)
+    assert (settings.lambda_adversarial, settings.lambda_classification, settings.lambda_prior) == (
+        0,
+        0,
+        1,
+    )
     assert (run.seed, run.iterations, run.batch_size) == (1, 20_000, 128)
     bins = plan_runs(Request("bins", tmp_path, tmp_path, category="chair"))
     assert [(run.view_bins, run.layout) for run in bins] == [(width, "kar") for width in BINS]
@@ -66,14 +75,22 @@ def test_smaller_batches_show_as_many_images(tmp_path) -> None:
     assert sizes(iterations=50, batch_size=8) == {("proposed", 50, 8, 0)} | short
     with pytest.raises(ValueError, match="divides batches by 4: batch_size must be a multiple, got 6"):
         sizes(batch_size=6)
-    for table, plus, proposed in (("kar", "kar-plus", "bins-15x20"), ("pascal", "pascal-plus", "pascal-proposed")):
+    for table, plus, proposed in (
+        ("kar", "kar-plus", "bins-15x20"),
+        ("pascal", "pascal-plus", "pascal-proposed"),
+    ):
         runs = plan_runs(Request(table, tmp_path, tmp_path, "airplane", seeds=1))
         images = {variant_of(run): run.iterations * run.batch_size for run in runs}
         assert images[plus] == images[proposed]
 
 
 def test_changes_reach_the_methods_that_they_name(request_for) -> None:
-    changes = ("precision=fp32", "vanilla:learning-rate=3e-4", "lambda_smooth=0.5", "augment=flip-image,channels")
+    changes = (
+        "precision=fp32",
+        "vanilla:learning-rate=3e-4",
+        "lambda_smooth=0.5",
+        "augment=flip-image,channels",
+    )
     vanilla, proposed = plan_runs(request_for(set=changes))
     assert (vanilla.settings.learning_rate, proposed.settings.learning_rate) == (3e-4, 1e-4)
     for run in (vanilla, proposed):
@@ -93,7 +110,10 @@ def test_changes_reach_the_methods_that_they_name(request_for) -> None:
         ({"set": ("pascal:lambda_prior=1",)}, "a method of vanilla, proposed"),
         ({"set": ("seed=1",)}, "that neither the table nor another option decides"),
         ({"set": ("lambda_prior=-1",)}, "lambda_prior must be"),
-        ({"table": "prgan", "methods": ("prgan",), "set": ("discriminator_channels=8,a",)}, "discriminator_chan"),
+        (
+            {"table": "prgan", "methods": ("prgan",), "set": ("discriminator_channels=8,a",)},
+            "discriminator_chan",
+        ),
         ({"seeds": 0}, "seeds must be at least 1"),
         ({"iterations": -1}, "iterations must be"),
         ({"layout": "dvr"}, "the layout 'dvr' has no true voxels"),
@@ -128,7 +148,10 @@ def test_results_of_other_networks_or_data_are_not_taken(tmp_path, make, request
     make(request_for())
     (run, _) = plan_runs(request_for())
     assert list(read_results([run])) == [run.output]
-    for other in (request_for(iterations=7), dataclasses.replace(request_for(), data=tmp_path / "elsewhere")):
+    for other in (
+        request_for(iterations=7),
+        dataclasses.replace(request_for(), data=tmp_path / "elsewhere"),
+    ):
         assert read_results(plan_runs(other)) == {}
 
 

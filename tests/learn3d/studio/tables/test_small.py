@@ -1,7 +1,8 @@
 """Every table of the paper in small: `learn3d experiment` from its command line to its reports.
 
-Procedural airplanes in three layouts, small networks, two steps of batch 8: the figures mean nothing, but every run is
-planned, trained, measured, shared between tables and reported. Runs in processes of their own are in `test_runs`.
+Procedural airplanes in three layouts, small networks, two steps of batch 8: the figures mean
+nothing, but every run is planned, trained, measured, shared between tables and reported. Runs in
+processes of their own are in `test_runs`.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ SMALLER = dict.fromkeys(VARIANTS, _SMALL) | {
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Data of each layout, and all tables, each made by its command into the folder `out`.
 
-    VPL's checkpoints of half a gigabyte are removed as soon as they are measured, the other runs at the end.
+    VPL's checkpoints of half a gigabyte are removed as soon as they are measured, the other runs
+    at the end.
     """
     folder = tmp_path_factory.mktemp("tables")
     for layout, options in DATA.items():
@@ -63,7 +65,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         words += "--set max_val_images=6 log_every=1 precision=fp32"
         variants = [row.variant for row in table.rows.values() if row.variant]
         smaller = [f"{variant}:{change}" for variant in variants for change in SMALLER[variant]]
-        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(io.StringIO()) as said:
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.redirect_stderr(io.StringIO()) as said,
+        ):
             patch.setattr("sys.argv", ["learn3d"])
             patch.setattr(experiment, "run_tasks", stub_work.run_tasks_here)
             assert commands.main("experiment", *words.split(), *smaller) == 0, said.getvalue()
@@ -88,7 +93,14 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
         results = [json.loads(file.read_text()) for file in files]
         assert len(results) == (PASCAL_SEEDS if name == "pascal" else 1)
         for result in results:
-            for measure in ("voxel_iou", "voxel_iou_kato19", "f_score", "mmd", "mmd_paper", "chamfer_l1"):
+            for measure in (
+                "voxel_iou",
+                "voxel_iou_kato19",
+                "f_score",
+                "mmd",
+                "mmd_paper",
+                "chamfer_l1",
+            ):
                 assert 0 <= result[measure] <= (1 if "iou" in measure or "score" in measure else math.inf), label
             assert result["voxel_iou"] > 0, "even an untrained shape overlaps with an airplane"
             assert result["iterations"] == 2 * (BATCH_DIVISOR if VARIANTS[row.variant].small_batches_of else 1)
@@ -105,6 +117,14 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
 
 
 def test_settings_of_rows_reach_their_runs(folder: Path) -> None:
-    wanted = {"60x60": 6, "30x30": 24, "20x20": 54, "20x15": 72, "15x20": 72, "15x15": 96, "10x10": 216}
+    wanted = {
+        "60x60": 6,
+        "30x30": 24,
+        "20x20": 54,
+        "20x15": 72,
+        "15x20": 72,
+        "15x15": 96,
+        "10x10": 216,
+    }
     files = {widths: folder / f"out/runs/airplane/bins-{widths}-seed0/best.safetensors" for widths in wanted}
     assert {widths: load_metadata(file).info.num_views for widths, file in files.items()} == wanted

@@ -10,7 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from small_packages import AIRCRAFT, AIRPLANE, CHAIR, TABLE, ac_object, ac_text, box, catalogue, deb, entry, fetch
+from small_packages import (
+    AIRCRAFT,
+    AIRPLANE,
+    CHAIR,
+    TABLE,
+    ac_object,
+    ac_text,
+    box,
+    catalogue,
+    deb,
+    entry,
+    fetch,
+)
 
 from learn3d.files.formats import RawMesh
 from learn3d.studio.make_data.debian import models
@@ -50,7 +62,11 @@ def debs(tmp_path: Path) -> Path:
     models = {"m/chair.obj": CHAIR, "m/copy.obj": CHAIR, "m/tall.obj": CHAIR, "m/table.obj": TABLE}
     models["m/broken.obj"] = "v 0 0 0\nf 1 2 3"
     folder, sh3f = tmp_path / "debs", {"usr/Test.sh3f": catalogue(entries, models)}
-    deb(folder, "sweethome3d-furniture", sh3f | {"usr/share/doc/sweethome3d-furniture/copyright": b"Free-Art"})
+    deb(
+        folder,
+        "sweethome3d-furniture",
+        sh3f | {"usr/share/doc/sweethome3d-furniture/copyright": b"Free-Art"},
+    )
     deb(folder, "sweethome3d-furniture-nonfree", {})
     disc = ac_object("thing", (-5.01, -1, -1), (-5, 1, 1))
     aircraft = {
@@ -59,7 +75,11 @@ def debs(tmp_path: Path) -> Path:
         "Plane/Models/lights/RedLight.ac": ac_text(AIRPLANE[0]),
         "balloon/Models/balloon1.ac": ac_text(AIRPLANE[0]),
     }
-    deb(folder, "flightgear-data-ai", {f"{AIRCRAFT}/{path}": text.encode() for path, text in aircraft.items()})
+    deb(
+        folder,
+        "flightgear-data-ai",
+        {f"{AIRCRAFT}/{path}": text.encode() for path, text in aircraft.items()},
+    )
     return folder
 
 
@@ -70,7 +90,11 @@ def contents(folder: Path) -> dict[Path, bytes]:
 def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> None:
     report = fetch(tmp_path / "out", debs)
     rows = list(csv.DictReader((tmp_path / "out/index.csv").open(encoding="utf-8")))
-    assert [row["file"] for row in rows] == ["airplane/plane.ply", "chair/test-chair.ply", "table/test-table.ply"]
+    assert [row["file"] for row in rows] == [
+        "airplane/plane.ply",
+        "chair/test-chair.ply",
+        "table/test-table.ply",
+    ]
     assert [row["author"] for row in rows] == ["B. Maker", "A. Maker", "A. Maker"]
     assert [row["licence"] for row in rows] == ["GPL-2+", "Free Art License 1.3", "CC0"]
     assert {row["version"] for row in rows} == {"1:2.0-1"} and rows[1]["source"] == "Test.sh3f!/m/chair.obj"

@@ -30,7 +30,11 @@ def test_metrics_become_curves(tmp_path) -> None:
     assert set(read) == {("train", "projection"), ("train", "total"), ("val", "voxel_iou")}
     assert read["train", "projection"] == pytest.approx({50: 1.25, 100: 0.75, 150: 1 / 3 + 0.25})
     titles = [plot["title"] for plot in report.draw_curves([read])]
-    assert titles == ["voxel IoU, val", "projection loss (1 - IoU), train", "total loss (weighted), train"]
+    assert titles == [
+        "voxel IoU, val",
+        "projection loss (1 - IoU), train",
+        "total loss (weighted), train",
+    ]
 
 
 HOSTILE = [

@@ -73,7 +73,10 @@ def test_names_are_text(page, tmp_path, runs, tiny_set, monkeypatch) -> None:
     monkeypatch.setattr(checkpoint, "load_data", lambda *_, **__: hostile)
     write_report(runs, tmp_path / "page.html")
     found = Page(tmp_path / "page.html")
-    assert {item["name"] for item in found.data["items"]} == {*hostile.object_names[:2], r"\u202eabc\x1b"}
+    assert {item["name"] for item in found.data["items"]} == {
+        *hostile.object_names[:2],
+        r"\u202eabc\x1b",
+    }
     assert all(attributes.get("src", "data:").startswith("data:") for _, attributes in found.tags)
 
 
@@ -99,7 +102,8 @@ def test_objects_go_from_the_best_to_the_worst(page) -> None:
     items = Page(page).data["items"]
     means = [np.mean(item["means"]) for item in items]
     rows = re.findall(
-        r"<tr( data-item=\"\d+\")?><th scope=\"row\">(?:<button type=\"button\">)?(\d+)", page.read_text()
+        r"<tr( data-item=\"\d+\")?><th scope=\"row\">(?:<button type=\"button\">)?(\d+)",
+        page.read_text(),
     )
     assert len(items) == 2 and means[0] > means[1]
     assert [bool(shown) for shown, _ in rows] == [True, False, True], "the best and the worst of three have shapes"
@@ -166,7 +170,11 @@ def test_mistakes_are_one_clear_line(words: str, message: str, runs, tmp_path, c
 @pytest.mark.parametrize(
     ("change", "config", "message"),
     [
-        ({"category": "chair"}, {}, "one class, and these runs are of airplane, chair; give --category"),
+        (
+            {"category": "chair"},
+            {},
+            "one class, and these runs are of airplane, chair; give --category",
+        ),
         ({}, {"data": Path("elsewhere")}, "trained on different data .*elsewhere.*; give --data"),
         ({"object_names": ("other",)}, {}, "read different images"),
     ],

@@ -40,7 +40,10 @@ def visit(browser) -> Iterator[Open]:
     def open_page(path: Path, width: int = 1200, height: int = 900, **options: Any) -> Any:
         contexts.append(browser.new_context(viewport={"width": width, "height": height}, **options))
         tab = contexts[-1].new_page()
-        tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+        tab.on(
+            "console",
+            lambda message: said.append(message.text) if message.type == "error" else None,
+        )
         tab.on("pageerror", lambda error: said.append(str(error)))
         tab.on("request", lambda request: asked.append(request.url))
         tab.goto(path.as_uri())
