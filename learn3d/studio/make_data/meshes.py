@@ -44,54 +44,31 @@ class DatasetConfig:
     layout: WrittenLayout = "kato"
     """Published data set whose file layout and viewpoints are used, see docs/data-sets.md."""
     views: Count | None = None
-<<<<<<< HEAD
     """Views of each object. If not given: 20 for kar, 8 for pascal3d, 12 for photos and around; kato always has 24."""
     source: FilePath | None = None
     """Folder of meshes, searched recursively, or a mesh pack .npz. If not given: shapes from --procedural."""
-=======
-    """Views of each object (default: 20 for kar, 8 for pascal3d, 12 for photos and around; kato
-    always has 24)."""
-    source: FilePath | None = None
-    """Folder of meshes, searched recursively, or a mesh pack .npz (default: shapes from
-    --procedural)."""
->>>>>>> 1e10c491 (Studio: lines of at most 100 columns where the formatter keeps them; log of words)
     procedural: Amount = 0
-    """Number of shapes from the procedural generator, instead of meshes from files or together
-    with them."""
+    """Number of shapes from the procedural generator, instead of meshes from files or together with them."""
     test: Weight | None = None
-<<<<<<< HEAD
     """Share (below 1, at least 4 meshes) or number of the meshes for the test split. If not given: 0.2; pascal3d has no
     test split."""
     val: Weight | None = None
     """Share or number of the meshes for the validation split, 0 for none. If not given: 0.1, for pascal3d 0.2."""
-=======
-    """Share (below 1, at least 4 meshes) or number of the meshes for the test split (default:
-    0.2; pascal3d has no test split)."""
-    val: Weight | None = None
-    """Share or number of the meshes for the validation split, 0 for none (default: 0.1, for
-    pascal3d 0.2)."""
->>>>>>> 1e10c491 (Studio: lines of at most 100 columns where the formatter keeps them; log of words)
     augment: Amount = 0
-    """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75
-    .. 1.25. With --source, shapes of --procedural get none."""
+    """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75 .. 1.25. With --source,
+    shapes of --procedural get none."""
     up: Axis = "y"
     """Axis of the mesh files that points up."""
     front: Axis | None = None
-<<<<<<< HEAD
     """Axis of the mesh files that faces the camera of view 0. If not given: x, or y if x is up; z for procedural
     shapes."""
     seed: Amount = 0
-=======
-    """Axis of the mesh files that faces the camera of view 0 (default: x, or y if x is up; z for
-    procedural shapes)."""
-    seed: Rare[Amount] = 0
->>>>>>> 1e10c491 (Studio: lines of at most 100 columns where the formatter keeps them; log of words)
     """Seed of the splits, scales, colours, views and procedural shapes."""
     overwrite: bool = False
     """Replace files of this category that are already in the folder."""
     shards: bool = False
-    """Write shards, for data sets that exceed the memory (docs/scale.md). Only for the layouts
-    kato and around. If the command is interrupted, run it again: it continues."""
+    """Write shards, for data sets that exceed the memory (docs/scale.md). Only for the layouts kato and around. If the
+    command is interrupted, run it again: it continues."""
     workers: Workers = ONE_WORKER
 
     def __post_init__(self) -> None:

@@ -67,14 +67,8 @@ class PoseOptions:
     repeats: Annotated[int, Field(ge=1, le=100)] = 3
     """Number of independent estimates that are averaged: more are more reliable and take longer."""
     prior: Literal["uniform", "free"] = "uniform"
-<<<<<<< HEAD
     """Prior over azimuths. uniform: all azimuths are about equally frequent in the data. free: no assumption."""
     steps: Annotated[int, Field(ge=1, le=100_000)] = 300
-=======
-    """Prior over azimuths. uniform: all azimuths are about equally frequent in the data. free: no
-    assumption."""
-    steps: Rare[Annotated[int, Field(ge=1, le=100_000)]] = 300
->>>>>>> 1e10c491 (Studio: lines of at most 100 columns where the formatter keeps them; log of words)
     """Optimisation steps of each mean shape and of each of the three stages of the prototypes."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial shapes and of the order of the images."""

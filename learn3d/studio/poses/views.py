@@ -40,7 +40,6 @@ class CameraOptions:
     """Known values of the cameras."""
 
     elevation: str | None = None
-<<<<<<< HEAD
     """Elevation of all cameras in degrees, or a range LOW:HIGH. If not given: from the data set, or 30 if it has
     none."""
     distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])] | None = None
@@ -48,16 +47,6 @@ class CameraOptions:
     from the largest mask."""
     fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None = None
     """Full field of view of all cameras in degrees. If not given: from the data set, or 30 if it has none."""
-=======
-    """Elevation of all cameras in degrees, or a range LOW:HIGH (default: from the data set, or 30
-    if it has none)."""
-    distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])] | None = None
-    """Distance of all cameras, in units of the object's longest side (default: from the data set,
-    or estimated from the largest mask)."""
-    fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None = None
-    """Full field of view of all cameras in degrees (default: from the data set, or 30 if it has
-    none)."""
->>>>>>> 1e10c491 (Studio: lines of at most 100 columns where the formatter keeps them; log of words)
 
     def elevations(self) -> tuple[float, float] | None:
         """The lowest and the highest elevation; None if no elevation is given. Raises ValueError for bad text."""

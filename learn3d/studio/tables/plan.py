@@ -33,13 +33,8 @@ class Request:
     methods: tuple[str, ...] = ()
     """Methods of the table: labels of rows, or names of variants. If not given: all."""
     iterations: int | None = None
-<<<<<<< HEAD
     """Training steps; methods with a quarter of the batch, such as Plus, take four times as many. If not given: the
     preset's."""
-=======
-    """Training steps; methods with a quarter of the batch, such as Plus, take four times as many
-    (default: the preset's)."""
->>>>>>> 1e10c491 (Studio: lines of at most 100 columns where the formatter keeps them; log of words)
     batch_size: int | None = None
     """Images per step; Plus and others take a quarter of it. If not given: the preset's."""
     seeds: int | None = None
@@ -48,20 +43,11 @@ class Request:
     """Layout of the data set. If not given: the table's."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
-<<<<<<< HEAD
     threads: int | None = None
     """CPU threads of each run. If not given: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with --cluster."""
     set: tuple[str, ...] = ()
     """Settings and training options to change: NAME=VALUE for all methods that have them, METHOD:NAME=VALUE for one. If
     not given: none."""
-=======
-    threads: Rare[int | None] = None
-    """CPU threads of each run (default: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with
-    --cluster)."""
-    set: tuple[str, ...] = ()
-    """Settings and training options to change: NAME=VALUE for all methods that have them,
-    METHOD:NAME=VALUE for one (default: none)."""
->>>>>>> 1e10c491 (Studio: lines of at most 100 columns where the formatter keeps them; log of words)
     workers: Workers = ONE_WORKER
     report_only: bool = False
     """Train nothing: report the runs that are complete."""
