@@ -9,12 +9,11 @@ from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import VIEWS_OF_OBJECT, batches
 from learn3d.device import keep_freed_memory, resolve_precision
-from learn3d.evaluation import NO_MMD, evaluate, spread_samples
+from learn3d.evaluation import NO_MMD, evaluate, picture_grid, spread_samples
 from learn3d.methods import create_method
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Losses, Method
 from learn3d.methods.pose_updates import update_poses, update_steps
-from learn3d.pictures.grid import picture_grid
 from learn3d.pictures.sheets import save_png
 from learn3d.runs import distributed
 from learn3d.runs import folder as run_folder

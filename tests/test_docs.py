@@ -20,7 +20,7 @@ import trimesh
 import tyro
 
 from learn3d.commands import main
-from learn3d.data.readers import READERS
+from learn3d.data.conventions import LAYOUTS
 from learn3d.methods.optimization import LRSchedule
 from learn3d.presets import PRESETS
 from learn3d.studio.tables.tables import TABLES
@@ -137,7 +137,7 @@ def test_presets_schedules_and_layouts_are_on_their_pages():
     names = {name if not name.startswith("kato2019") else "kato2019-..." for name in PRESETS}
     assert not [name for name in names if f"`{name}`" not in methods]
     assert "|".join(sorted(get_args(LRSchedule))) in methods.replace("\\", "")
-    assert not [name for name in READERS if f"`{name}`" not in data_sets]
+    assert not [name for name in LAYOUTS if f"`{name}`" not in data_sets]
 
 
 def commands():

@@ -7,8 +7,7 @@ from learn3d.commands.command import Command, DataFolder, Split
 from learn3d.data import shards
 from learn3d.data.categories import synset_of
 from learn3d.data.conventions import IMAGE_SIZE
-from learn3d.data.layouts import Layout, check_folder, load_dataset
-from learn3d.data.readers import READERS
+from learn3d.data.layouts import Layout, check_folder, load_dataset, reader
 from learn3d.files.writing import check_target, write_json
 from learn3d.settings import Count, split_names
 from learn3d.tasks import Task, Workers, run_tasks
@@ -77,7 +76,7 @@ class ConvertDataset(Command):
 
     def run(self) -> int:
         check_target(self.output, "--output", folder=True)
-        found = READERS[self.layout].contents(self.data)
+        found = reader(self.layout).contents(self.data)
         splits_of = {synset_of(category): splits for category, splits in found.items()}
         if not (wanted := split_names(self.category) or found):
             raise ValueError(f"{self.data} holds nothing of the layout {self.layout!r}")

@@ -88,6 +88,34 @@ class LayoutProperties:
         return {"category": category, "split": split, "convention": self.convention, "inverted": self.inverted}
 
 
+#: The .mat volumes of Kar, as the paper's code reads them: axes (-z, y, x) of the object frame.
+KAR = VoxelConvention("kar", swap=(1, 3), flip=(1,), kato18_scale=INNER)
+#: The grid of Pascal3D+ spans [-1, 1]; axes (-x, -z, -y) of the object frame.
+PASCAL3D = VoxelConvention("pascal3d", swap=(2, 3), flip=(1, 2, 3), cube_side=2.0)
+
+#: By name; the module of that name in `readers` reads it.
+LAYOUTS = {
+    "kato": LayoutProperties(voxels=True, inverted=True),
+    "dvr": LayoutProperties(voxels=False, inverted=True),
+    "kar": LayoutProperties(
+        voxels=True,
+        convention=KAR,
+        inverted=False,
+        options=("image_size", "views_per_object"),
+    ),
+    "pascal3d": LayoutProperties(
+        voxels=True,
+        convention=PASCAL3D,
+        inverted=False,
+        angles=False,
+        stretched=True,
+        options=("image_size",),
+    ),
+    "photos": LayoutProperties(voxels=False, inverted=True, options=("image_size",)),
+    "around": LayoutProperties(voxels=True, inverted=True),
+}
+
+
 def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
     """Matrix float64 [3, 3] from right-handed mesh coordinates to the object frame: object = matrix @ mesh.
 

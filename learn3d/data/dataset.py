@@ -6,7 +6,7 @@ import dataclasses
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -16,11 +16,13 @@ from torch import Tensor
 import nmr
 from learn3d.data.conventions import VOXEL_SIZE, VoxelConvention
 from learn3d.data.disk_array import DiskArray
-from learn3d.data.framing import Crops
 from learn3d.data.poses import LookAtPoses, PoseCandidates, Poses
 from learn3d.data.view_bins import AngleBins
-from learn3d.files.renderings import MASK_SIZE
+from learn3d.files.limits import MASK_SIZE
 from learn3d.settings import checked
+
+if TYPE_CHECKING:
+    from learn3d.data.framing import Crops
 
 Array = np.ndarray | DiskArray
 

@@ -1,23 +1,34 @@
 """Loads and checks data sets by the name of their layout."""
 
 import contextlib
+import importlib
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 from learn3d.data import shards
 from learn3d.data.categories import SPLITS, find_splits, synset_of
-from learn3d.data.conventions import IMAGE_SIZE, LayoutProperties
+from learn3d.data.conventions import IMAGE_SIZE, LAYOUTS
 from learn3d.data.dataset import ViewDataset, concatenate
-from learn3d.data.pose_table import PoseTable
-from learn3d.data.readers import READERS
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, Problem
 
-Layout = Literal[tuple(READERS)]
-LAYOUTS: dict[str, LayoutProperties] = {name: reader.PROPERTIES for name, reader in READERS.items()}
+Layout = Literal[tuple(LAYOUTS)]
+
+
+def reader(layout: str) -> ModuleType:
+    """The module that reads a layout of `LAYOUTS`; it is imported when it is needed.
+
+    `load(folder, category, split, *, findings, ...)` reads a split of a category (name or synset id), with the
+    layout's `options` as keywords. It raises MissingFile or DamagedFile for the first fault; if the findings are not
+    strict, it records all faults and returns None. `contents(folder)` returns the categories of a folder and the
+    splits of each. Raises KeyError for another name.
+    """
+    LAYOUTS[layout]
+    return importlib.import_module(f"learn3d.data.readers.{layout}")
 
 
 def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None) -> None:
@@ -82,6 +93,8 @@ def load_dataset(
     if views_per_object is not None:
         dataset = dataset.with_few_views(views_per_object)
     if poses is not None:
+        from learn3d.data.pose_table import PoseTable  # here, as few runs need its reader
+
         dataset = PoseTable.read(poses).apply(dataset, str(poses))
     return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
 
@@ -94,15 +107,15 @@ def _read_split(
         size = options.get("image_size")
         return shards.load(folder, category, split, layout=layout, image_size=size, findings=findings)
     known = {name: options[name] for name in LAYOUTS[layout].options if name in options}
-    return READERS[layout].load(folder, category, split, findings=findings, **known)
+    return reader(layout).load(folder, category, split, findings=findings, **known)
 
 
 def _check_layout(folder: Path | str, asked: str) -> None:
     """Raise MissingFile if all data sets of a folder have other layouts."""
     found = []
-    for layout, reader in READERS.items():
+    for layout in LAYOUTS:
         with contextlib.suppress(ValueError, OSError):  # a list of objects is damaged, or of another layout
-            found += [layout] * bool(reader.contents(folder))
+            found += [layout] * bool(reader(layout).contents(folder))
     if found and asked not in found:
         advice = f"add --layout {found[0]}, or choose another folder or preset"
         message = f"this is a data set of the layout {found[0]!r}, not {asked!r}; {advice}"
@@ -135,7 +148,7 @@ def check_folder(
     require_folder(folder)
     found = find_splits(folder, f"*/SPLIT/{shards.SET_FILE}")
     with contextlib.suppress(*(ValueError, OSError) if found or categories else ()):  # the check finds this fault, too
-        for category, there in READERS[layout].contents(folder).items():
+        for category, there in reader(layout).contents(folder).items():
             found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))
     if not found and not categories:
         _check_layout(folder, layout)

@@ -33,10 +33,10 @@ from safetensors.numpy import save_file
 from torch import Tensor
 
 from learn3d.data.categories import synset_of
+from learn3d.data.conventions import LAYOUTS
 from learn3d.data.dataset import ViewDataset, join_datasets
 from learn3d.data.disk_array import CHANGED, MAX_BYTES, ROW, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, RotationPoses
-from learn3d.data.readers import READERS
 from learn3d.files import limits
 from learn3d.files.reading import STRICT, DamagedFile, Findings, open_file, parse_json, read_json
 from learn3d.files.writing import replacing, write_json
@@ -65,7 +65,7 @@ Text = Annotated[str, Field(max_length=1000)]
 class SetFile:
     """`set.json`: facts about all shards of a split."""
 
-    layout: Literal[tuple(READERS)]
+    layout: Literal[tuple(LAYOUTS)]
     shards: Annotated[int, Field(ge=1)]
     image_size: Annotated[int, Field(ge=1, le=4096)]
     view_names: Annotated[list[Text], Field(max_length=limits.VIEW_CLASSES)]
@@ -203,7 +203,7 @@ def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDa
             if not ((tables["sides"] >= 0) & (tables["sides"] <= 1)).all():
                 raise ValueError("sides must lie in 0 .. 1")
             dataset = ViewDataset(
-                **READERS[facts.layout].PROPERTIES.about(category, split),
+                **LAYOUTS[facts.layout].about(category, split),
                 poses=poses,
                 view_ids=tables["view_ids"],
                 view_names=tuple(facts.view_names),

@@ -25,6 +25,7 @@ VOLUME_BYTES = 4 * MIB  # voxel file (.mat); 32^3 cells: 0.3 MB as float64
 IMAGE_FILE_BYTES = 256 * MIB
 IMAGE_SIDE = 10_000  # pixels; a photograph of this side, padded to a square: 400 MB
 IMAGE_PIXELS = 64_000_000  # decoding, masking and framing take about 40 bytes per pixel
+MASK_SIZE = 64  # side of stored silhouettes in pixels, as published
 RENDER_SIDE = 2048  # pixels, for renderings of a data set; published ones: up to 224
 
 # Meshes

@@ -34,7 +34,6 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
         return image
 
 
-MASK_SIZE = 64
 View = tuple[np.ndarray, np.ndarray, int]  # image uint8 [4, S, S], mask uint8 [64, 64], largest value of the mask
 
 
@@ -74,7 +73,7 @@ def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
 
 
 def _read_square(path: Path, size: int) -> tuple[np.ndarray, np.ndarray | None]:
-    image, least = open_image(path, RENDERINGS, limits.RENDER_SIDE), max(size, MASK_SIZE)
+    image, least = open_image(path, RENDERINGS, limits.RENDER_SIDE), max(size, limits.MASK_SIZE)
     if image.width != image.height or image.width < least or image.mode.startswith(("I", "F", "C")):
         raise DamagedFile(path, f"is {_kind(image)}; expected a square image of at least {least}x{least}, 8 bits")
     return split_alpha(image)
@@ -106,7 +105,7 @@ def shrink(planes: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     The planes are padded with 0 to a square. Each pixel is the mean over its area, fractions of pixels included.
     """
     image = _shrink(planes, size)
-    return image, image[3] if size == MASK_SIZE else _shrink(planes[3:], MASK_SIZE)[0]
+    return image, image[3] if size == limits.MASK_SIZE else _shrink(planes[3:], limits.MASK_SIZE)[0]
 
 
 def _shrink(planes: np.ndarray, size: int) -> np.ndarray:

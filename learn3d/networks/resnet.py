@@ -12,8 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.files import formats, sandbox
-
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
@@ -89,6 +87,8 @@ def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
 
     Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has weights of another network.
     """
+    from learn3d.files import formats, sandbox  # here, as a training without pretrained weights reads no such file
+
     read = sandbox.read(formats.read_state_dict, path, wanted="weights of torchvision's resnet18")
     weights = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
     weights |= {name: value for name, value in encoder.state_dict().items() if name.startswith("code.")}

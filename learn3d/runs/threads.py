@@ -15,7 +15,6 @@ from learn3d.runs.distributed import size
 WARM_UP, TRIAL = 1, 5  # steps at the start of a trial that are not timed, and all of its steps
 WINDOW = 20  # steps whose median is compared with the smallest median so far
 SLOWER = 3.0  # ratio of the two medians at which both numbers of threads are measured again
-REST = 1000  # steps with one thread after which both are measured again; it doubles each time
 
 
 class ThreadTuner:
@@ -31,7 +30,7 @@ class ThreadTuner:
         self._seconds: deque[float] = deque(maxlen=WINDOW)  # durations of the last steps
         self._best = float("inf")  # smallest median of WINDOW steps
         self._medians: dict[int, float] = {}  # medians of the current trial, by the number of threads
-        self._trying, self._rest = not self.fixed, REST
+        self._trying = not self.fixed
         self._use(self.all)
 
     def resume(self, chosen: int | None) -> None:
@@ -54,17 +53,15 @@ class ThreadTuner:
     def after_step(self, seconds: float) -> str:
         """Record the duration of a step. Returns a line for the log when a number is chosen, else ""."""
         self._seconds.append(seconds)
-        self._steps += 1
         if self.fixed or len(self._seconds) < (TRIAL if self._trying else WINDOW):
             return ""
         if self._trying:
             return self._try()
         median = statistics.median_low(self._seconds)
         self._best = min(self._best, median)
-        is_due = self.threads == 1 and self._steps >= self._rest
-        if median > SLOWER * self._best or is_due:
-            self._rest = 2 * self._rest if is_due else REST
-            self._trying, self._medians = True, {}
+        if median > SLOWER * self._best:
+            self._trying = True
+            self._medians = {}
             self._use(self.all)
         return ""
 
@@ -73,7 +70,8 @@ class ThreadTuner:
         if self.threads == self.all:
             self._use(1)
             return ""
-        self._trying, self._best = False, min(self._medians.values())
+        self._trying = False
+        self._best = min(self._medians.values())
         times = {count: f"{1000 * self._medians[count]:.0f} ms a step" for count in (1, self.all)}
         self._use(min(self._medians, key=self._medians.__getitem__))
         other = self.all if self.threads == 1 else 1
@@ -82,5 +80,4 @@ class ThreadTuner:
     def _use(self, threads: int) -> None:
         self.threads = threads
         self._seconds.clear()
-        self._steps = 0
         torch.set_num_threads(threads)

@@ -23,7 +23,7 @@ from shapenet_files import write_dvr
 import nmr.neural_renderer as nr
 from learn3d.config import config_to_dict
 from learn3d.data.framing import read_photo
-from learn3d.data.readers import READERS
+from learn3d.data.layouts import reader
 from learn3d.files import formats, sandbox
 from learn3d.presets import config_from_dict, configure, load_config
 from learn3d.runs import checkpoint, log
@@ -89,12 +89,12 @@ def layout_target(tmp: Path, layout: str) -> Target:
             row.split(",")[0] for row in (folder / "chair" / "poses.csv").read_text().split("\n") if ",test" in row
         ),
     }.get(layout, str)()
-    reader = READERS[layout]
+    load = reader(layout).load
 
     def read(folder: Path) -> None:
         found = [p for p in problems(layout, folder, split) if p.severity == "error"]
         try:
-            dataset = reader.load(folder, "chair", split)
+            dataset = load(folder, "chair", split)
         except ERRORS:
             assert found, "the scan did not see what load refused"
             raise

@@ -14,8 +14,7 @@ import torch
 
 import nmr
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import check_folder
-from learn3d.data.readers import READERS
+from learn3d.data.layouts import check_folder, reader
 from learn3d.files.reading import Problem
 
 
@@ -30,7 +29,7 @@ def expect(layout: str, folder: Path, split: str, message: str, severity: str = 
     (found,) = problems(layout, folder, split)
     assert found.severity == severity
     assert message in f"{found.path}: {found.message}"
-    load = READERS[layout].load
+    load = reader(layout).load
     if severity == "warning":
         load(folder, "chair", split)
         return

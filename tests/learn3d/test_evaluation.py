@@ -15,10 +15,8 @@ from vectors import load_vector
 
 import nmr
 from learn3d import evaluation
-from learn3d.data.conventions import KATO
+from learn3d.data.conventions import KAR, KATO, PASCAL3D
 from learn3d.data.dataset import Batch, ViewDataset
-from learn3d.data.readers.kar import KAR
-from learn3d.data.readers.pascal3d import PASCAL3D
 from learn3d.evaluation import NO_MMD, evaluate, mean_mmd, spread_samples
 from learn3d.methods.method import Grids, Meshes
 from learn3d.runs.measurement import class_means, evaluate_runs, format_table

@@ -51,4 +51,4 @@ def test_the_loop_needs_few_modules(tmp_path: Path):
     words = [sys.executable, "-c", code]
     loaded = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path).stdout.split()
     assert not [name for name in loaded if ".studio" in name]
-    assert len(loaded) <= 68
+    assert len(loaded) <= 52

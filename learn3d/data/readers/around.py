@@ -8,11 +8,9 @@ classes are 24 cells of azimuth.
 from pathlib import Path
 from typing import NoReturn
 
-from learn3d.data.conventions import KATO, LayoutProperties
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.reading import STRICT, Findings, MissingFile
 
-PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
 BINS = AngleBins.parse("15x70:-10:60")
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from learn3d.data.categories import SPLITS, find_splits
-from learn3d.data.conventions import IMAGE_SIZE, NUM_VIEWS, LayoutProperties, view_poses
+from learn3d.data.conventions import IMAGE_SIZE, NUM_VIEWS, view_poses
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.data.readers.renderings import category_folder, check_lists, read_objects
@@ -29,7 +29,6 @@ from learn3d.files import limits, npz, renderings
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, read_text
 from learn3d.files.sandbox import Call
 
-PROPERTIES = LayoutProperties(voxels=False, inverted=True)
 POINTS = 10_000  # points that are kept of each object's 100,000, which are in random order
 _EYE_TOLERANCE = 0.01  # largest error of a camera position, in units of the object frame
 _MIN_COSINE = 0.9995  # least cosine of the angle between an image axis or a viewing direction and Kato's

@@ -26,16 +26,13 @@ from pathlib import Path
 import numpy as np
 
 from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import INNER, VOXEL_SIZE, LayoutProperties, VoxelConvention
+from learn3d.data.conventions import LAYOUTS, VOXEL_SIZE
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers.renderings import check_lists, check_poses, join_objects, read_objects
 from learn3d.files import formats, limits, renderings
 from learn3d.files.reading import STRICT, DamagedFile, Findings, faults_of, read_bytes, read_json
 from learn3d.files.sandbox import Call
 
-#: The .mat volumes, as the paper's code reads them: axes (-z, y, x) of the object frame.
-KAR = VoxelConvention("kar", swap=(1, 3), flip=(1,), kato18_scale=INNER)
-PROPERTIES = LayoutProperties(voxels=True, convention=KAR, inverted=False, options=("image_size", "views_per_object"))
 NUM_RENDERS = 20
 HALF_FOV_DEG = math.degrees(math.atan(16 / 60))  # 14.9314
 VIEW_BINS = "15x20"  # K = 72
@@ -86,7 +83,7 @@ def load(
         return check_poses(path, table[:, [0, 1, 3]], _TABLE), volume
 
     objects = read_objects(ids, files, build, image_size, findings, f"{category} {split}")
-    return join_objects(objects, ids, HALF_FOV_DEG, VIEW_BINS, PROPERTIES.about(category, split))
+    return join_objects(objects, ids, HALF_FOV_DEG, VIEW_BINS, LAYOUTS["kar"].about(category, split))
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:

@@ -17,17 +17,14 @@ from learn3d.data.categories import SYNSETS, find_splits, synset_of
 from learn3d.data.conventions import (
     AZIMUTH_STEP_DEG,
     IMAGE_SIZE,
-    KATO,
+    LAYOUTS,
     NUM_VIEWS,
     VOXEL_SIZE,
-    LayoutProperties,
     view_poses,
 )
 from learn3d.data.dataset import ViewDataset
 from learn3d.files import npz
 from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile
-
-PROPERTIES = LayoutProperties(voxels=True, convention=KATO, inverted=True)
 
 _KEY = "arr_0"
 _ARRAYS = {  # dtype and shape of one object
@@ -68,7 +65,7 @@ def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, sp
     count = len(images) // NUM_VIEWS
     view_ids = np.tile(np.arange(NUM_VIEWS), count)
     return ViewDataset(
-        **PROPERTIES.about(category, split),
+        **LAYOUTS["kato"].about(category, split),
         images=images,
         poses=view_poses(torch.from_numpy(view_ids)),
         view_ids=view_ids,

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from learn3d.data.categories import find_splits, synset_of
-from learn3d.data.conventions import VOXEL_SIZE, LayoutProperties, VoxelConvention
+from learn3d.data.conventions import LAYOUTS, VOXEL_SIZE
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import SMALLEST, Crops, bounds
 from learn3d.data.poses import RotationPoses
@@ -30,11 +30,6 @@ from learn3d.files import npz
 from learn3d.files.reading import STRICT, DamagedFile, Findings
 from learn3d.files.sandbox import Call, read_all
 
-#: The grid spans [-1, 1]; axes (-x, -z, -y) of the object frame.
-PASCAL3D = VoxelConvention("pascal3d", swap=(2, 3), flip=(1, 2, 3), cube_side=2.0)
-PROPERTIES = LayoutProperties(
-    voxels=True, convention=PASCAL3D, inverted=False, angles=False, stretched=True, options=("image_size",)
-)
 IMAGE_SIZE = 224
 CATEGORIES = ("aeroplane", "car", "chair")
 FILES = {"train": ("train", "imagenet"), "val": ("val",), "test": ("val",)}
@@ -75,7 +70,7 @@ def load(
     view_ids, view_names = view_classes(rotations, training)
     crops = Crops.from_images(images, boxes, image_size)
     return ViewDataset(
-        **PROPERTIES.about(category, split),
+        **LAYOUTS["pascal3d"].about(category, split),
         images=np.concatenate([crops.cut(), _nearest(masks, image_size)[:, None]], axis=1),
         masks=_nearest(masks, MASK_SIZE),
         poses=poses(rotations),

@@ -21,7 +21,7 @@ from pydantic import Field
 from tqdm import tqdm
 
 from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import LayoutProperties
+from learn3d.data.conventions import LAYOUTS
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
@@ -32,7 +32,6 @@ from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
 from learn3d.terminal import is_watched, note
 
-PROPERTIES = LayoutProperties(voxels=False, inverted=True, options=("image_size",))
 _SCALE_ODD = 1.7  # factor between sizes in images and table that gives a warning; half angles for whole ones give 2
 _SCALE_OFF = 5.0  # factor that is an error: distances are in another unit
 TABLE = "poses.csv"
@@ -104,7 +103,7 @@ def load(
     if not findings.strict:
         return None
     return ViewDataset(
-        **PROPERTIES.about(category, split),
+        **LAYOUTS["photos"].about(category, split),
         images=np.stack([each.image for each in framed]),
         masks=None if image_size == MASK_SIZE else np.stack([each.mask for each in framed]),
         poses=poses,

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from learn3d.data.dataset import ViewDataset
-from learn3d.evaluation import spread_samples
-from learn3d.pictures.grid import AROUND, TURNS_DEG
+from learn3d.evaluation import AROUND, TURNS_DEG, spread_samples
 from learn3d.pictures.sheets import TILE, magnify, natural_colors, save_png, tile
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, grid_surface, orbit
 from learn3d.studio.tables.trained_models import TrainedModel

@@ -12,8 +12,8 @@ import pytest
 from reader_checks import cut_short
 from shapenet_files import CHAIR, write_dvr, write_kar
 
-from learn3d.data.layouts import LAYOUTS, Layout, check_folder, check_options, load_dataset
-from learn3d.data.readers import READERS, renderings
+from learn3d.data.layouts import LAYOUTS, Layout, check_folder, check_options, load_dataset, reader
+from learn3d.data.readers import renderings
 
 TABLE = "04379243"
 
@@ -70,7 +70,7 @@ def test_progress_is_shown_on_a_terminal_only(folders, capsys, monkeypatch) -> N
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_options_of_a_layout(layout) -> None:
-    known = set(inspect.signature(READERS[layout].load).parameters) & {"image_size", "views_per_object"}
+    known = set(inspect.signature(reader(layout).load).parameters) & {"image_size", "views_per_object"}
     assert known == set(LAYOUTS[layout].options)
     if "image_size" in known:
         check_options(layout, image_size=224)
@@ -80,7 +80,7 @@ def test_options_of_a_layout(layout) -> None:
 
 
 def test_unknown_names(folders) -> None:
-    assert tuple(LAYOUTS) == get_args(Layout) == tuple(READERS)
+    assert tuple(LAYOUTS) == get_args(Layout)
     with pytest.raises(ValueError, match=r"layout must be one of kato, .* got 'lsm'"):
         load_dataset("lsm", folders, "chair", "test")
     for category in ("chair,chair", "", "chair,"):

@@ -16,6 +16,7 @@ from reader_checks import problems
 from scipy.spatial.transform import Rotation
 
 import nmr
+from learn3d.data import conventions
 from learn3d.data.dataset import concatenate
 from learn3d.data.layouts import check_folder
 from learn3d.data.readers import pascal3d
@@ -99,7 +100,7 @@ def test_training_is_train_and_imagenet(folder: Path, contents: dict[str, dict])
     dataset = pascal3d.load(folder, "aeroplane", "train")
     assert len(dataset) == dataset.num_objects == 6 and dataset.image_size == 224
     assert dataset.object_names[2:4] == ("aeroplane_train/2", "aeroplane_imagenet/0")
-    assert not dataset.inverted and dataset.convention is pascal3d.PASCAL3D
+    assert not dataset.inverted and dataset.convention is conventions.PASCAL3D
     np.testing.assert_array_equal(dataset.voxels[3:], contents["imagenet"]["voxels"])
     assert dataset.num_views == 4 and sorted(set(dataset.view_ids)) == [0, 1, 2, 3]
     np.testing.assert_array_equal(dataset.view_ids[[1, 2]], dataset.view_ids[[3, 4]])  # the same rotations
@@ -148,7 +149,7 @@ def test_voxels_follow_vpls_rule() -> None:
     """(v + 1) / 2, last two axes exchanged, all three reversed."""
     vertices, faces = tetrahedra()
     grid = nmr.voxelize((vertices + 1) / 2, faces, size=32)
-    assert torch.equal(pascal3d.PASCAL3D.voxelize(vertices, faces), grid.transpose(2, 3).flip((1, 2, 3)))
+    assert torch.equal(conventions.PASCAL3D.voxelize(vertices, faces), grid.transpose(2, 3).flip((1, 2, 3)))
 
 
 def test_view_classes_of_val_are_those_of_training(folder: Path) -> None:

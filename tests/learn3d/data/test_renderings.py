@@ -13,10 +13,9 @@ import torch
 from reader_checks import cut_short, expect, problems, silhouette_iou
 from shapenet_files import CHAIR, COLOR, box_mesh, save, shapes, swap_frames, write_dvr, write_kar
 
-from learn3d.data.conventions import KATO, view_poses
-from learn3d.data.readers import READERS, dvr, kar
-from learn3d.data.readers.kar import KAR
-from learn3d.data.readers.pascal3d import PASCAL3D
+from learn3d.data.conventions import KAR, KATO, PASCAL3D, view_poses
+from learn3d.data.layouts import reader
+from learn3d.data.readers import dvr, kar
 from learn3d.data.readers.renderings import check_poses
 from learn3d.files.reading import DamagedFile
 from nmr.metrics import voxel_iou
@@ -130,7 +129,7 @@ def test_large_images_keep_their_size_and_masks_have_64_pixels(originals) -> Non
 
 def test_contents_and_splits(originals) -> None:
     for layout in ("dvr", "kar"):
-        assert READERS[layout].contents(originals / layout) == {CHAIR: tuple(LISTS)}
+        assert reader(layout).contents(originals / layout) == {CHAIR: tuple(LISTS)}
         assert [problems(layout, originals / layout, split) for split in LISTS] == [()] * len(LISTS)
 
 

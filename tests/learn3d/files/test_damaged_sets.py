@@ -14,8 +14,8 @@ import pytest
 from fuzz_targets import ERRORS, FILES, SETTINGS, TARGETS, Target, layout_target
 from reader_checks import at_most
 
+from learn3d.data.conventions import LAYOUTS
 from learn3d.data.layouts import check_folder
-from learn3d.data.readers import READERS
 from learn3d.presets import configure
 from learn3d.training import train
 
@@ -30,7 +30,7 @@ DAMAGED = {  # what is cut short, and a preset of the layout
 
 def test_every_layout_is_tried():
     message = "add the layout to DAMAGED here, and to FILES (and SETTINGS) of tests/data/fuzz_targets.py"
-    assert set(DAMAGED) == set(FILES) == {*SETTINGS, "dvr"} == set(READERS) - {"around"}, message
+    assert set(DAMAGED) == set(FILES) == {*SETTINGS, "dvr"} == set(LAYOUTS) - {"around"}, message
 
 
 @pytest.mark.parametrize("layout", DAMAGED)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import nmr
 from learn3d.data.categories import SPLITS, synset_of
+from learn3d.data.conventions import KAR as KAR_AXES
 from learn3d.data.dataset import DEPTH_REACH
-from learn3d.data.readers.kar import KAR as KAR_AXES
 from learn3d.data.readers.kar import read_splits
 from learn3d.files.writing import write_json
 from learn3d.studio.make_data.writers.writer import RenderedObject, Writer, random_views, write_png

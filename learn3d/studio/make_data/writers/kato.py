@@ -9,6 +9,7 @@ import numpy as np
 
 import nmr
 from learn3d.data.categories import SPLITS
+from learn3d.data.conventions import LAYOUTS
 from learn3d.data.dataset import ViewDataset, depth_levels
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import around, kato
@@ -59,7 +60,7 @@ def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -
         depth.append(depth_levels(seen, item.poses).numpy())
     poses = LookAtPoses.join([item.poses for item in objects] or [LookAtPoses(*np.zeros((4, 0), np.float32))])
     return ViewDataset(
-        **around.PROPERTIES.about(category, split),
+        **LAYOUTS["around"].about(category, split),
         images=np.array([_images(item) for item in objects], np.uint8).reshape(-1, 4, 64, 64),
         depth=np.array(depth, np.uint8).reshape(-1, 64, 64),
         poses=poses,

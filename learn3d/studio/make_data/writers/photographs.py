@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 import nmr
+from learn3d.data import conventions
 from learn3d.data.poses import RotationPoses
 from learn3d.data.readers import pascal3d
 from learn3d.studio.make_data.writers.writer import (
@@ -93,7 +94,7 @@ PASCAL3D = Writer(
     default_test=0.0,
     default_val=0.2,
     fixed=("test",),
-    convention=pascal3d.PASCAL3D,
+    convention=conventions.PASCAL3D,
     turn=WORLD_FROM_OBJECT,
     diagonal=2.0,
 )

@@ -13,8 +13,8 @@ from tiny_networks import FixedMethod
 from torch import Tensor
 
 import nmr
+from learn3d.evaluation import picture_grid
 from learn3d.methods.method import Grids, Meshes
-from learn3d.pictures.grid import picture_grid
 from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_colors
 from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
 from learn3d.runs import checkpoint
