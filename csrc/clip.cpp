@@ -16,17 +16,17 @@
 namespace nmr {
 namespace {
 
-constexpr int64_t kLanes = 16;
+constexpr int64_t kGroup = 16;
 
 // Whether a depth is behind the plane; false for NaN, because such a face is not drawn anyway.
 template <class T>
 bool any_behind(const T* vertices, int64_t count, T near) {
-  int32_t behind[kLanes] = {};
+  int32_t behind[kGroup] = {};
   int64_t v = 0;
-  for (; v + kLanes <= count; v += kLanes)
-    for (int64_t l = 0; l < kLanes; ++l) behind[l] |= vertices[3 * (v + l) + 2] < near;
+  for (; v + kGroup <= count; v += kGroup)
+    for (int64_t l = 0; l < kGroup; ++l) behind[l] |= vertices[3 * (v + l) + 2] < near;
   for (; v < count; ++v) behind[0] |= vertices[3 * v + 2] < near;
-  return std::any_of(behind, behind + kLanes, [](int32_t any) { return any != 0; });
+  return std::any_of(behind, behind + kGroup, [](int32_t any) { return any != 0; });
 }
 
 // Number of triangles that remain of a face with 0, 1, 2 or 3 corners behind the plane.

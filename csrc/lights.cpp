@@ -43,9 +43,9 @@ struct Unit {
   }
 };
 
-// One lamp of an image, directional or a point, and the gradients of the same.
+// One light of an image, directional or a point, and the gradients of the same.
 template <class T>
-struct Lamp {
+struct Light {
   bool point;
   T intensity;
   Vec3<T> color, place;  // place: direction, or position
@@ -54,53 +54,54 @@ struct Lamp {
 
 // All light of an image; as gradients, the sums over its pixels.
 template <class T>
-struct Lamps {
+struct Lights {
   T ambient, specular, shininess;
   Vec3<T> ambient_color;
-  std::vector<Lamp<T>> lamps;
+  std::vector<Light<T>> each;
   bool highlights;
 
   void set_zero() {
     ambient = specular = shininess = 0;
     ambient_color.setZero();
-    for (Lamp<T>& lamp : lamps) {
-      lamp.intensity = lamp.falloff = 0;
-      lamp.color.setZero();
-      lamp.place.setZero();
+    for (Light<T>& light : each) {
+      light.intensity = light.falloff = 0;
+      light.color.setZero();
+      light.place.setZero();
     }
   }
 };
 
 // Calls body(first value in `parameters`, value) for every parameter of image b.
 template <class T, class Body>
-void for_parameters(const Lit<T>& args, int64_t b, Lamps<T>& lamps, const Body& body) {
-  const auto at = [&](Light name, int64_t light, int64_t width) {
+void for_parameters(const Lit<T>& args, int64_t b, Lights<T>& lights, const Body& body) {
+  const auto at = [&](LightParameter name, int64_t n, int64_t width) {
     const int64_t* l = args.layout + 3 * static_cast<int>(name);
-    return l[0] + ((l[1] == 1 ? 0 : b) * l[2] + (l[2] == 1 ? 0 : light)) * width;
+    return l[0] + ((l[1] == 1 ? 0 : b) * l[2] + (l[2] == 1 ? 0 : n)) * width;
   };
-  const auto one = [&](Light name, int64_t light, T& value) { body(at(name, light, 1), value); };
-  const auto three = [&](Light name, int64_t light, Vec3<T>& value) {
-    for (int k = 0; k < 3; ++k) body(at(name, light, 3) + k, value[k]);
+  const auto one = [&](LightParameter name, int64_t n, T& value) { body(at(name, n, 1), value); };
+  const auto three = [&](LightParameter name, int64_t n, Vec3<T>& value) {
+    for (int k = 0; k < 3; ++k) body(at(name, n, 3) + k, value[k]);
   };
-  one(Light::ambient, 0, lamps.ambient);
-  three(Light::ambient_color, 0, lamps.ambient_color);
+  one(LightParameter::ambient, 0, lights.ambient);
+  three(LightParameter::ambient_color, 0, lights.ambient_color);
   int64_t directional = 0, points = 0;
-  for (Lamp<T>& lamp : lamps.lamps) {
-    const int64_t n = lamp.point ? points++ : directional++;
-    one(lamp.point ? Light::point : Light::directional, n, lamp.intensity);
-    three(lamp.point ? Light::point_color : Light::directional_color, n, lamp.color);
-    three(lamp.point ? Light::position : Light::direction, n, lamp.place);
-    if (lamp.point) one(Light::falloff, n, lamp.falloff);
+  for (Light<T>& light : lights.each) {
+    const int64_t n = light.point ? points++ : directional++;
+    one(light.point ? LightParameter::point : LightParameter::directional, n, light.intensity);
+    three(light.point ? LightParameter::point_color : LightParameter::directional_color, n,
+          light.color);
+    three(light.point ? LightParameter::position : LightParameter::direction, n, light.place);
+    if (light.point) one(LightParameter::falloff, n, light.falloff);
   }
-  if (lamps.highlights) {
-    one(Light::specular, 0, lamps.specular);
-    one(Light::shininess, 0, lamps.shininess);
+  if (lights.highlights) {
+    one(LightParameter::specular, 0, lights.specular);
+    one(LightParameter::shininess, 0, lights.shininess);
   }
 }
 
 // Number of lights of a kind: the largest of its parameters, 0 if one has none.
 template <class T>
-int64_t light_count(const Lit<T>& args, Light first, int64_t parameters) {
+int64_t light_count(const Lit<T>& args, LightParameter first, int64_t parameters) {
   int64_t most = 0;
   for (int64_t n = 0; n < parameters; ++n) {
     const int64_t count = args.layout[3 * (static_cast<int64_t>(first) + n) + 2];
@@ -111,25 +112,25 @@ int64_t light_count(const Lit<T>& args, Light first, int64_t parameters) {
 }
 
 template <class T>
-Lamps<T> lamps_of(const Lit<T>& args, int64_t b) {
-  Lamps<T> lamps{};
-  lamps.ambient_color.setZero();
-  if (!args.parameters) return lamps;
-  const Lamp<T> zero{false, 0, Vec3<T>::Zero(), Vec3<T>::Zero(), 0};
-  lamps.lamps.assign(light_count(args, Light::directional, 3), zero);
-  const size_t directional = lamps.lamps.size();
-  lamps.lamps.resize(directional + light_count(args, Light::point, 4), zero);
-  for (size_t n = directional; n < lamps.lamps.size(); ++n) lamps.lamps[n].point = true;
-  lamps.highlights = light_count(args, Light::specular, 2) > 0;
-  for_parameters(args, b, lamps, [&](int64_t n, T& value) { value = args.parameters[n]; });
-  return lamps;
+Lights<T> lights_of(const Lit<T>& args, int64_t b) {
+  Lights<T> lights{};
+  lights.ambient_color.setZero();
+  if (!args.parameters) return lights;
+  const Light<T> zero{false, 0, Vec3<T>::Zero(), Vec3<T>::Zero(), 0};
+  lights.each.assign(light_count(args, LightParameter::directional, 3), zero);
+  const size_t directional = lights.each.size();
+  lights.each.resize(directional + light_count(args, LightParameter::point, 4), zero);
+  for (size_t n = directional; n < lights.each.size(); ++n) lights.each[n].point = true;
+  lights.highlights = light_count(args, LightParameter::specular, 2) > 0;
+  for_parameters(args, b, lights, [&](int64_t n, T& value) { value = args.parameters[n]; });
+  return lights;
 }
 
 // Whether the light varies over a face.
 template <class T>
 bool uses_position(const Lit<T>& args) {
-  return args.parameters &&
-         (light_count(args, Light::point, 4) > 0 || light_count(args, Light::specular, 2) > 0);
+  return args.parameters && (light_count(args, LightParameter::point, 4) > 0 ||
+                             light_count(args, LightParameter::specular, 2) > 0);
 }
 
 // What a pixel shows: its point, normal and the direction towards the eye.
@@ -174,48 +175,48 @@ struct Highlight {
 };
 
 template <class T>
-PixelLight<T> light_at(const Lamps<T>& lamps, const SurfacePoint<T>& surface, bool highlights) {
-  PixelLight<T> light{lamps.ambient * lamps.ambient_color, Vec3<T>::Zero()};
-  for (const Lamp<T>& lamp : lamps.lamps) {
-    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - surface.point) : lamp.place;
+PixelLight<T> light_at(const Lights<T>& lights, const SurfacePoint<T>& surface, bool highlights) {
+  PixelLight<T> reflected{lights.ambient * lights.ambient_color, Vec3<T>::Zero()};
+  for (const Light<T>& light : lights.each) {
+    const Vec3<T> towards = light.point ? Vec3<T>(light.place - surface.point) : light.place;
     if (!(surface.normal.dot(towards) > 0)) continue;
-    const Vec3<T> color = lamp.intensity * lamp.color;
-    if (!lamp.point && !highlights) {
-      light.diffuse += surface.normal.dot(towards) * color;
+    const Vec3<T> color = light.intensity * light.color;
+    if (!light.point && !highlights) {
+      reflected.diffuse += surface.normal.dot(towards) * color;
       continue;
     }
     const Unit<T> l(towards);
-    const T strength = lamp.point ? 1 / (1 + lamp.falloff * towards.squaredNorm()) : l.length;
-    light.diffuse +=
-        (lamp.point ? strength * surface.normal.dot(l.unit) : surface.normal.dot(towards)) * color;
+    const T strength = light.point ? 1 / (1 + light.falloff * towards.squaredNorm()) : l.length;
+    reflected.diffuse +=
+        (light.point ? strength * surface.normal.dot(l.unit) : surface.normal.dot(towards)) * color;
     if (highlights)
-      light.highlight +=
-          lamps.specular * strength * Highlight<T>(surface, l.unit, lamps.shininess).value * color;
+      reflected.highlight += lights.specular * strength *
+                             Highlight<T>(surface, l.unit, lights.shininess).value * color;
   }
-  return light;
+  return reflected;
 }
 
-// Adds the gradients of the lamps and of the surface (its normal, point and direction towards the
+// Adds the gradients of the lights and of the surface (its normal, point and direction towards the
 // eye).
 template <class T>
-void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface,
-                    const PixelLight<T>& grad, Lamps<T>& grad_lamps,
+void light_backward(const Lights<T>& lights, const SurfacePoint<T>& surface,
+                    const PixelLight<T>& grad, Lights<T>& grad_lights,
                     SurfacePoint<T>& grad_surface) {
-  grad_lamps.ambient += grad.diffuse.dot(lamps.ambient_color);
-  grad_lamps.ambient_color += lamps.ambient * grad.diffuse;
-  for (size_t n = 0; n < lamps.lamps.size(); ++n) {
-    const Lamp<T>& lamp = lamps.lamps[n];
-    Lamp<T>& grad_lamp = grad_lamps.lamps[n];
-    const Vec3<T> towards = lamp.point ? Vec3<T>(lamp.place - surface.point) : lamp.place;
+  grad_lights.ambient += grad.diffuse.dot(lights.ambient_color);
+  grad_lights.ambient_color += lights.ambient * grad.diffuse;
+  for (size_t n = 0; n < lights.each.size(); ++n) {
+    const Light<T>& light = lights.each[n];
+    Light<T>& grad_light = grad_lights.each[n];
+    const Vec3<T> towards = light.point ? Vec3<T>(light.place - surface.point) : light.place;
     if (!(surface.normal.dot(towards) > 0)) continue;
-    const Vec3<T> color = lamp.intensity * lamp.color;
+    const Vec3<T> color = light.intensity * light.color;
     Vec3<T> grad_color = Vec3<T>::Zero(), grad_towards = Vec3<T>::Zero(), grad_l = Vec3<T>::Zero();
     T grad_strength = 0;
     const Unit<T> l(towards);
     const T square = towards.squaredNorm(),
-            strength = lamp.point ? 1 / (1 + lamp.falloff * square) : l.length;
+            strength = light.point ? 1 / (1 + light.falloff * square) : l.length;
     const T colored = grad.diffuse.dot(color);
-    if (lamp.point) {
+    if (light.point) {
       const T cosine = surface.normal.dot(l.unit);
       grad_color += strength * cosine * grad.diffuse;
       grad_strength += colored * cosine;
@@ -226,27 +227,27 @@ void light_backward(const Lamps<T>& lamps, const SurfacePoint<T>& surface,
       grad_surface.normal += colored * towards;
       grad_towards += colored * surface.normal;
     }
-    if (lamps.highlights) {
-      const Highlight<T> h(surface, l.unit, lamps.shininess);
+    if (lights.highlights) {
+      const Highlight<T> h(surface, l.unit, lights.shininess);
       const T shine = grad.highlight.dot(color);
-      grad_color += lamps.specular * strength * h.value * grad.highlight;
-      grad_lamps.specular += shine * strength * h.value;
-      grad_strength += shine * lamps.specular * h.value;
-      h.backward(surface, l.unit, lamps.shininess, shine * lamps.specular * strength, grad_surface,
-                 grad_l, grad_lamps.shininess);
+      grad_color += lights.specular * strength * h.value * grad.highlight;
+      grad_lights.specular += shine * strength * h.value;
+      grad_strength += shine * lights.specular * h.value;
+      h.backward(surface, l.unit, lights.shininess, shine * lights.specular * strength,
+                 grad_surface, grad_l, grad_lights.shininess);
     }
-    grad_lamp.intensity += grad_color.dot(lamp.color);
-    grad_lamp.color += lamp.intensity * grad_color;
+    grad_light.intensity += grad_color.dot(light.color);
+    grad_light.color += light.intensity * grad_color;
     grad_towards += l.backward(grad_l);
-    if (lamp.point) {
+    if (light.point) {
       const T grad_square = -grad_strength * strength * strength;
-      grad_lamp.falloff += grad_square * square;
-      grad_towards += 2 * grad_square * lamp.falloff * towards;
+      grad_light.falloff += grad_square * square;
+      grad_towards += 2 * grad_square * light.falloff * towards;
       grad_surface.point -= grad_towards;
     } else {
       grad_towards += grad_strength * l.unit;
     }
-    grad_lamp.place += grad_towards;
+    grad_light.place += grad_towards;
   }
 }
 
@@ -316,23 +317,23 @@ NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id
 constexpr int64_t kSums = 18;  // per visible face: of the normal (smooth: of three corners), of the
                                // positions of the corners
 
-// The sums of a block: of visible faces, and of the lamps.
+// The sums of a block: of visible faces, and of the lights.
 template <class T>
 struct LitSums {
   VisibleFaces visible;
   std::vector<T> values;  // [count, kSums]
   std::vector<T> faces;   // [count, 3] light of each face, or its gradient
-  Lamps<T> lamps;
+  Lights<T> lights;
 };
 
 // The gradients of one pixel, or of one face if all its pixels are lit alike (weights: nullptr).
 template <class T>
-NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps,
+NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lights<T>& lights,
                                const Pixel<T>& p, const T* weights, const PixelLight<T>& grad,
-                               bool position, Lamps<T>& grad_lamps, T* sums, T* grad_weights) {
+                               bool position, Lights<T>& grad_lights, T* sums, T* grad_weights) {
   SurfacePoint<T> grad_surface{Vec3<T>::Zero(), Vec3<T>::Zero(), Vec3<T>::Zero()};
   if (args.parameters)
-    light_backward(lamps, p.surface, grad, grad_lamps, grad_surface);
+    light_backward(lights, p.surface, grad, grad_lights, grad_surface);
   else
     grad_surface.normal = grad.diffuse;
   Vec3<T> grad_mean = p.sign * grad_surface.normal;
@@ -360,12 +361,13 @@ NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const La
 
 // The light of each visible face of the block, or its normal. Weights do not matter.
 template <class T>
-void light_faces(const Lit<T>& args, const View<T>& view, const Lamps<T>& lamps, LitSums<T>& sums) {
+void light_faces(const Lit<T>& args, const View<T>& view, const Lights<T>& lights,
+                 LitSums<T>& sums) {
   T* face = reserve(sums.faces, 3 * sums.visible.count);
   for (int64_t n = 1; n < sums.visible.count; ++n) {
     const Pixel<T> p = pixel_of<T>(args, view, sums.visible.ids[n], nullptr, false);
     const Vec3<T> light =
-        args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
+        args.parameters ? light_at(lights, p.surface, false).diffuse : p.surface.normal;
     for (int k = 0; k < 3; ++k) face[3 * n + k] = light[k];
   }
 }
@@ -423,11 +425,11 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
   const int64_t H = args.at.raster.height, W = args.at.raster.width;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   const View<T> view(args, b);
-  const Lamps<T> lamps = lamps_of(args, b);
+  const Lights<T> lights = lights_of(args, b);
   const bool position = uses_position(args), per_face = !args.smooth && !position;
   if (per_face) {
     find_visible(args, view, blocks, begin, end, sums);
-    light_faces(args, view, lamps, sums);
+    light_faces(args, view, lights, sums);
     return lit_faces_forward<kColors>(args, begin, end, sums);
   }
   for (int64_t n = begin; n < end; ++n) {
@@ -439,11 +441,13 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
     }
     const T* color = kColors ? args.colors + kColors * n : nullptr;
     const Pixel<T> p = pixel_of(args, view, id, args.at.weights + 3 * n, position);
-    const PixelLight<T> light = args.parameters ? light_at(lamps, p.surface, lamps.highlights)
-                                                : PixelLight<T>{p.surface.normal, Vec3<T>::Zero()};
+    const PixelLight<T> reflected = args.parameters
+                                        ? light_at(lights, p.surface, lights.highlights)
+                                        : PixelLight<T>{p.surface.normal, Vec3<T>::Zero()};
     for (int k = 0; k < 3; ++k)
-      lit[k] = (kColors ? color[kColors == 3 ? k : 0] * light.diffuse[k] : light.diffuse[k]) +
-               light.highlight[k];
+      lit[k] =
+          (kColors ? color[kColors == 3 ? k : 0] * reflected.diffuse[k] : reflected.diffuse[k]) +
+          reflected.highlight[k];
   }
 }
 
@@ -453,15 +457,15 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
   const int64_t H = args.at.raster.height, W = args.at.raster.width;
   const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
   const View<T> view(args, b);
-  const Lamps<T> lamps = lamps_of(args, b);
+  const Lights<T> lights = lights_of(args, b);
   const bool position = uses_position(args), per_face = !args.smooth && !position;
-  sums.lamps = lamps;
-  sums.lamps.set_zero();
+  sums.lights = lights;
+  sums.lights.set_zero();
   find_visible(args, view, blocks, begin, end, sums);
   const int64_t count = sums.visible.count;
   std::fill_n(reserve(sums.values, kSums * count), kSums * count, T(0));
   if (per_face) {
-    light_faces(args, view, lamps, sums);
+    light_faces(args, view, lights, sums);
     lit_faces_backward<kColors>(args, begin, end, sums);
   }
   for (int64_t n = begin; !per_face && n < end; ++n) {
@@ -480,16 +484,16 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
     for (int k = 0; kColors && k < 3; ++k) grads.diffuse[k] *= color[kColors == 3 ? k : 0];
     if (grad_color) {
       const Vec3<T> light =
-          args.parameters ? light_at(lamps, p.surface, false).diffuse : p.surface.normal;
+          args.parameters ? light_at(lights, p.surface, false).diffuse : p.surface.normal;
       for (int k = 0; k < 3; ++k) grad_color[kColors == 3 ? k : 0] += light[k] * grad[k];
     }
-    pixel_backward(args, view, lamps, p, weights, grads, position, sums.lamps, sum, grad_weights);
+    pixel_backward(args, view, lights, p, weights, grads, position, sums.lights, sum, grad_weights);
   }
   for (int64_t n = 1; per_face && n < count; ++n) {
     T* sum = sums.values.data() + kSums * n;
     const Pixel<T> p = pixel_of<T>(args, view, sums.visible.ids[n], nullptr, false);
     const PixelLight<T> grads{load3(sum + 9), Vec3<T>::Zero()};
-    pixel_backward<T>(args, view, lamps, p, nullptr, grads, false, sums.lamps, sum, nullptr);
+    pixel_backward<T>(args, view, lights, p, nullptr, grads, false, sums.lights, sum, nullptr);
   }
 }
 
@@ -514,7 +518,7 @@ void scatter_lit(const Lit<T>& args, int64_t b, LitSums<T>& sums) {
     }
   }
   if (args.parameters && args.grad_parameters)
-    for_parameters(args, b, sums.lamps,
+    for_parameters(args, b, sums.lights,
                    [&](int64_t n, T& value) { args.grad_parameters[n] += value; });
 }
 

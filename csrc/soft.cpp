@@ -2,9 +2,9 @@
 //
 // At pixel centre p, face j has the probability D_j = 1 / (1 + exp(-x_j)) with x_j = +-d^2 / sigma:
 // d is the distance from p to the border of the triangle, + inside and - outside. Faces outside
-// with d^2 >= reach are left out. alpha = 1 - clear with clear = prod_j (1 - D_j). The derivative
-// needs no division: d alpha / d x_j = clear D_j. That of sigma is the sum of -x_j / sigma times
-// this.
+// with d^2 >= reach are left out. alpha = 1 - transmittance with transmittance = prod_j (1 - D_j).
+// The derivative needs no division: d alpha / d x_j = transmittance D_j. That of sigma is the sum
+// of -x_j / sigma times this.
 //
 // Distances are measured in units of half the shorter side of the raster. The nearest point of the
 // border is on one of the three sides, at p_a + t (p_b - p_a); the derivative of d^2 with respect
@@ -160,11 +160,11 @@ void soft_forward(const SoftForward<T>& args) {
   parallel_for(args.mesh.batch * bands, args.num_threads, [&](int64_t task) {
     const int64_t b = task / bands, first = task % bands * kBandRows,
                   last = std::min(first + kBandRows, raster.height) - 1;
-    T* clear = args.clear + b * raster.pixels();
-    std::fill_n(clear + (raster.height - 1 - last) * raster.width,
+    T* transmittance = args.transmittance + b * raster.pixels();
+    std::fill_n(transmittance + (raster.height - 1 - last) * raster.width,
                 (last - first + 1) * raster.width, T(1));
     const SoftImage<T> image = soft_image(args.mesh, args.settings, b, columns.data());
-    NMR_AT_BEST_LEVEL(soft_forward_band, image, first, last, clear);
+    NMR_AT_BEST_LEVEL(soft_forward_band, image, first, last, transmittance);
   });
 }
 
@@ -183,7 +183,7 @@ void soft_backward(const SoftBackward<T>& args) {
   }
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
     for (int64_t n = b * raster.pixels(); n < (b + 1) * raster.pixels(); ++n)
-      pull[n] = -args.grad_clear[n] * args.clear[n];
+      pull[n] = -args.grad_transmittance[n] * args.transmittance[n];
   });
   std::vector<T> grads(kSums * first_face.back());
   std::vector<unsigned char> drawn(first_face.back());

@@ -72,17 +72,17 @@ NMR_INLINE SoftPixel<T> evaluate(const SoftFace<T>& face, T px, T py, T sigma, T
   return p;
 }
 
-// Multiplies the rows [first, last] (from the bottom) of `clear [H, W]`, row 0 = top, by 1 - D of
-// every face.
+// Multiplies the rows [first, last] (from the bottom) of `transmittance [H, W]`, row 0 = top, by 1
+// - D of every face.
 template <class T>
-void soft_forward_band(const SoftImage<T>& image, int64_t first, int64_t last, T* clear) {
+void soft_forward_band(const SoftImage<T>& image, int64_t first, int64_t last, T* transmittance) {
   const Size raster = image.settings.raster;
   for (int64_t f = 0; f < image.num_faces; ++f) {
     SoftFace<T> face;
     if (!set_up_face(image, f, face)) continue;
     for (int64_t j = std::max(face.row_first, first); j <= std::min(face.row_last, last); ++j) {
       const T py = image.row(j);
-      T* row = clear + (raster.height - 1 - j) * raster.width;
+      T* row = transmittance + (raster.height - 1 - j) * raster.width;
       for (int64_t i = face.column_first; i <= face.column_last; i += kGroup) {
         T clears[kGroup];
         for (int64_t n = 0; n < kGroup; ++n)
@@ -133,8 +133,8 @@ void soft_layers_band(const SoftImage<T>& image, const SoftBand<T>& band) {
   }
 }
 
-// The gradient of one face: x and y of its corners, and sigma. pull [H, W] is grad_alpha * clear:
-// the gradient of x_j (soft.cpp) without its factor D_j.
+// The gradient of one face: x and y of its corners, and sigma. pull [H, W] is grad_alpha *
+// transmittance: the gradient of x_j (soft.cpp) without its factor D_j.
 template <class T>
 void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, const T* pull,
                         T* grad) {

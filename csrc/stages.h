@@ -192,8 +192,8 @@ struct SilhouetteBackward {
   int num_threads;
 };
 
-// The soft silhouette of SoftRas (soft.cpp): alpha = 1 - clear, clear = the product of 1 - D over
-// all faces.
+// The soft silhouette of SoftRas (soft.cpp): alpha = 1 - transmittance, transmittance = the product
+// of 1 - D over all faces.
 template <class T>
 struct SoftSettings {
   RasterSettings<T> raster;  // faces wholly nearer than near or farther than far are left out
@@ -206,7 +206,7 @@ template <class T>
 struct SoftForward {
   MeshBatch<T> mesh;
   SoftSettings<T> settings;
-  T* clear;  // out [B, H, W]
+  T* transmittance;  // out [B, H, W]
   int num_threads;
 };
 
@@ -214,10 +214,10 @@ template <class T>
 struct SoftBackward {
   MeshBatch<T> mesh;
   SoftSettings<T> settings;
-  const T* clear;       // [B, H, W] of the forward pass
-  const T* grad_clear;  // [B, H, W]
-  T* grad_vertices;     // out, like mesh.vertices; z gets 0
-  T* grad_sigma;        // out [B]
+  const T* transmittance;       // [B, H, W] of the forward pass
+  const T* grad_transmittance;  // [B, H, W]
+  T* grad_vertices;             // out, like mesh.vertices; z gets 0
+  T* grad_sigma;                // out [B]
   int num_threads;
 };
 
@@ -440,7 +440,7 @@ struct Normals {
 
 // The parameters of lights, in this order in `layout`. Each has a row for every image or one for
 // all, and in a row a number, or a vector of three, for every light or one for all.
-enum class Light : int {
+enum class LightParameter : int {
   ambient,
   ambient_color,
   directional,
@@ -473,8 +473,9 @@ struct Lit {
   bool smooth;  // normals of vertices, interpolated: sum of b_k n_k, divided by its length or 1e-5
   const T* viewer;  // [B, 5]: place of the eye, 1; or direction towards the viewer, 0; then -1 if
                     // the camera sees a right-handed world (Pinhole), else 1
-  const T* parameters;    // all lights, or nullptr: the result is the normal
-  const int64_t* layout;  // [Light::count, 3]: first value, rows (1 or B), lights (may be 0)
+  const T* parameters;  // all lights, or nullptr: the result is the normal
+  const int64_t*
+      layout;  // [LightParameter::count, 3]: first value, rows (1 or B), lights (may be 0)
   int64_t num_parameters;
   const T* colors;     // [B, H, W, C], or nullptr: white
   int64_t channels;    // C: 1 or 3

@@ -71,8 +71,8 @@ class Scene(NamedTuple):
 
     def soft_silhouette(self, sigma: Tensor, dist_eps: float) -> Tensor:
         settings, reach = self.settings, math.log(1 / dist_eps - 1)
-        clear = ops.soft_silhouette(*self.drawn[:3], *settings.raster, sigma.double(), *settings[3:6], reach)
-        return 1 - average(clear.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
+        transmittance = ops.soft_silhouette(*self.drawn[:3], *settings.raster, sigma.double(), *settings[3:6], reach)
+        return 1 - average(transmittance.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
     def depth(self, face_index: Tensor) -> Tensor:
         settings = self.settings

@@ -229,11 +229,11 @@ def render_transparent(
     fragments = scene.fragments(scene.rasterize_layers(check_size(faces_per_pixel, "faces_per_pixel", 1024)))
     image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
     opacity = torch.where(fragments.covered, _opacity_at(fragments, opacity), image.new_zeros(()))
-    clear = _running_products(1 - opacity)
-    before = torch.cat([torch.ones_like(clear[..., :1]), clear[..., :-1]], dim=-1)
+    transmittance = _running_products(1 - opacity)
+    before = torch.cat([torch.ones_like(transmittance[..., :1]), transmittance[..., :-1]], dim=-1)
     image = torch.where(fragments.covered.unsqueeze(-1), image, image.new_zeros(()))
-    rgb = ((before * opacity).unsqueeze(-1) * image).sum(-2) + clear[..., -1:] * behind[:, None, None]
-    both = fragments.layer(0)._resolve(torch.cat([rgb, 1 - clear[..., -1:]], dim=-1), None, "nmr")
+    rgb = ((before * opacity).unsqueeze(-1) * image).sum(-2) + transmittance[..., -1:] * behind[:, None, None]
+    both = fragments.layer(0)._resolve(torch.cat([rgb, 1 - transmittance[..., -1:]], dim=-1), None, "nmr")
     return Images({"rgb": both[..., :-1], "alpha": both[..., -1]})
 
 

@@ -33,7 +33,8 @@ _HARMONICS = (
     0.54627422,
 )
 
-# In the order of the kernel's enum Light: accepted shapes, as text and as numbers of axes; then 1 for vectors, else 0.
+# In the order of the kernel's enum LightParameter: accepted shapes, as text and as numbers of axes;
+# then 1 for vectors, else 0.
 _SHAPES = {
     "ambient": ("[] or [B]", (0, 1), 0),
     "ambient_color": ("[3] or [B, 3]", (1, 2), 1),

@@ -18,12 +18,13 @@ Normals<T> read_normals(Call& call) {
   return args;
 }
 
-// Numbers of each parameter, in the order of Light.
+// Numbers of each parameter, in the order of LightParameter.
 constexpr int64_t kWidths[] = {1, 3, 1, 3, 3, 1, 3, 3, 1, 1, 1};
-constexpr int64_t kCount = static_cast<int64_t>(Light::count), kMostLights = int64_t(1) << 20;
+constexpr int64_t kCount = static_cast<int64_t>(LightParameter::count), kMostLights = int64_t(1)
+                                                                                      << 20;
 
 // Parameters that belong together have one light or the same number.
-void require_group(const int64_t* layout, Light from, Light to) {
+void require_group(const int64_t* layout, LightParameter from, LightParameter to) {
   const int64_t begin = static_cast<int64_t>(from), end = static_cast<int64_t>(to) + 1;
   int64_t most = 0, least = kMostLights;
   for (int64_t n = begin; n < end; ++n) {
@@ -39,8 +40,8 @@ void require_group(const int64_t* layout, Light from, Light to) {
 void require_layout(const int64_t* layout, int64_t num_parameters, int64_t batch) {
   for (int64_t n = 0; n < kCount; ++n) {
     const int64_t *l = layout + 3 * n, first = l[0], rows = l[1], lights = l[2];
-    const bool several =
-        n >= static_cast<int64_t>(Light::directional) && n < static_cast<int64_t>(Light::specular);
+    const bool several = n >= static_cast<int64_t>(LightParameter::directional) &&
+                         n < static_cast<int64_t>(LightParameter::specular);
     require(
         lights >= 0 && lights < kMostLights && (several || lights <= 1) && (n > 1 || lights == 1),
         "impossible number of lights");
@@ -48,8 +49,8 @@ void require_layout(const int64_t* layout, int64_t num_parameters, int64_t batch
                             first + rows * lights * kWidths[n] <= num_parameters),
             "a parameter of lights lies outside the array");
   }
-  require_group(layout, Light::directional, Light::direction);
-  require_group(layout, Light::point, Light::falloff);
+  require_group(layout, LightParameter::directional, LightParameter::direction);
+  require_group(layout, LightParameter::point, LightParameter::falloff);
 }
 
 template <class T>

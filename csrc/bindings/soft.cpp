@@ -20,8 +20,8 @@ template <class T>
 void draw_soft(Call& call) {
   SoftForward<T> args{};
   args.mesh = read_mesh<T>(call);
-  call.read("clear [B, H, W]", args.clear);
-  args.settings = read_settings<T>(call, "clear", true);
+  call.read("transmittance [B, H, W]", args.transmittance);
+  args.settings = read_settings<T>(call, "transmittance", true);
   args.num_threads = num_threads(call);
   soft_forward(args);
 }
@@ -30,9 +30,9 @@ template <class T>
 void soft_gradient(Call& call) {
   SoftBackward<T> args{};
   args.mesh = read_mesh<T>(call);
-  call.read("clear [B, H, W]", args.clear);
-  call.read("grad_clear [B, H, W]", args.grad_clear);
-  args.settings = read_settings<T>(call, "clear", true);
+  call.read("transmittance [B, H, W]", args.transmittance);
+  call.read("grad_transmittance [B, H, W]", args.grad_transmittance);
+  args.settings = read_settings<T>(call, "transmittance", true);
   args.num_threads = num_threads(call);
   std::vector<T> all_vertices, of_sigma(args.mesh.batch);  // where nobody asked for them
   double* grad_sigma = nullptr;

@@ -7,7 +7,7 @@ from ._kernel import kernel
 from .raster import batch_size
 
 
-@kernel("clear", gradients="vertices sigma", keep="clear", used_by="render_soft_silhouette")
+@kernel("transmittance", gradients="vertices sigma", keep="transmittance", used_by="render_soft_silhouette")
 def soft_silhouette(
     vertices: Tensor,
     faces: Tensor,

@@ -96,9 +96,9 @@ struct Run {
 
     const T sigma = seed % 7 < 3 ? T(1e-4) : seed % 7 < 5 ? T(1e-2) : T(0.3);
     const SoftSettings<T> soft{settings, sigma, seed % 5 == 0 ? T(100) : T(7) * sigma};
-    T* clear = out("clear", pixels);
-    soft_forward(SoftForward<T>{mesh, soft, clear, threads});
-    soft_backward(SoftBackward<T>{mesh, soft, clear, in("grad_clear", pixels),
+    T* transmittance = out("transmittance", pixels);
+    soft_forward(SoftForward<T>{mesh, soft, transmittance, threads});
+    soft_backward(SoftBackward<T>{mesh, soft, transmittance, in("grad_transmittance", pixels),
                                   out("grad_soft", 3 * rows), out("grad_sigma", s.batch), threads});
     soft_layers(SoftLayers<T>{mesh, soft, layers,
                               r.template out<int32_t>("soft_layers", layers * pixels), threads});
@@ -338,7 +338,7 @@ struct Run {
     normals_forward(normals);
     normals_backward(normals);
 
-    constexpr int64_t kKinds = static_cast<int64_t>(Light::count),
+    constexpr int64_t kKinds = static_cast<int64_t>(LightParameter::count),
                       kWidths[kKinds] = {1, 3, 1, 3, 3, 1, 3, 3, 1, 1, 1};
     const int64_t directional = seed / 2 % 3, points = seed / 8 % 3, highlights = seed / 32 % 2;
     const int64_t number[kKinds] = {1, 1,      directional, 1,          directional, points,
@@ -517,7 +517,7 @@ struct Run {
     T* target = in("target", pixels);
     for (int64_t n = 0; n < pixels; ++n) target[n] = std::abs(target[n]);
     double* areas = r.areas.resize("areas", 2 * s.batch).data();
-    const SoftIou<T> args{r.get("clear").data(),
+    const SoftIou<T> args{r.get("transmittance").data(),
                           target,
                           s.batch,
                           raster.pixels(),
@@ -765,7 +765,8 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     }
   }
 
-  check_all({"clear"}, [](T x) { return x >= 0 && x <= 1; }, "a soft silhouette lies in [0, 1]");
+  check_all(
+      {"transmittance"}, [](T x) { return x >= 0 && x <= 1; }, "a soft silhouette lies in [0, 1]");
   check_all(
       {"normals"}, [](T x) { return std::abs(x) <= T(1.00001); }, "a normal has the length 1 or 0");
   check_all({"level"}, [](T x) { return x >= 0 && x <= 2; }, "a mipmap level is one that there is");

@@ -96,7 +96,7 @@ TEST_REAL(an_image_does_not_depend_on_its_company) {
     for (const char* name : {"voxels", "touched"})
       CHECK(alone.template get<unsigned char>(name) ==
             share(together.template get<unsigned char>(name), b, kMeshes));
-    for (const char* name : {"alpha", "clear", "weights", "depth", "depth_image", "colors",
+    for (const char* name : {"alpha", "transmittance", "weights", "depth", "depth_image", "colors",
                              "values", "normals", "loss"})
       CHECK(alone.get(name) == share(together.get(name), b, kMeshes));
   }
@@ -128,8 +128,9 @@ TEST_REAL(the_order_of_faces_changes_nothing) {
     CHECK(a.template get<unsigned char>(name) == b.template get<unsigned char>(name));
   for (const char* name : {"alpha", "weights", "depth", "depth_image", "values"})
     CHECK(a.get(name) == b.get(name));
-  for (const char* name : {"clear", "grad_soft", "grad_silhouette", "grad_local", "grad_edges",
-                           "grad_fragments", "grad_depth_vertices", "grad_soft_fragments"})
+  for (const char* name :
+       {"transmittance", "grad_soft", "grad_silhouette", "grad_local", "grad_edges",
+        "grad_fragments", "grad_depth_vertices", "grad_soft_fragments"})
     CHECK(relative_difference(a.get(name), b.get(name)) < (sizeof(T) == 4 ? 1e-4 : 1e-12));
 }
 
@@ -163,7 +164,7 @@ TEST(float_agrees_with_double) {
 TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
   const std::pair<const char*, std::vector<const char*>> cases[] = {
       {"grad_alpha", {"grad_silhouette", "grad_local"}},
-      {"grad_clear", {"grad_soft", "grad_sigma"}},
+      {"grad_transmittance", {"grad_soft", "grad_sigma"}},
       {"grad_distances", {"grad_soft_fragments"}},
       {"grad_weights", {"grad_fragments"}},
       {"grad_depth", {"grad_fragments"}},
