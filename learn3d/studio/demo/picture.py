@@ -2,7 +2,8 @@
 
 import base64
 import io
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,11 +14,19 @@ from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.pictures.photograph import PALETTES, natural_look, photograph
 from learn3d.studio.picture_to_mesh.cutting import Box, Judge, Outline, correct, find_outline
-from learn3d.studio.picture_to_mesh.reconstruction import Model, mesh_bytes, reconstruct_picture
+from learn3d.studio.picture_to_mesh.reconstruction import (
+    Model,
+    Reconstruction,
+    mesh_bytes,
+    reconstruct_guesses,
+    reconstruct_several,
+)
+from learn3d.studio.picture_to_mesh.several import MOST_PICTURES
 from learn3d.studio.shapes import make_shape
 
 SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
 EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # category: seed
+GUESSES = 3  # different shapes of one picture among which a visitor can choose
 _MARGIN = 24  # pixels around the object of an example
 
 Send = Callable[[dict[str, Any]], None]
@@ -61,38 +70,74 @@ def find_object(picture: Picture, judge: Judge | None = None) -> tuple[Outline, 
     return outline._replace(mask=mask), left_out
 
 
-def make_meshes(models: Mapping[str, Model], picture: Picture, send: Send) -> None:
-    """Send the mask, the progress, and in the end the meshes of all models, or an error as a sentence."""
+def unpack_several(content: bytes, widths: Sequence[int], heights: Sequence[int]) -> list[Picture]:
+    """Decode several pictures, each R, G, B and mask for each pixel, one after the other.
+
+    Raises ValueError for a wrong number of pictures or bytes.
+    """
+    if len(widths) != len(heights) or not 2 <= len(widths) <= MOST_PICTURES:
+        raise ValueError(f"{len(widths)} widths and {len(heights)} heights came for 2 to {MOST_PICTURES} pictures")
+    ends = [0, *itertools.accumulate(4 * w * h for w, h in zip(widths, heights, strict=True))]
+    if ends[-1] != len(content):
+        raise ValueError(f"{len(content)} bytes came for pictures of {ends[-1]} bytes")
+    parts = (content[start:end] for start, end in itertools.pairwise(ends))
+    return [unpack(*each) for each in zip(parts, widths, heights, strict=True)]
+
+
+def make_meshes(
+    models: Mapping[str, Model], pictures: Sequence[Picture], send: Send, category: str | None = None
+) -> None:
+    """Send the masks, the progress, and in the end the meshes of all models, or an error as a sentence.
+
+    Several pictures show one object, of which the first model makes a mesh. category: the object's, None if unknown.
+    """
     try:
-        outline, left_out = find_object(picture, next(iter(models.values())).judge)
-        mask = outline.mask
-        send({"mask": _base64(np.packbits(mask > 127).tobytes()), "left_out": left_out, "how": outline.how})
-        try:
-            check_mask(mask, cropped=True)
-        except ValueError:
-            raise ValueError("No object was found. Draw a box around it, or paint it with Add.") from None
-        if outline.doubt:
-            raise ValueError(f"Is this the object? {outline.doubt.capitalize()}. Draw a box around it (Box).")
-        send({"meshes": [_mesh(label, model, picture.colors, mask, send) for label, model in models.items()]})
+        judge, masks = next(iter(models.values())).judge, []
+        for number, picture in enumerate(pictures):
+            outline, left_out = find_object(picture, judge)
+            of = {"of": number} if len(pictures) > 1 else {}
+            found = {"mask": _base64(np.packbits(outline.mask > 127).tobytes()), "left_out": left_out}
+            send(found | {"how": outline.how} | of)
+            try:
+                check_mask(outline.mask, cropped=True)
+            except ValueError:
+                which = f" in picture {number + 1}" if of else ""
+                raise ValueError(f"No object was found{which}. Draw a box around it, or paint it with Add.") from None
+            if outline.doubt and not of:
+                raise ValueError(f"Is this the object? {outline.doubt.capitalize()}. Draw a box around it (Box).")
+            masks.append(outline.mask)
+
+        def progress(text: str, part: float) -> None:
+            send({"progress": text, "part": part})
+
+        photos = [(picture.colors, mask) for picture, mask in zip(pictures, masks, strict=True)]
+        if len(photos) == 1:
+            options = {"progress": progress, "category": category, "guesses": GUESSES}
+            made = {label: reconstruct_guesses(model, *photos[0], **options) for label, model in models.items()}
+            send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
+            for label, guesses in made.items():
+                for guess in guesses:
+                    send({"guess": _message(label, guess)})
+            return
+        label, model = next(iter(models.items()))
+        found = reconstruct_several(model, photos, category=category, progress=progress)
+        send({"meshes": [_message(label, found.made)], "unused": found.left_out})
     except ValueError as error:
         send({"error": str(error)})
 
 
-def _mesh(label: str, model: Model, colors: np.ndarray, mask: np.ndarray, send: Send) -> dict[str, Any]:
-    result = reconstruct_picture(
-        model, colors, mask, progress=lambda text, part: send({"progress": text, "part": part})
-    )
-    if not len(result.surface.faces):
+def _message(label: str, made: Reconstruction) -> dict[str, Any]:
+    if not len(made.surface.faces):
         raise ValueError(f"The model {label} makes an empty shape of this picture. Try another picture.")
-    angle = np.radians(result.azimuth_deg)
+    angle = np.radians(made.azimuth_deg)
     x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
-    glb = mesh_bytes(result.surface, "glb", "object")
+    glb = mesh_bytes(made.surface, "glb", "object")
     return {
         "label": label,
         "glb": _base64(glb),
         "yaw": float(np.arctan2(x, z)),
-        "kind": result.kind,
-        "warning": result.warning,
+        "kind": made.kind,
+        "warning": made.warning,
     }
 
 

@@ -32,8 +32,9 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from learn3d.studio.demo.picture import EXAMPLES, SIDE, Picture, example, make_meshes, unpack
+from learn3d.studio.demo.picture import EXAMPLES, SIDE, Picture, example, make_meshes, unpack, unpack_several
 from learn3d.studio.picture_to_mesh.reconstruction import Model, load_model
+from learn3d.studio.picture_to_mesh.several import MOST_PICTURES
 from learn3d.terminal import plain, say
 
 MOST_BYTES = 5 * SIDE**2  # largest body of a request
@@ -169,7 +170,8 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
     kinds = [kind for model in models.values() for kind in model.categories]
 
     def about(_: Request) -> Response:
-        return JSONResponse({"kinds": list(dict.fromkeys(kinds)), "examples": list(pictures), "side": SIDE})
+        limits = {"side": SIDE, "most": MOST_PICTURES}
+        return JSONResponse({"kinds": list(dict.fromkeys(kinds)), "examples": list(pictures), **limits})
 
     def show_example(request: Request) -> Response:
         if (png := pictures.get(request.path_params["category"])) is None:
@@ -177,13 +179,15 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
         return Response(png, media_type="image/png")
 
     async def mesh(request: Request) -> Response:
+        category = request.query_params.get("category") or None
         try:
-            picture = await asyncio.wait_for(_receive(request), PATIENCE)
+            pictures = await asyncio.wait_for(_receive(request), PATIENCE)
         except (ValueError, KeyError) as error:
             raise HTTPException(400, f"this is no picture as the page sends it: {error}") from None
         except (asyncio.TimeoutError, ClientDisconnect):
             raise HTTPException(408, "the picture did not arrive in time") from None
-        return StreamingResponse(jobs.run(partial(make_meshes, models, picture)), media_type="application/x-ndjson")
+        work = partial(make_meshes, models, pictures, category=category)
+        return StreamingResponse(jobs.run(work), media_type="application/x-ndjson")
 
     routes = [
         Route("/about", about),
@@ -194,8 +198,11 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
     return Starlette(routes=routes, middleware=[Middleware(Gate, host=host)])
 
 
-async def _receive(request: Request) -> Picture:
-    """The picture in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with its bytes in the body."""
+async def _receive(request: Request) -> list[Picture]:
+    """The pictures in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with their bytes in the body.
+
+    Several pictures have W,W,... and H,H,..., and no box.
+    """
     query = request.query_params
     box = tuple(map(_number, query["box"].split(","))) if "box" in query else None
     if box is not None and len(box) != 4:
@@ -205,7 +212,10 @@ async def _receive(request: Request) -> Picture:
         content += chunk
         if len(content) > MOST_BYTES:
             raise HTTPException(413, f"a picture has at most {MOST_BYTES} bytes")
-    return unpack(bytes(content), _number(query["width"]), _number(query["height"]), box)
+    sizes = [[_number(number) for number in query[name].split(",")] for name in ("width", "height")]
+    if len(sizes[0]) > 1:
+        return unpack_several(bytes(content), *sizes)
+    return [unpack(bytes(content), *(numbers[0] for numbers in sizes), box)]
 
 
 def _number(text: str) -> int:

@@ -1,7 +1,7 @@
 """Reconstruction: from images with masks to mesh files and pictures of them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -31,6 +31,7 @@ from learn3d.studio.picture_to_mesh.cutting import Box, Judge, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
+from learn3d.studio.picture_to_mesh.several import MOST_PICTURES, find_outliers, find_strangers, fit_several
 from learn3d.studio.picture_to_mesh.smoothing import divide, outer_surface
 from learn3d.studio.picture_to_mesh.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.terminal import note
@@ -114,14 +115,7 @@ def reconstruct_files(
     the images, with "-2" and so on for further guesses (see `save`). Raises ValueError if a mask is empty, or if a
     result would replace an input file. A file that cannot be used is an error after all others are done.
     """
-    if masks and len(masks) != len(images):
-        raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
-    names = [Path(image).stem for image in images]
-    if len(set(names)) < len(names):
-        names = [f"{number:03}_{name}" for number, name in enumerate(names)]
-    given = {Path(path).resolve() for path in (*images, *masks)}
-    if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
-        raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
+    names = check_files(folder, images, images, masks)
     model = load_model(run, which)
     if category is not None:
         check_category(model, category)
@@ -133,7 +127,7 @@ def reconstruct_files(
             faults.append(error)
             continue
         options = {"crop": crop, "refined": refined, "category": category, "guesses": guesses}
-        made = reconstruct_guesses(model, *photo, **options)
+        made = list(reconstruct_guesses(model, *photo, **options))
         if made[0].warning:
             note(f"warning: {name}: {made[0].warning}")
         elif made[0].kind:
@@ -144,6 +138,56 @@ def reconstruct_files(
     if faults:
         raise faults[0]
     return paths
+
+
+def reconstruct_object_files(
+    run: Path | None,
+    folder: Path,
+    images: Sequence[Path],
+    masks: Sequence[Path] = (),
+    *,
+    crop: bool = True,
+    category: str | None = None,
+    which: str = "last",
+    mesh_format: MeshFormat = "glb",
+) -> list[Path]:
+    """Reconstruct one object from several image files, and save the result in `folder` under the first one's name.
+
+    See `reconstruct_files` for the arguments, and `reconstruct_several` for the errors. A file that cannot be used is
+    left out with a line, as is a picture that does not fit the others.
+    """
+    name = check_files(folder, images[:1], images, masks)[0]
+    model = load_model(run, which)
+    photos, names = [], []
+    for image, mask in zip(images, masks or [None] * len(images), strict=True):
+        try:
+            photos.append(_read(image, mask, judge=model.judge))
+            names.append(image)
+        except (ValueError, OSError) as error:
+            note(f"left out: {error}")
+    found = reconstruct_several(model, photos, crop=crop, category=category)
+    for number, reason in found.left_out.items():
+        note(f"left out: {names[number]}: {reason}")
+    for number, azimuth_deg in zip(found.used, found.azimuths_deg, strict=True):
+        note(f"{names[number]}: azimuth {azimuth_deg:.0f} degrees")
+    if found.made.warning:
+        note(f"warning: {found.made.warning}")
+    elif found.made.kind:
+        note(f"{name}: category {found.made.kind}")
+    return save(folder, [name], [found.made], model, mesh_format)
+
+
+def check_files(folder: Path, named: Sequence[Path], images: Sequence[Path], masks: Sequence[Path]) -> list[str]:
+    """Names of the results of `named` images. ValueError if a result would replace a file, or if a mask is missing."""
+    if masks and len(masks) != len(images):
+        raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
+    names = [Path(image).stem for image in named]
+    if len(set(names)) < len(names):
+        names = [f"{number:03}_{name}" for number, name in enumerate(names)]
+    given = {Path(path).resolve() for path in (*images, *masks)}
+    if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
+        raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
+    return names
 
 
 def reconstruct_dataset(
@@ -289,7 +333,7 @@ def reconstruct_picture(
 ) -> Reconstruction:
     """The first of `reconstruct_guesses`."""
     options = {"crop": crop, "refined": refined, "category": category, "progress": progress}
-    return reconstruct_guesses(model, colors, mask, **options)[0]
+    return next(reconstruct_guesses(model, colors, mask, **options))
 
 
 @torch.no_grad()
@@ -303,7 +347,7 @@ def reconstruct_guesses(
     category: str | None = None,
     guesses: int = 1,
     progress: Progress = lambda *_: None,
-) -> list[Reconstruction]:
+) -> Iterator[Reconstruction]:
     """Reconstruct a picture uint8 [H, W, 3] with its mask uint8 [H, W]; its camera is unknown.
 
     refined: fit camera, shape and colours to the picture; methods with voxels only predict.
@@ -321,7 +365,8 @@ def reconstruct_guesses(
         (surface,) = reconstruct(method, image[None])
         found = method.view_probabilities(image[None])
         azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
-        return [Reconstruction(surface, stored, azimuth_deg)]
+        yield Reconstruction(surface, stored, azimuth_deg)
+        return
     framed = frame(colors, mask)
     mask = reduce_mask(framed[3])
     progress("camera", 0.0)
@@ -330,23 +375,84 @@ def reconstruct_guesses(
     if warning is not None:
         surface, view = inflate(framed)
         iou = float(view.ious(surface.vertices[None], surface.faces, mask))
-        return [Reconstruction(surface, stored, 0.0, iou, None, warning)]
+        yield Reconstruction(surface, stored, 0.0, iou, None, warning)
+        return
     templates = model.templates
-    if templates is not None:
-        options = {"category": category, "guesses": guesses}
-        fits = fit_template(templates, model.categories, predicted, mask, progress, **options)
-        meshes = [(divide(fitted.vertices, fitted.faces, _LONGEST_EDGE), fitted, kind) for fitted, kind in fits]
-        mirror = MIRROR
-    else:
+    if templates is None:
         fitted = fit(method, predicted, mask, progress)
-        meshes = [(outer_surface(fitted.vertices, fitted.faces), fitted, kind)]
-        mirror = method.generator.reflection
+        mesh = outer_surface(fitted.vertices, fitted.faces)
+        progress("colours", 0.9)
+        surface = color_mesh(mesh, fitted.view, [framed], method.generator.reflection)
+        yield Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
+        return
+    options = {"category": category, "guesses": guesses}
+    for fitted, kind in fit_template(templates, model.categories, predicted, mask, progress, **options):
+        mesh = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE)
+        progress("colours", 0.9)
+        surface = color_mesh(mesh, fitted.view, [framed], MIRROR, textured=True)
+        yield Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind)
+
+
+class SeveralPictures(NamedTuple):
+    """The shape of an object in several pictures, and how it was found."""
+
+    made: Reconstruction  # its input and azimuth are the first used picture's
+    used: list[int]  # the pictures that it explains
+    left_out: dict[int, str]  # the other pictures, each with a reason
+    azimuths_deg: list[float]  # of the cameras of the used pictures
+
+
+@torch.no_grad()
+def reconstruct_several(
+    model: Model,
+    pictures: Sequence[tuple[np.ndarray, np.ndarray]],
+    *,
+    crop: bool = True,
+    category: str | None = None,
+    progress: Progress = lambda *_: None,
+) -> SeveralPictures:
+    """Reconstruct an object from 2 to 8 pictures uint8 [H, W, 3] with masks uint8 [H, W]; their cameras are unknown.
+
+    Of three pictures or more, those that show something else, or have a wrong outline, are left out.
+    category, progress: see `reconstruct_guesses`. Raises ValueError for another number of pictures, for an unknown
+    category, or if the model has no templates.
+    """
+    if not 2 <= len(pictures) <= MOST_PICTURES:
+        raise ValueError(
+            f"an object needs 2 to {MOST_PICTURES} pictures, got {len(pictures)}; leave some out or add some"
+        )
+    if model.templates is None or not isinstance(model.method, MeshMethod):
+        raise ValueError("this model has no templates, which several pictures need; use the small model of the package")
+    if category is not None:
+        check_category(model, category)
+    progress("camera", 0.0)
+    stored = [model.prepare(*picture, crop=crop) for picture in pictures]
+    framed = [frame(*picture) for picture in pictures]
+    masks = torch.stack([reduce_mask(each[3]) for each in framed])
+    predicted = []
+    for number, image in enumerate(stored):
+        predicted.append(predict(model.method, torch.from_numpy(image), masks[number]))
+        progress("camera", 0.3 * (number + 1) / len(stored))
+    left_out = dict.fromkeys(find_strangers(predicted), "it seems to show another object")
+    while True:
+        used = [number for number in range(len(pictures)) if number not in left_out]
+        chosen = [predicted[number] for number in used]
+        fitted = fit_several(model.templates, model.categories, chosen, masks[used], progress, category=category)
+        outliers = find_outliers(fitted.ious)
+        if not outliers:
+            break
+        left_out |= {used[row]: "its outline does not fit the others" for row in outliers}
     progress("colours", 0.9)
-    made = []
-    for mesh, fitted, kind in meshes:
-        surface = color_mesh(mesh, fitted.view, framed, mirror, textured=templates is not None)
-        made.append(Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning))
-    return made
+    mesh = fitted.vertices, fitted.faces
+    if fitted.is_template:
+        mesh = divide(*mesh, _LONGEST_EDGE)
+    surface = color_mesh(mesh, fitted.views, [framed[number] for number in used], MIRROR, textured=True)
+    code = torch.stack([nn.functional.normalize(each.code[0], dim=0) for each in chosen]).mean(0)
+    warning = None if category else recognize(model, code)[1]
+    azimuths_deg = fitted.views.azimuth_deg.tolist()
+    iou = float(fitted.ious.mean())
+    made = Reconstruction(surface, stored[used[0]], azimuths_deg[0], iou, category or fitted.kind, warning)
+    return SeveralPictures(made, used, left_out, azimuths_deg)
 
 
 def check_category(model: Model, category: str) -> None:

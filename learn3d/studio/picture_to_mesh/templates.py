@@ -6,8 +6,9 @@ templates; the shapes themselves are made again from their numbers.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -141,7 +142,7 @@ def fit_template(
     *,
     category: str | None = None,
     guesses: int = 1,
-) -> list[tuple[Fit, str]]:
+) -> Iterator[tuple[Fit, str]]:
     """Fit templates to a framed mask float32 [64, 64]: up to `guesses` different ones, the best first, with categories.
 
     Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel IoU with the predicted
@@ -151,24 +152,22 @@ def fit_template(
     progress("shape", 0.3)
     found = find_candidates(templates, categories, [predicted], category)
     views = predicted.shape.view.select(torch.zeros(len(found.shapes), dtype=torch.int64))
-    scores = _likeness(views, found.shapes, found.faces, mask) + found.prior
+    scores = likeness(views, found.shapes, found.faces, mask) + found.prior
     best = scores.topk(min(KEPT, len(scores))).indices
     found = found.select(best.tolist())
     progress("stretch", 0.5)
-    views, shapes, cost = _stretch(views.select(best), found.shapes, found.faces, mask)
-    scores = _likeness(views, shapes, found.faces, mask) + belief(views.azimuth_deg, predicted.azimuths)
+    views, shapes, cost = stretch(views.select(best), found.shapes, found.faces, mask)
+    scores = likeness(views, shapes, found.faces, mask) + belief(views.azimuth_deg, predicted.azimuths)
     order = (scores + found.prior - cost).argsort(descending=True).tolist()
     progress("surface", 0.8)
-    fits = []
     for row in _choose_different([_voxels(shapes[row], found.faces[row]) for row in order], guesses):
         row = order[row]
-        view, vertices = _bend(views.select(torch.tensor([row])), shapes[row], found.faces[row], mask)
+        view, vertices = bend(views.select(torch.tensor([row])), shapes[row], found.faces[row], mask)
         size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
         view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * view.shift)
         vertices = size * vertices
         iou = float(view.ious(vertices[None], found.faces[row], mask))
-        fits.append((Fit(vertices, found.faces[row], view, iou), found.kinds[row]))
-    return fits
+        yield Fit(vertices, found.faces[row], view, iou), found.kinds[row]
 
 
 def _choose_different(voxels: list[Tensor], count: int) -> list[int]:
@@ -185,14 +184,21 @@ def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
     return nmr.voxelize(0.998 * vertices[None].clamp(-0.5, 0.5) + 0.5, faces)
 
 
-def _likeness(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> Tensor:
-    """How alike the outlines of N shapes and of a mask [64, 64] are: their IoU less the distance of their edges, [N].
+def likeness(views: View, shapes: list[Tensor], faces: list[Tensor], masks: Tensor) -> Tensor:
+    """How alike the outlines of N shapes and of masks are: their IoU less the distance of their edges, [N].
 
-    By the IoU alone a solid back is better than slats beside the true ones.
+    By the IoU alone a solid back is better than slats beside the true ones. masks: [64, 64], or [M, 64, 64] for N a
+    multiple of M, which are taken in turn.
     """
-    (wanted, near_wanted), *drawn = map(_edges, (mask, *views.silhouettes(shapes, faces)))
-    apart = [(near_wanted[edge].mean() + near[wanted].mean()) / 2 for edge, near in drawn]
-    return views.ious(shapes, faces, mask) - EDGES * torch.tensor(apart).float()
+    masks = masks.view(-1, *masks.shape[-2:])
+    wanted = [_edges(mask) for mask in masks]
+    drawn = map(_edges, views.silhouettes(shapes, faces))
+    apart = [
+        (near_wanted[edge].mean() + near[outline].mean()) / 2
+        for (edge, near), (outline, near_wanted) in zip(drawn, itertools.cycle(wanted), strict=False)
+    ]
+    ious = views.ious(shapes, faces, masks.repeat(len(shapes) // len(masks), 1, 1))
+    return ious - EDGES * torch.tensor(apart).float()
 
 
 def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -203,8 +209,17 @@ def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
     return edge, np.minimum(distance_transform_edt(~edge), FARTHEST)
 
 
-def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> tuple[View, list[Tensor], Tensor]:
-    """Stretch each shape along the three axes: fitted views and shapes, and how unequal the factors are, [N]."""
+def stretch(
+    views: View, shapes: list[Tensor], faces: list[Tensor], masks: Tensor, held: Callable[[View], View] = lambda v: v
+) -> tuple[View, list[Tensor], Tensor]:
+    """Stretch N shapes along the three axes until they have the outlines of masks [64, 64] or [M, 64, 64].
+
+    views: N, or N M with those of the first shape first. held: puts known parts of the views in their place.
+    Returns the fitted views, the shapes, and how unequal the factors are, [N].
+    """
+    copies = len(views.azimuth_deg) // len(shapes)
+    wanted = masks if masks.dim() == 2 else masks.repeat(len(shapes), 1, 1)
+    faces = [each for each in faces for _ in range(copies)]
     logs = torch.zeros(len(shapes), 3).requires_grad_()
 
     def stretched() -> list[Tensor]:
@@ -214,14 +229,19 @@ def _stretch(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tenso
         return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
 
     def loss(views: View) -> Tensor:
-        ious = views.ious(stretched(), faces, mask)
-        return (costs() + 0.1 * logs.square().sum(1) - ious).sum()
+        ious = held(views).ious([shape for shape in stretched() for _ in range(copies)], faces, wanted)
+        return (costs() + 0.1 * logs.square().sum(1)).sum() - ious.sum() / copies
 
-    return minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs), stretched(), costs()
+    return held(minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs)), stretched(), costs()
 
 
-def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[View, Tensor]:
-    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them."""
+def bend(
+    view: View, vertices: Tensor, faces: Tensor, masks: Tensor, held: Callable[[View], View] = lambda v: v
+) -> tuple[View, Tensor]:
+    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them.
+
+    masks: [64, 64] for one view, or [N, 64, 64] for N. held: see `stretch`.
+    """
     low, high = vertices.amin(0), vertices.amax(0)
     place = (vertices - low) / (high - low).clamp(min=1e-3)
     x, y, z = (
@@ -239,6 +259,6 @@ def _bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[Vi
 
     def loss(view: View) -> Tensor:
         rough = sum(moves().diff(dim=axis).square().sum() for axis in range(3)) + 0.1 * moves().square().sum()
-        return BENDING * rough - view.ious(bent()[None], faces, mask).sum()
+        return BENDING * rough - held(view).ious(bent()[None], faces, masks).mean()
 
-    return minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice), bent()
+    return held(minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice)), bent()

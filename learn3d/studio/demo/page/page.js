@@ -15,69 +15,112 @@ const HINTS = {
 };
 const OBJECT = 1, BACKGROUND = 2, OPEN = 3; // the values of learn3d.studio.picture_to_mesh.cutting
 const BRUSH = 12, REACH = 34; // radii in pixels: of a stroke, and of the region around it in which the outline may move
-let side = 512, name = "picture", colors = null, given = null, mask = null, tool = null, drag = null, current = null;
+let side = 512, most = 8, name = "picture", colors = null, given = null, mask = null, tool = null, drag = null, current = null;
+let album = [], chosen = 0; // several pictures of one object; `colors`, `given` and `mask` are those of album[chosen]
 
 // Taking pictures
 
-async function take(source, title) {
+/** Read a picture with sides of at most `side` pixels: { name, colors, given }. */
+async function load(source, title, side) {
+  const image = new Image();
+  image.src = typeof source === "string" ? source : URL.createObjectURL(source);
+  await image.decode();
+  if (typeof source !== "string") URL.revokeObjectURL(image.src);
+  const scale = side / Math.max(image.naturalWidth, image.naturalHeight);
+  if (!(scale > 0 && scale < Infinity)) throw new Error("it has no size");
+  const width = Math.max(1, Math.round(image.naturalWidth * scale)), height = Math.max(1, Math.round(image.naturalHeight * scale));
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.imageSmoothingQuality = "high";
+  context.drawImage(image, 0, 0, width, height);
+  const alpha = context.getImageData(0, 0, width, height).data.filter((_, i) => i % 4 === 3);
+  context.globalCompositeOperation = "destination-over"; // white below transparent pictures
+  context.fillStyle = "#fff";
+  context.fillRect(0, 0, width, height);
+  return {
+    name: title.replace(/\.[^.]*$/, "").replace(/[^\p{L}\p{N} _-]/gu, "") || "picture",
+    colors: context.getImageData(0, 0, width, height),
+    given: alpha.some((value) => value < 250) ? alpha : new Uint8ClampedArray(alpha.length).fill(255),
+    mask: null,
+  };
+}
+
+/** Take one picture, or several of the same object: [[source, title], ...]. */
+async function take(sources) {
+  if (sources.length > most) return say(`At most ${most} pictures of an object; ${sources.length} came.`, true);
+  const fitting = Math.floor(side * Math.sqrt(5 / (4 * sources.length + 1))); // all fit into one request
   try {
-    const image = new Image();
-    image.src = typeof source === "string" ? source : URL.createObjectURL(source);
-    await image.decode();
-    if (typeof source !== "string") URL.revokeObjectURL(image.src);
-    const scale = side / Math.max(image.naturalWidth, image.naturalHeight);
-    if (!(scale > 0 && scale < Infinity)) throw new Error("it has no size");
-    const width = Math.max(1, Math.round(image.naturalWidth * scale)), height = Math.max(1, Math.round(image.naturalHeight * scale));
-    const canvas = Object.assign(document.createElement("canvas"), { width, height });
-    const context = canvas.getContext("2d", { willReadFrequently: true });
-    context.imageSmoothingQuality = "high";
-    context.drawImage(image, 0, 0, width, height);
-    const alpha = context.getImageData(0, 0, width, height).data.filter((_, i) => i % 4 === 3);
-    context.globalCompositeOperation = "destination-over"; // white below transparent pictures
-    context.fillStyle = "#fff";
-    context.fillRect(0, 0, width, height);
-    colors = context.getImageData(0, 0, width, height);
-    given = alpha.some((value) => value < 250) ? alpha : new Uint8ClampedArray(alpha.length).fill(255);
+    album = await Promise.all(sources.map(([source, title]) => load(source, title, Math.min(side, fitting))));
   } catch {
     current?.abort();
     return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
   }
-  name = title.replace(/\.[^.]*$/, "").replace(/[^\p{L}\p{N} _-]/gu, "") || "picture";
-  Object.assign(picture, { width: colors.width, height: colors.height });
   document.body.classList.add("given");
   $("invitation").hidden = true;
   $("stage").hidden = $("tools").hidden = false;
-  $("choose").textContent = "Another picture";
+  $("choose").textContent = "Other pictures";
   $("choose").classList.remove("primary");
-  choose(null);
-  for (const button of $("examples").children) button.setAttribute("aria-pressed", String(button.firstChild.src === source));
+  for (const button of $("examples").children) button.setAttribute("aria-pressed", String(button.firstChild.src === sources[0][0]));
   scrollTo(0, 0); // on a phone the examples are below
-  mask = null;
-  show();
-  send(given);
+  turnTo(0);
+  sendAll();
 }
 
-function takeFirst(files) {
-  if (files.length) take(files[0], files[0].name);
+/** Show one of the pictures for correction. */
+function turnTo(number) {
+  chosen = number;
+  ({ name, colors, given, mask } = album[chosen]);
+  Object.assign(picture, { width: colors.width, height: colors.height });
+  choose(null);
+  show();
+}
+
+/** Small pictures of the album with their outlines; one that was left out is crossed. */
+function showAlbum() {
+  $("album").hidden = album.length < 2;
+  $("album").replaceChildren(...(album.length < 2 ? [] : album.map((each, number) => {
+    const button = document.createElement("button"), { width, height } = each.colors;
+    const canvas = Object.assign(document.createElement("canvas"), { width, height });
+    canvas.getContext("2d").putImageData(each.colors, 0, 0);
+    if (each.mask) canvas.getContext("2d").drawImage(outline(each.mask, width, height), 0, 0);
+    button.title = each.unused ? `Left out: ${each.unused}` : `Picture ${number + 1}`;
+    button.setAttribute("aria-label", button.title);
+    button.setAttribute("aria-pressed", String(number === chosen));
+    button.classList.toggle("unused", Boolean(each.unused));
+    button.append(canvas);
+    button.onclick = () => turnTo(number);
+    return button;
+  })));
+  $("without").hidden = album.length < 2;
+}
+
+$("without").onclick = () => {
+  album.splice(chosen, 1);
+  turnTo(Math.max(0, chosen - 1));
+  sendAll();
+};
+
+function takeFiles(files) {
+  if (files.length) take([...files].map((file) => [file, file.name]));
   else say("Drop a picture file. A picture in another page must be saved first.", true);
 }
 
 for (const [button, input] of [["choose", "file"], ["photograph", "camera"]]) {
   $(button).onclick = () => $(input).click();
-  $(input).onchange = () => { if ($(input).files.length) takeFirst($(input).files); $(input).value = ""; };
+  $(input).onchange = () => { if ($(input).files.length) takeFiles($(input).files); $(input).value = ""; };
 }
-addEventListener("paste", (event) => { if (event.clipboardData.files.length) takeFirst(event.clipboardData.files); });
+addEventListener("paste", (event) => { if (event.clipboardData.files.length) takeFiles(event.clipboardData.files); });
 addEventListener("dragover", (event) => { event.preventDefault(); $("over").hidden = false; });
 addEventListener("dragleave", (event) => { if (!event.relatedTarget) $("over").hidden = true; });
-addEventListener("drop", (event) => { event.preventDefault(); $("over").hidden = true; takeFirst(event.dataTransfer.files); });
+addEventListener("drop", (event) => { event.preventDefault(); $("over").hidden = true; takeFiles(event.dataTransfer.files); });
 
 // The picture, its outline, and its correction
 
 function show() {
   const context = picture.getContext("2d"), { width, height } = colors;
   context.putImageData(colors, 0, 0);
-  if (mask) context.drawImage(outline(width, height), 0, 0);
-  if (!drag) return;
+  if (mask) context.drawImage(outline(mask, width, height), 0, 0);
+  if (!drag) return showAlbum();
   if (tool === "box") {
     context.setLineDash([8, 6]);
     for (const [color, shift] of [["#000", 0], ["#fff", 7]]) {
@@ -94,7 +137,7 @@ function show() {
 }
 
 /** The outline: white inside of the mask's border, dark outside, so that any picture shows it. */
-function outline(width, height) {
+function outline(mask, width, height) {
   const image = new ImageData(width, height), thick = 2;
   const near = (x, y, value) => {
     for (let v = Math.max(0, y - thick); v <= Math.min(height - 1, y + thick); v++)
@@ -147,7 +190,7 @@ function choose(which) {
 
 for (const button of document.querySelectorAll("[data-tool]"))
   button.onclick = () => choose(tool === button.dataset.tool ? null : button.dataset.tool);
-$("again").onclick = () => send(given);
+$("again").onclick = () => { mask = album[chosen].mask = null; album.length > 1 ? sendAll() : send(given); };
 picture.onpointerdown = (event) => {
   if (!tool) return;
   picture.setPointerCapture(event.pointerId);
@@ -187,19 +230,39 @@ function busy(part) {
 
 const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 
-async function send(alpha, strokes = null, box = null) {
-  current?.abort();
-  const mine = (current = new AbortController()), { width, height, data } = colors, pixels = width * height;
+/** Send the picture on the stage with a mask or hints about it. */
+function send(alpha, strokes = null, box = null) {
+  const { width, height, data } = colors, pixels = width * height;
   const body = new Uint8Array(pixels * (strokes ? 5 : 4));
-  body.set(data);
-  for (let i = 0; i < pixels; i++) body[4 * i + 3] = alpha[i];
+  body.set(withAlpha(data, alpha));
   if (strokes) body.set(strokes, 4 * pixels);
+  post(`width=${width}&height=${height}${box ? `&box=${box}` : ""}`, body);
+}
+
+/** Send all pictures, with the masks that are known. */
+function sendAll() {
+  if (album.length < 2) return send(mask || given);
+  const sizes = (side) => album.map((each) => each.colors[side]).join();
+  const parts = album.map((each) => withAlpha(each.colors.data, each.mask || each.given));
+  for (const each of album) each.unused = null;
+  post(`width=${sizes("width")}&height=${sizes("height")}`, new Blob(parts));
+}
+
+function withAlpha(data, alpha) {
+  const body = new Uint8Array(data);
+  for (let i = 0; i < alpha.length; i++) body[4 * i + 3] = alpha[i];
+  return body;
+}
+
+async function post(query, body) {
+  current?.abort();
+  const mine = (current = new AbortController()), category = $("category").value;
   $("warning").hidden = $("downloads").hidden = true;
   say("Finding the object …");
   busy(0.05);
   try {
     const request = { method: "POST", body, signal: mine.signal, headers: { "Content-Type": "application/octet-stream" } };
-    let answer, address = `mesh?width=${width}&height=${height}${box ? `&box=${box}` : ""}`;
+    let answer, address = `mesh?${query}${category && `&category=${category}`}`;
     while ((answer = await fetch(address, request)).status === 503 && !mine.signal.aborted) {
       say("Many visitors are here. Waiting for a place …");
       await new Promise((resolve) => setTimeout(resolve, 2000));
@@ -212,7 +275,7 @@ async function send(alpha, strokes = null, box = null) {
       if (done) break;
       const lines = (rest + value).split("\n");
       rest = lines.pop();
-      for (const line of lines) ended = (await handle(JSON.parse(line), pixels, mine.signal)) || ended;
+      for (const line of lines) ended = (await handle(JSON.parse(line), mine)) || ended;
     }
     if (!ended) throw new Error("the answer broke off");
   } catch (error) {
@@ -220,14 +283,22 @@ async function send(alpha, strokes = null, box = null) {
   }
 }
 
-/** Handle one message of the server; returns whether it is the last. */
-async function handle(message, pixels, signal) {
+/** Handle one message of the server; returns whether it is the last that must come. */
+async function handle(message, mine) {
   if (message.place) say(message.place === 1 ? "You are next …" : `${message.place} are before you …`);
   if (message.mask) {
-    const bits = bytes(message.mask);
-    mask = Uint8ClampedArray.from({ length: pixels }, (_, i) => (bits[i >> 3] >> (7 - (i & 7))) & 1 ? 255 : 0);
-    $("hint").textContent = `Found ${message.how}. ${message.left_out ? `Note: ${message.left_out}. ` : ""}${HINT}`;
+    const number = message.of ?? chosen, each = album[number];
+    const bits = bytes(message.mask), pixels = each.colors.width * each.colors.height;
+    each.mask = Uint8ClampedArray.from({ length: pixels }, (_, i) => (bits[i >> 3] >> (7 - (i & 7))) & 1 ? 255 : 0);
+    if (number === chosen) {
+      mask = each.mask;
+      $("hint").textContent = `Found ${message.how}. ${message.left_out ? `Note: ${message.left_out}. ` : ""}${HINT}`;
+    }
     show();
+    if (album.length > 1 && message.of === undefined) { // its outline was corrected: now all together
+      sendAll();
+      return true;
+    }
   }
   if (message.progress) { say(WORDS[message.progress]); busy(0.1 + 0.85 * message.part); }
   if (message.error) {
@@ -239,34 +310,63 @@ async function handle(message, pixels, signal) {
       const glb = bytes(made.glb);
       return { ...made, glb, mesh: await readGlb(glb.buffer) };
     }));
-    if (!signal.aborted) present(read);
+    if (!mine.signal.aborted) present(read, message.unused || {});
+  }
+  if (message.guess && !mine.signal.aborted) {
+    const glb = bytes(message.guess.glb);
+    offerGuess({ ...message.guess, glb, mesh: await readGlb(glb.buffer) });
   }
   return Boolean(message.error || message.meshes);
 }
 
-function present(meshes) {
+let views = []; // for each model: its label, the shown mesh, and how to show another
+
+function present(meshes, unused) {
   busy(false);
   say("Drag the mesh to turn it.");
-  const warnings = [...new Set(meshes.map((made) => made.warning).filter(Boolean))];
+  for (const [number, reason] of Object.entries(unused)) album[number].unused = reason;
+  const left = Object.entries(unused).map(([number, reason]) => `picture ${Number(number) + 1} is left out: ${reason}`);
+  const warnings = [...new Set([...left, ...meshes.map((made) => made.warning).filter(Boolean)])];
   $("warning").hidden = !warnings.length;
   $("warning").textContent = `Careful: ${warnings.join("; ")}.`;
+  showAlbum();
   $("views").replaceChildren();
   $("downloads").replaceChildren();
   $("downloads").hidden = false;
-  for (const made of meshes) {
-    const view = document.createElement("div"), canvas = document.createElement("canvas");
+  views = meshes.map((made) => {
+    const view = document.createElement("div"), title = document.createElement("b"), guesses = document.createElement("div");
+    const several = meshes.length > 1 ? ` ${made.label}` : "";
     view.className = "card view";
-    view.append(canvas);
+    guesses.className = "row guesses";
     $("views").append(view);
-    const title = document.createElement("b"), label = meshes.length > 1 ? ` ${made.label}` : "";
-    title.textContent = [label, made.kind && `Category: ${made.kind}${made.warning ? "?" : ""}`].filter(Boolean).join(" · ");
-    view.append(title);
-    const { glb, mesh } = made;
-    new Viewer(canvas, mesh, made.yaw);
-    offer(`GLB${label} (3D viewers, Blender)`, `${name}${label}.glb`, () => new Blob([glb], { type: "model/gltf-binary" }));
-    offer(`OBJ${label}`, `${name}${label}.obj`, () => new Blob([toObj(mesh)], { type: "model/obj" }));
-  }
+    const entry = { label: made.label, guesses, made, show(shown) {
+      const canvas = document.createElement("canvas");
+      entry.made = shown;
+      title.textContent = [several, shown.kind && `Category: ${shown.kind}${shown.warning ? "?" : ""}`].filter(Boolean).join(" · ");
+      view.replaceChildren(canvas, title, guesses);
+      new Viewer(canvas, shown.mesh, shown.yaw);
+    } };
+    entry.show(made);
+    offer(`GLB${several} (3D viewers, Blender)`, `${name}${several}.glb`, () => new Blob([entry.made.glb], { type: "model/gltf-binary" }));
+    offer(`OBJ${several}`, `${name}${several}.obj`, () => new Blob([toObj(entry.made.mesh)], { type: "model/obj" }));
+    return entry;
+  });
   offer("Cut-out (PNG)", `${name}.png`, cutout);
+}
+
+/** A button for another shape that explains the picture, and one for the first. */
+function offerGuess(guess) {
+  const entry = views.find((each) => each.label === guess.label), { guesses } = entry;
+  for (const made of guesses.children.length ? [guess] : [entry.made, guess]) {
+    const button = document.createElement("button");
+    button.textContent = `${guesses.children.length ? "Another guess" : "First guess"}: ${made.kind}`;
+    button.setAttribute("aria-pressed", String(made === entry.made));
+    button.onclick = () => {
+      entry.show(made);
+      for (const each of guesses.children) each.setAttribute("aria-pressed", String(each === button));
+    };
+    guesses.append(button);
+  }
 }
 
 /** The picture with the mask as transparency, as this page and `learn3d reconstruct` read it. */
@@ -288,17 +388,20 @@ function offer(label, file, make) {
   $("downloads").append(button);
 }
 
+$("category").onchange = () => { if (album.length) sendAll(); };
+
 // Start
 
 fetch("about").then((answer) => answer.json()).then((about) => {
-  side = about.side;
+  ({ side, most } = about);
+  for (const kind of about.kinds) $("category").append(new Option(kind, kind));
   $("kinds").textContent = about.kinds.length > 1 ? `${about.kinds.slice(0, -1).join(", ")} or ${about.kinds.at(-1)}` : about.kinds[0];
   for (const example of about.examples) {
     const button = document.createElement("button"), image = document.createElement("img");
     button.title = image.alt = example;
     image.src = `examples/${example}.png`;
     button.append(image);
-    button.onclick = () => take(image.src, example);
+    button.onclick = () => take([[image.src, example]]);
     $("examples").append(button);
   }
 });

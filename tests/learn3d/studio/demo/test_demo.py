@@ -83,7 +83,7 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
     assert 0.2 < (alpha > 127).mean() < 0.7
     sent: list[dict] = []
     models = {"my run": load_model(finished_run)}
-    pictures.make_meshes(models, pictures.Picture(colors.copy(), alpha[..., 0]), sent.append)
+    pictures.make_meshes(models, [pictures.Picture(colors.copy(), alpha[..., 0])], sent.append)
     assert (
         "mask" in sent[0]
         and sent[0]["left_out"] is None
@@ -94,7 +94,7 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
     assert result["label"] == "my run" and b"COLOR_0" in glb
     assert len(trimesh.load(io.BytesIO(glb), "glb", force="mesh").faces) > 100
     for mask in (np.zeros_like(alpha[..., 0]), np.full_like(alpha[..., 0], 254)):
-        pictures.make_meshes(models, pictures.Picture(colors, mask), sent.append)
+        pictures.make_meshes(models, [pictures.Picture(colors, mask)], sent.append)
         assert sent[-1] == {"error": "No object was found. Draw a box around it, or paint it with Add."}
 
 
