@@ -68,9 +68,26 @@ def _print(text: str, stream: TextIO) -> None:
     try:
         print(plain(text), file=stream, flush=True)
     except OSError:
-        # Python flushes once more when it ends. See "Note on SIGPIPE" in the documentation of `signal`.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        _silence(stream)
         raise
+
+
+def _silence(stream: TextIO) -> None:
+    """Let no further output fail. Python flushes once more when it ends: "Note on SIGPIPE" of module `signal`."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+@contextlib.contextmanager
+def closed_pipe_ends() -> Iterator[None]:
+    """End the program in good order if its output goes to a closed pipe (`| head`) within this context."""
+    try:
+        try:
+            yield
+        finally:
+            print(end="", flush=True)
+    except BrokenPipeError:
+        _silence(sys.stdout)
+        raise SystemExit(0) from None
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:

@@ -9,7 +9,7 @@ import sys
 from importlib import metadata
 from typing import Annotated, Any, Union
 
-from learn3d.terminal import note, say, unknown_name, without_traceback
+from learn3d.terminal import closed_pipe_ends, note, say, unknown_name, without_traceback
 
 #: For each command: its module below learn3d and its class, the extra that installs its packages, and a description.
 COMMANDS = {
@@ -54,7 +54,9 @@ def main(*given: str) -> int:
         print_completion(*arguments[:1])
     elif name in COMMANDS:
         try:
-            return _load(name).parse(name, arguments).run() or 0
+            with closed_pipe_ends():
+                command = _load(name).parse(name, arguments)
+            return command.run() or 0
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] in ("", "learn3d", "nmr"):
                 raise

@@ -67,12 +67,12 @@ def test_a_lost_result_is_an_error_and_lost_progress_is_none(call: str, stream: 
     assert call == "note" or result.stderr == b"error: [Errno 28] No space left on device\n"
 
 
-def test_an_output_that_nobody_reads_is_no_error() -> None:
+@pytest.mark.parametrize("program", [["-c", PROGRAM.format(call="say")], ["-m", "learn3d", "train", "--help"]])
+def test_an_output_that_nobody_reads_is_no_error(program: list[str]) -> None:
     """As with `| head`."""
     reading, writing = os.pipe()
     os.close(reading)
-    program = [sys.executable, "-c", PROGRAM.format(call="say")]
-    result = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, timeout=120)
+    result = subprocess.run([sys.executable, *program], stdout=writing, stderr=subprocess.PIPE, timeout=120)
     os.close(writing)
     assert (result.returncode, result.stderr) == (0, b"")
 
