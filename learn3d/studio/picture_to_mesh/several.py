@@ -10,8 +10,10 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy import ndimage
 from torch import Tensor
 
 import nmr
@@ -242,13 +244,20 @@ def _average(found: Candidates, weights: Tensor) -> Tensor:
 def _carve_out(view: View, masks: Tensor, likely: Tensor, held) -> tuple[View, Tensor, Tensor] | None:
     """Carve a shape, and fit the cameras to it, in turn. None if no cell is left."""
     for wider in CARVINGS:
-        kept = _carve(view, masks, likely, wider)
+        kept = _largest_piece(_carve(view, masks, likely, wider))
         vertices, faces, *_ = grid_surface(kept, box=BOX)
         if not len(faces):
             return None
         if wider:
             view = held(minimize(_misfit(vertices, faces, masks, held), view, CAMERA_STEPS, (0.01,)))
     return view, smooth(vertices, faces, rounds=3), faces
+
+
+def _largest_piece(cells: Tensor) -> Tensor:
+    """The cells [s, s, s], 0 or 1, without those that hang in the air."""
+    pieces, _ = ndimage.label(cells.numpy(), np.ones((3, 3, 3)))
+    sizes = np.bincount(pieces.ravel())[1:]  # 0 is empty space
+    return cells * torch.from_numpy(pieces == 1 + sizes.argmax()) if len(sizes) else cells
 
 
 def _misfit(vertices: Tensor, faces: Tensor, masks: Tensor, held):

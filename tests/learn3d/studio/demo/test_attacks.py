@@ -147,7 +147,7 @@ def silent_crowd(page: Page) -> None:
             silent.sendall(page.get()[:20] if number % 2 else b"")
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
         shown = browser.new_page()
-        shown.set_default_timeout(60_000)
+        shown.set_default_timeout(300_000)
         shown.goto(page.url)
         shown.get_by_role("button", name="sofa").click()
         shown.get_by_text("Drag the mesh to turn it").wait_for()
