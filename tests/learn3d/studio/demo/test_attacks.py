@@ -95,9 +95,9 @@ def page(finished_run) -> Iterator[Page]:
             super().connection_made(transport)
             held.append(sum(not each.transport.is_closing() for each in self.connections))
 
-    def count(*arguments: object) -> None:
+    def count(*arguments: object, **options: object) -> None:
         started.append(1)
-        make_meshes(*arguments)
+        make_meshes(*arguments, **options)
         finished.append(1)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -312,7 +312,7 @@ def pictures_full_of_holes(page: Page) -> None:
     seconds = []
     for picture in (ordinary, ordinary, *pictures, *found):
         start = time.process_time()
-        make_meshes(models, picture, lambda _: None)
+        make_meshes(models, [picture], lambda _: None)
         seconds.append(time.process_time() - start)
     assert max(seconds[2:]) < 2 * seconds[1], seconds
 

@@ -104,7 +104,7 @@ def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> Non
     unknown = np.full((100, 120), 255, np.uint8)
     sent: list[dict] = []
     models = {"my run": load_model(finished_run)}
-    pictures.make_meshes(models, pictures.Picture(colors, unknown), sent.append)
+    pictures.make_meshes(models, [pictures.Picture(colors, unknown)], sent.append)
     shown, error = sent
     assert shown["how"] == "as all that differs from the plain background"
     assert np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)).sum() == 8 * 120
