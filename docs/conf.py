@@ -20,13 +20,19 @@ release = nmr.__version__
 html_title = f"nmr + learn3d {release}"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "sphinx_copybutton"]
-exclude_patterns = ["_build", "examples/README.md", "log"]  # show_gallery has the gallery; logs are downloads
+exclude_patterns = [
+    "_build",
+    "examples/README.md",
+    "log",
+]  # show_gallery has the gallery; logs are downloads
 default_role = "literal"  # `name` in a docstring
 
 highlight_language = "none"  # blocks without a language are drawings and tables
 myst_heading_anchors = 4  # [text](page.md#a-heading), as in the repository's view
 nb_merge_streams = True
-nb_execution_mode = "off"  # notebooks are shown with the outputs that they carry; tests/test_examples.py runs them
+nb_execution_mode = (
+    "off"  # notebooks are shown with the outputs that they carry; tests/test_examples.py runs them
+)
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -54,7 +60,9 @@ def show_gallery(app: Sphinx, page: str, text: list[str]) -> None:
         text[0] = text[0].replace("[Gallery](examples/README.md)", body)
     else:
         text[0] = re.sub(
-            r"\]\((?:\.\./)?examples/README\.md\)", f"]({'../' * page.count('/')}index.md#gallery)", text[0]
+            r"\]\((?:\.\./)?examples/README\.md\)",
+            f"]({'../' * page.count('/')}index.md#gallery)",
+            text[0],
         )
 
 
@@ -62,11 +70,19 @@ def offer_colab(app: Sphinx, page: str, text: list[str]) -> None:
     """Put a link to Google Colab above each notebook, if the site is built by GitHub, which names the repository."""
     repository = os.environ.get("GITHUB_REPOSITORY")
     if repository and Path(app.env.doc2path(page)).suffix == ".ipynb":
-        address = f"https://colab.research.google.com/github/{repository}/blob/main/docs/{page}.ipynb"
+        address = (
+            f"https://colab.research.google.com/github/{repository}/blob/main/docs/{page}.ipynb"
+        )
         folder = repository.rpartition("/")[2]
-        first = f"!git clone -q https://github.com/{repository} && pip install -q './{folder}[train]'"
+        first = (
+            f"!git clone -q https://github.com/{repository} && pip install -q './{folder}[train]'"
+        )
         notebook = json.loads(text[0])
-        lines = [f"[Open in Colab]({address}), and run this in a new first cell:\n", "```\n", f"{first}\n"]
+        lines = [
+            f"[Open in Colab]({address}), and run this in a new first cell:\n",
+            "```\n",
+            f"{first}\n",
+        ]
         lines += [f"%cd {folder}/docs/examples\n", "```"]
         cell = {"cell_type": "markdown", "id": "colab", "metadata": {}, "source": lines}
         notebook["cells"].insert(1, cell)  # below the title
@@ -78,26 +94,42 @@ def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
     for link in list(doctree.findall(addnodes.pending_xref)):
         if link.get("refdomain") != "doc" or link["reftarget"] in app.env.found_docs:
             continue
-        target = Path(app.srcdir) / f"{link['reftarget']}.md"  # outside of docs, the target is absolute
+        target = (
+            Path(app.srcdir) / f"{link['reftarget']}.md"
+        )  # outside of docs, the target is absolute
         if target.is_file():
             relative = os.path.relpath(target, Path(app.env.doc2path(link["refdoc"])).parent)
-            link.replace_self(addnodes.download_reference("", "", *link.children, reftarget=relative))
+            link.replace_self(
+                addnodes.download_reference("", "", *link.children, reftarget=relative)
+            )
 
 
 def parameter_texts(function: Any) -> dict[str, Parameter]:
     """The texts of a function's parameters by name, without those that refer to another function."""
-    entries = [entry for entry in FunctionDoc(function)["Parameters"] if not entry.desc[0].startswith("As :func:")]
+    entries = [
+        entry
+        for entry in FunctionDoc(function)["Parameters"]
+        if not entry.desc[0].startswith("As :func:")
+    ]
     return {name: entry for entry in entries for name in entry.name.split(", ")}
 
 
-def explain_all_parameters(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+def explain_all_parameters(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+) -> None:
     """Complete the parameters of the drawing functions: their docstrings leave the common ones to `render`."""
     if what != "function" or getattr(thing, "__module__", "") not in ("nmr.render", "nmr.layers"):
         return
-    texts = parameter_texts(nmr.render_silhouette) | parameter_texts(nmr.render) | parameter_texts(thing)
+    texts = (
+        parameter_texts(nmr.render_silhouette)
+        | parameter_texts(nmr.render)
+        | parameter_texts(thing)
+    )
     text = NumpyDocString("\n".join(lines))
     # "near, far" is one entry
-    text["Parameters"] = list(dict.fromkeys(_hashable(texts[name]) for name in inspect.signature(thing).parameters))
+    text["Parameters"] = list(
+        dict.fromkeys(_hashable(texts[name]) for name in inspect.signature(thing).parameters)
+    )
     lines[:] = str(text).splitlines()
 
 
@@ -106,7 +138,11 @@ def _hashable(entry: Parameter) -> Parameter:
 
 
 def setup(app: Sphinx) -> None:
-    app.connect("autodoc-process-docstring", explain_all_parameters, priority=400)  # before numpydoc
+    app.connect(
+        "autodoc-process-docstring", explain_all_parameters, priority=400
+    )  # before numpydoc
     app.connect("source-read", show_gallery)
     app.connect("source-read", offer_colab)
-    app.connect("doctree-read", hand_out_files, priority=400)  # before Sphinx collects the downloads
+    app.connect(
+        "doctree-read", hand_out_files, priority=400
+    )  # before Sphinx collects the downloads

@@ -36,7 +36,9 @@ def draw_balls() -> dict[str, Tensor]:
     """The kinds of colours, and of lights, each on a sphere."""
     vertices, faces = nmr.icosphere(3)
     camera = nmr.LookAt.from_angles(2.732, 25.0, 40.0, half_fov_deg=23.0)
-    squares = ((torch.arange(16)[:, None] + torch.arange(32)) % 2).float()[..., None].expand(-1, -1, 3) * 0.6 + 0.3
+    squares = ((torch.arange(16)[:, None] + torch.arange(32)) % 2).float()[..., None].expand(
+        -1, -1, 3
+    ) * 0.6 + 0.3
     u = (torch.atan2(vertices[:, 0], vertices[:, 2]) / (2 * torch.pi)) % 1
     uv = torch.stack([u, vertices[:, 1].clamp(-1, 1).asin() / torch.pi + 0.5], dim=1)
     uv = uv[faces]  # three corners for each face: the texture has a seam
@@ -44,7 +46,9 @@ def draw_balls() -> dict[str, Tensor]:
     kinds = {
         "VertexColors": nmr.VertexColors((vertices + 1) / 2),
         "FaceColors": nmr.FaceColors(index_colors(torch.arange(len(faces)))),
-        "UVTexture": nmr.UVTexture(squares, uv.view(-1, 2), torch.arange(3 * len(faces)).view(-1, 3), wrap="repeat"),
+        "UVTexture": nmr.UVTexture(
+            squares, uv.view(-1, 2), torch.arange(3 * len(faces)).view(-1, 3), wrap="repeat"
+        ),
     }
     lights = {
         "flat": nmr.Lights(0.3, 0.7, [0.3, 0.9, 0.4]),
@@ -53,7 +57,9 @@ def draw_balls() -> dict[str, Tensor]:
     }
 
     def draw(**look) -> Tensor:
-        return nmr.render_rgb(0.95 * vertices, faces, camera, background=1.0, image_size=SIZE, **look)
+        return nmr.render_rgb(
+            0.95 * vertices, faces, camera, background=1.0, image_size=SIZE, **look
+        )
 
     return {
         "colors": torch.cat([draw(colors=colors) for colors in kinds.values()]),
@@ -64,19 +70,25 @@ def draw_balls() -> dict[str, Tensor]:
 def main(output: Path = Path("output")) -> None:
     """Writes OUTPUT/<function>.png: views side by side."""
     vertices, faces = chair()
-    camera = nmr.LookAt.from_angles(2.732, 25.0, [40.0, 150.0], half_fov_deg=12.0, right_handed=True)
+    camera = nmr.LookAt.from_angles(
+        2.732, 25.0, [40.0, 150.0], half_fov_deg=12.0, right_handed=True
+    )
     lights = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, 0.4], [-0.7, 0.1, 0.6]])
     colors = nmr.VertexColors((vertices * 1.2 + 0.55).clamp(0.1, 0.95))
     mesh, square = (vertices, faces, camera), {"image_size": SIZE}
     look = {"colors": colors, "lights": lights, "background": 1.0} | square
     near, far = 2.3, 3.2
     normals = nmr.render(*mesh, outputs=("normals", "alpha"), **square)
-    voxels = nmr.voxelize(vertices + 0.5, faces).flip(-1).sum(-1).clamp(max=12) / 12  # [1, x, y]: seen along z
+    voxels = (
+        nmr.voxelize(vertices + 0.5, faces).flip(-1).sum(-1).clamp(max=12) / 12
+    )  # [1, x, y]: seen along z
     side = voxels[0].T.flip(0).repeat_interleave(SIZE // 32, 0).repeat_interleave(SIZE // 32, 1)
     light = {"lights": lights, "background": 1.0}
     spheres = [nmr.icosphere(level) for level in (1, 3)]
     balls = [
-        nmr.render_rgb(*ball, nmr.LookAt.from_angles(2.732, 25.0, 40.0, half_fov_deg=23.0), **light, **square)
+        nmr.render_rgb(
+            *ball, nmr.LookAt.from_angles(2.732, 25.0, 40.0, half_fov_deg=23.0), **light, **square
+        )
         for ball in spheres
     ]
     pictures = {
@@ -85,8 +97,11 @@ def main(output: Path = Path("output")) -> None:
         "render_soft": nmr.render_soft(*mesh, sigma=1e-3, **look).rgb,
         "render_transparent": nmr.render_transparent(*mesh, opacity=0.4, **look).rgb,
         "render_rgb": nmr.render_rgb(*mesh, **look),
-        "render_depth": gray((nmr.render_depth(*mesh, near=near, far=far, **square) - near) / (far - near)),
-        "render_normals": (normals.normals + 1) / 2 * normals.alpha[..., None] + (1 - normals.alpha[..., None]),
+        "render_depth": gray(
+            (nmr.render_depth(*mesh, near=near, far=far, **square) - near) / (far - near)
+        ),
+        "render_normals": (normals.normals + 1) / 2 * normals.alpha[..., None]
+        + (1 - normals.alpha[..., None]),
         "render_face_index": index_colors(nmr.render_face_index(*mesh, **square)),
         "icosphere": torch.cat(balls),
         "voxelize": torch.stack([nmr.render_rgb(*mesh, **look)[0], gray(1 - side)]),

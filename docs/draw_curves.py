@@ -22,7 +22,9 @@ METHODS = {
     "proposed": ("Proposed", "#00798c"),
     "plus": ("Plus", "#7a7a7a"),
 }
-Curves = dict[str, dict[str, dict[str, np.ndarray]]]  # by panel, method and seed; rows of step, IoU and MMD
+Curves = dict[
+    str, dict[str, dict[str, np.ndarray]]
+]  # by panel, method and seed; rows of step, IoU and MMD
 
 
 def read_curves(files: list[str]) -> Curves:
@@ -59,7 +61,9 @@ def draw(curves: Curves) -> Figure:
             for row in (0, 1):
                 steps, values = shared[0, :, 0], shared[:, :, 1 + row]
                 axes[row, column].plot(steps, values.mean(0), color=color, label=label)
-                axes[row, column].fill_between(steps, values.min(0), values.max(0), color=color, alpha=0.2, lw=0)
+                axes[row, column].fill_between(
+                    steps, values.min(0), values.max(0), color=color, alpha=0.2, lw=0
+                )
     axes[0, 0].set_ylabel("voxel IoU")
     axes[1, 0].set_ylabel("MMD: pose in the code")
     for panel in axes[1]:
@@ -68,7 +72,9 @@ def draw(curves: Curves) -> Figure:
         panel.grid(color="#e6e6e6")
         panel.spines[["top", "right"]].set_visible(False)
     legend = {line.get_label(): line for panel in axes[0] for line in panel.get_lines()}
-    figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False)
+    figure.legend(
+        legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False
+    )
     return figure
 
 

@@ -31,7 +31,12 @@ class Picture:
     result: str  # what it leaves there: a path in {folder} or in the repository, the last match of a pattern; or
     # NOTEBOOK#K: picture K of its outputs, made small
     sources: tuple[str, ...]  # files that decide what it shows
-    box: tuple[float, float, float, float] = (0, 0, 1, 1)  # left, top, right and bottom of the part that is kept
+    box: tuple[float, float, float, float] = (
+        0,
+        0,
+        1,
+        1,
+    )  # left, top, right and bottom of the part that is kept
     small: bool = False  # made to fit into 320 x 240 pixels
 
 
@@ -40,9 +45,30 @@ _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
-_FUNCTIONS = ("silhouette", "rgb", "depth", "normals", "face_index", "soft_silhouette", "soft", "transparent")
-_FUNCTIONS = (*(f"render_{name}" for name in _FUNCTIONS), "icosphere", "voxelize", "colors", "lights", "look_at")
-_NOTEBOOKS = {"quick_tour": 5, "shape_from_silhouettes": 4, "texture_and_light": 4, "photographs_to_glb": 1}
+_FUNCTIONS = (
+    "silhouette",
+    "rgb",
+    "depth",
+    "normals",
+    "face_index",
+    "soft_silhouette",
+    "soft",
+    "transparent",
+)
+_FUNCTIONS = (
+    *(f"render_{name}" for name in _FUNCTIONS),
+    "icosphere",
+    "voxelize",
+    "colors",
+    "lights",
+    "look_at",
+)
+_NOTEBOOKS = {
+    "quick_tour": 5,
+    "shape_from_silhouettes": 4,
+    "texture_and_light": 4,
+    "photographs_to_glb": 1,
+}
 _SCRIPTS = {  # picture that a script draws, and the part of it that the gallery shows
     "fit_masks": ("fit_masks.png", (0, 0, 1 / 3, 1)),
     "fit_packed": ("fit_packed.png", (0, 0, 1, 1)),
@@ -55,7 +81,9 @@ _SCRIPTS = {  # picture that a script draws, and the part of it that the gallery
 }
 PICTURES = {
     "views.png": Picture(
-        "python docs/examples/draw_views.py --output {folder}", "{folder}/views.png", ("docs/examples/draw_views.py",)
+        "python docs/examples/draw_views.py --output {folder}",
+        "{folder}/views.png",
+        ("docs/examples/draw_views.py",),
     ),
     "gradients.png": Picture(
         "python docs/examples/draw_gradients.py --output {folder}",
@@ -72,7 +100,9 @@ PICTURES = {
         "{folder}/small-model.png",
         ("docs/examples/draw_small_model.py", "learn3d/studio/picture_to_mesh/small.safetensors"),
     ),
-    "quickstart.png": Picture("bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART),
+    "quickstart.png": Picture(
+        "bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART
+    ),
     **{
         f"gallery-{name.replace('_', '-')}.png": Picture(
             f"jupyter execute --inplace docs/examples/{name}.ipynb",
@@ -92,14 +122,24 @@ PICTURES = {
         for name, (drawn, box) in _SCRIPTS.items()
     },
     "door-mesh.png": Picture(
-        "true", "docs/images/small-model.png", ("docs/images/small-model.png",), (0.055, 0.22, 0.595, 0.66), True
+        "true",
+        "docs/images/small-model.png",
+        ("docs/images/small-model.png",),
+        (0.055, 0.22, 0.595, 0.66),
+        True,
     ),
     "door-paper.png": Picture(
-        "true", "docs/images/results-grid.png", ("docs/images/results-grid.png",), (0, 0, 1, 0.34), True
+        "true",
+        "docs/images/results-grid.png",
+        ("docs/images/results-grid.png",),
+        (0, 0, 1, 0.34),
+        True,
     ),
     **{
         f"api-{name.replace('_', '-')}.png": Picture(
-            "python docs/draw_api.py --output {folder}", f"{{folder}}/{name}.png", ("docs/draw_api.py",)
+            "python docs/draw_api.py --output {folder}",
+            f"{{folder}}/{name}.png",
+            ("docs/draw_api.py",),
         )
         for name in _FUNCTIONS
     },
@@ -118,7 +158,9 @@ PICTURES = {
 
 def digest(picture: Picture) -> str:
     """Of the sources of a picture."""
-    return hashlib.sha256(b"\0".join((ROOT / source).read_bytes() for source in picture.sources)).hexdigest()[:16]
+    return hashlib.sha256(
+        b"\0".join((ROOT / source).read_bytes() for source in picture.sources)
+    ).hexdigest()[:16]
 
 
 def records() -> dict[str, dict[str, str]]:
@@ -129,7 +171,11 @@ def records() -> dict[str, dict[str, str]]:
 def out_of_date() -> list[str]:
     """Pictures whose sources have changed since they were made, or that nobody has recorded."""
     made = records()
-    return [name for name, picture in PICTURES.items() if made.get(name, {}).get("sources") != digest(picture)]
+    return [
+        name
+        for name, picture in PICTURES.items()
+        if made.get(name, {}).get("sources") != digest(picture)
+    ]
 
 
 def make(name: str) -> None:
@@ -144,9 +190,11 @@ def make(name: str) -> None:
         last = max((ROOT / found.parent).glob(found.name), key=lambda path: path.stat().st_mtime)
         if picture.small:
             image = Image.open(last).convert("RGB")
-            small(image.crop([round(x * side) for x, side in zip(picture.box, 2 * image.size, strict=True)])).save(
-                IMAGES / name
-            )
+            small(
+                image.crop(
+                    [round(x * side) for x, side in zip(picture.box, 2 * image.size, strict=True)]
+                )
+            ).save(IMAGES / name)
         else:
             shutil.copyfile(last, IMAGES / name)
 
@@ -160,7 +208,11 @@ def small(image: Image.Image) -> Image.Image:
 def picture_of_notebook(notebook: str, number: str) -> Image.Image:
     """Picture `number` (from 1) among the outputs of a notebook."""
     cells = json.loads((ROOT / notebook).read_text())["cells"]
-    data = [output.get("data", {}).get("image/png") for cell in cells for output in cell.get("outputs", [])]
+    data = [
+        output.get("data", {}).get("image/png")
+        for cell in cells
+        for output in cell.get("outputs", [])
+    ]
     pictures = ["".join(text) for text in data if text]
     return Image.open(io.BytesIO(base64.b64decode(pictures[int(number) - 1]))).convert("RGB")
 
@@ -168,11 +220,19 @@ def picture_of_notebook(notebook: str, number: str) -> Image.Image:
 def record(name: str) -> None:
     """Note the commit and the sources that the picture was made with."""
     commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
+        ["git", "rev-parse", "--short", "HEAD"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     picture = PICTURES[name]
     made = records() if RECORDS.exists() else {}
-    made[name] = {"command": picture.command, "commit": commit.stdout.strip(), "sources": digest(picture)}
+    made[name] = {
+        "command": picture.command,
+        "commit": commit.stdout.strip(),
+        "sources": digest(picture),
+    }
     RECORDS.write_text(json.dumps(dict(sorted(made.items())), indent=2) + "\n")
 
 
@@ -186,4 +246,9 @@ if __name__ == "__main__":
         record(name)
     if not names:
         old = out_of_date()
-        print("\n".join(f"{name}{'  (out of date)' * (name in old)}: {p.command}" for name, p in PICTURES.items()))
+        print(
+            "\n".join(
+                f"{name}{'  (out of date)' * (name in old)}: {p.command}"
+                for name, p in PICTURES.items()
+            )
+        )

@@ -37,17 +37,25 @@ def rows(name: str, part: str) -> list[list[str]]:
     if part == "means":
         header, *lines = tables["poses"]
         kept = [k for k, name in enumerate(header) if name != "seed"]
-        return [[line[k] for k in kept] for line in [header, *(line for line in lines if line[1] == "mean")]]
+        return [
+            [line[k] for k in kept]
+            for line in [header, *(line for line in lines if line[1] == "mean")]
+        ]
     if part not in ("both", "side"):
         return [row for row in tables[part] if row[1] != "here (kato19)"]
     header, *main = [row for row in tables["main"] if row[1] != "here (kato19)"]
     ours = {name for name, source, *_ in main if source.startswith("here")}
     main = [row for row in main if row[0] in ours]  # quoted methods stay in the file
-    baseline = next(row[0] for row in main if row[0] not in {row[0] for row in tables["differences"]})
+    baseline = next(
+        row[0] for row in main if row[0] not in {row[0] for row in tables["differences"]}
+    )
     differences = {row[0]: row[2 - len(header) :] for row in tables["differences"]}
     groups = [list(group) for _, group in groupby(main, key=lambda row: row[0])]
     if part == "both":
-        named = [[*group, [group[0][0], f"minus {baseline}", *differences.get(group[0][0], [])]] for group in groups]
+        named = [
+            [*group, [group[0][0], f"minus {baseline}", *differences.get(group[0][0], [])]]
+            for group in groups
+        ]
         return [header, *(row for group in named for row in group if len(row) == len(header))]
     lines = [["method", "paper", "here", f"minus {baseline}"]]
     for group in groups:
@@ -55,7 +63,9 @@ def rows(name: str, part: str) -> list[list[str]]:
         for _, source, value, mean in group:
             note = " (kato19)" if "kato19" in source else ""
             cells[re.match(r"\w+", source)[0]] = (mean if value == "-" else value) + note
-        lines.append([group[0][0], cells["paper"], cells["here"], differences.get(group[0][0], [""])[0]])
+        lines.append(
+            [group[0][0], cells["paper"], cells["here"], differences.get(group[0][0], [""])[0]]
+        )
     return lines
 
 
@@ -78,5 +88,7 @@ if __name__ == "__main__":
         before = page.read_text()
         after = filled(before)
         if "--check" in sys.argv and after != before:
-            sys.exit(f"{page.name} differs from docs/results/*.json; run python docs/make_results.py")
+            sys.exit(
+                f"{page.name} differs from docs/results/*.json; run python docs/make_results.py"
+            )
         page.write_text(after)

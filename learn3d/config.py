@@ -15,7 +15,9 @@ from learn3d.settings import Count, FilePath, Items, Step, checked
 
 T = TypeVar("T")
 _MAY_DIFFER = "a resumed run may have another value"
-MayDiffer = Annotated[T, _MAY_DIFFER]  # an option that changes how a run computes or reports, not its result
+MayDiffer = Annotated[
+    T, _MAY_DIFFER
+]  # an option that changes how a run computes or reports, not its result
 
 
 @checked
@@ -90,14 +92,18 @@ class TrainConfig:
             raise ValueError(f"settings must be those of a method, got {self.settings!r:.200}")
         check_options(self.layout, image_size=self.settings.image_size, view_bins=self.view_bins)
         if self.val_split == "val" and not LAYOUTS[self.layout].validation:
-            raise ValueError(f"the layout {self.layout!r} has no split val; validate on test (val_split test)")
+            raise ValueError(
+                f"the layout {self.layout!r} has no split val; validate on test (val_split test)"
+            )
         if "flip" in self.augment and self.settings.reads_view_ids:
             raise ValueError(
                 f"augment 'flip' changes the view class, but {self.preset!r} learns with the class of the original"
             )
         needed = self.settings.sampling
         if needed not in (None, self.sampling):
-            raise ValueError(f"{self.preset!r} needs sampling {needed!r}, got {self.sampling!r}; leave sampling out")
+            raise ValueError(
+                f"{self.preset!r} needs sampling {needed!r}, got {self.sampling!r}; leave sampling out"
+            )
         size = VIEWS_OF_OBJECT[self.sampling]
         if self.batch_size % size:
             raise ValueError(
@@ -127,12 +133,15 @@ _MAY_DIFFER_NAMES = {
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     """A line for each option that must not change, but differs between `config` and the run `saved`."""
     old, new = (
-        {"method": type(c.settings).__name__.removesuffix("Settings"), **all_options(c)} for c in (saved, config)
+        {"method": type(c.settings).__name__.removesuffix("Settings"), **all_options(c)}
+        for c in (saved, config)
     )
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
     updates = "pose_updates" if config.poses is not None and config.pose_updates > 0 else ""
     varies = schedule or config.settings.varies_over_run or updates
-    allowed = (_MAY_DIFFER_NAMES | {"preset"}) - ({"iterations"} if varies else set())  # a preset only sets defaults
+    allowed = (_MAY_DIFFER_NAMES | {"preset"}) - (
+        {"iterations"} if varies else set()
+    )  # a preset only sets defaults
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
         + f" ({varies} depends on it)" * (name == "iterations")
@@ -144,7 +153,11 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
 def check_resume(config: TrainConfig, saved: TrainConfig) -> None:
     """Raise a ValueError that names every option that must not change when a run is resumed."""
     if changed := differences(config, saved):
-        raise ValueError("cannot resume with different options (" + "; ".join(changed) + "); start a new run for that")
+        raise ValueError(
+            "cannot resume with different options ("
+            + "; ".join(changed)
+            + "); start a new run for that"
+        )
 
 
 def all_options(config: TrainConfig) -> dict[str, Any]:

@@ -9,7 +9,9 @@ import torch
 CPUINFO = "/proc/cpuinfo"  # Linux lists the CPU's instruction sets here
 
 
-def resolve_precision(precision: Literal["auto", "bf16", "fp32"], device: str) -> Literal["bf16", "fp32"]:
+def resolve_precision(
+    precision: Literal["auto", "bf16", "fp32"], device: str
+) -> Literal["bf16", "fp32"]:
     """Turn 'auto' into the faster precision: bf16 on CUDA and on x86 CPUs with bf16 instructions, else fp32.
 
     bf16 instructions halve the time of the networks; without them bf16 is emulated and slower than fp32.
@@ -35,4 +37,10 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except AttributeError:  # another C library
         return False
-    return all((mallopt(_M_MMAP_MAX, 0), mallopt(_M_TRIM_THRESHOLD, 2**31 - 1), mallopt(_M_TOP_PAD, 1 << 27)))
+    return all(
+        (
+            mallopt(_M_MMAP_MAX, 0),
+            mallopt(_M_TRIM_THRESHOLD, 2**31 - 1),
+            mallopt(_M_TOP_PAD, 1 << 27),
+        )
+    )

@@ -30,7 +30,16 @@ F_SCORE_DISTANCE = 0.05  # units of the object frame: objects are 1 long (Pascal
 #: Metrics of each image; learn3d.runs.measurement.MEASURES defines them. IoUs are NaN if both shapes are empty,
 #: chamfer_l1 if one is. f_score is 0 if only the prediction is empty. precision, recall and voxel_iou are kato18's.
 #: hollow is 1 if a mesh exceeds the grid: kato18 then leaves its inside empty.
-MEASURED = ("voxel_iou", "voxel_iou_kato19", "precision", "recall", "hollow", "chamfer_l1", "f_score", "silhouette_iou")
+MEASURED = (
+    "voxel_iou",
+    "voxel_iou_kato19",
+    "precision",
+    "recall",
+    "hollow",
+    "chamfer_l1",
+    "f_score",
+    "silhouette_iou",
+)
 NO_MMD = "no MMD: it needs at least two view classes with at least two images each"
 
 
@@ -40,8 +49,12 @@ class Evaluation:
 
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
-    values: dict[str, Tensor]  # float64 [M] by the names of `MEASURED`; NaN if undefined or not asked for
-    means: dict[str, float]  # means without NaN, and "mmd", "mmd_paper"; undefined ones are left out
+    values: dict[
+        str, Tensor
+    ]  # float64 [M] by the names of `MEASURED`; NaN if undefined or not asked for
+    means: dict[
+        str, float
+    ]  # means without NaN, and "mmd", "mmd_paper"; undefined ones are left out
 
     @property
     def voxel_iou(self) -> float | None:
@@ -76,7 +89,9 @@ def evaluate(
     distances to about 1/32.
     align: turns or moves the predicted shapes of a batch before they are compared.
     """
-    samples = spread_samples(dataset.object_ids, dataset.view_ids, len(dataset) if max_images is None else max_images)
+    samples = spread_samples(
+        dataset.object_ids, dataset.view_ids, len(dataset) if max_images is None else max_images
+    )
     others = _other_images(dataset.object_ids)
     novel_views = bool((others != torch.arange(len(others))).any())
     generator = torch.Generator().manual_seed(0)
@@ -89,31 +104,52 @@ def evaluate(
             shapes = method.decode(code)
             if align is not None:
                 shapes = align(shapes, batch, dataset)
-            measured = {} if dataset.voxels is None else _compare_voxels(shapes, batch, dataset, detailed)
-            if (novel_views or not measured) and dataset.poses is not None and isinstance(shapes, Meshes):
+            measured = (
+                {} if dataset.voxels is None else _compare_voxels(shapes, batch, dataset, detailed)
+            )
+            if (
+                (novel_views or not measured)
+                and dataset.poses is not None
+                and isinstance(shapes, Meshes)
+            ):
                 measured |= _compare_silhouettes(shapes, dataset.batch(others[chosen]))
             if surfaces:
-                measured |= _compare_surfaces(shapes, [surfaces[k] for k in batch.object_ids.tolist()], generator)
+                measured |= _compare_surfaces(
+                    shapes, [surfaces[k] for k in batch.object_ids.tolist()], generator
+                )
             unknown = torch.full((len(chosen),), math.nan)
-            values.append(torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1))
+            values.append(
+                torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1)
+            )
             codes.append(code.float().cpu())
-    object_ids, view_ids = (torch.from_numpy(ids[samples.numpy()]) for ids in (dataset.object_ids, dataset.view_ids))
+    object_ids, view_ids = (
+        torch.from_numpy(ids[samples.numpy()]) for ids in (dataset.object_ids, dataset.view_ids)
+    )
     figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
     means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
-    mmds = mean_mmd(torch.cat(codes).double(), view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))
+    mmds = mean_mmd(
+        torch.cat(codes).double(), view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",)
+    )
     return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds)
 
 
-def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, detailed: bool) -> dict[str, Tensor]:
+def _compare_voxels(
+    shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, detailed: bool
+) -> dict[str, Tensor]:
     convention, definitions = dataset.convention, ("kato18", "kato19")[: 1 + detailed]
     if isinstance(shapes, Meshes):
-        grids = [convention.voxelize(shapes.vertices, shapes.faces, definition) for definition in definitions]
+        grids = [
+            convention.voxelize(shapes.vertices, shapes.faces, definition)
+            for definition in definitions
+        ]
         hollow = convention.exceeds_grid(shapes.vertices, "kato18")
     elif convention.cube_side == 1.0:
         grids = [convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))] * len(definitions)
         hollow = torch.zeros(len(batch))
     else:
-        raise ValueError(f"grids over the box [-0.5, 0.5] cannot be compared with {convention.name} voxels")
+        raise ValueError(
+            f"grids over the box [-0.5, 0.5] cannot be compared with {convention.name} voxels"
+        )
     precision, recall = nmr.metrics.voxel_precision_recall(grids[0], batch.voxels)
     ious = (nmr.metrics.voxel_iou(grid, batch.voxels) for grid in grids)
     found = dict(zip(("voxel_iou", "voxel_iou_kato19"), ious, strict=False))
@@ -123,19 +159,28 @@ def _compare_voxels(shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, 
 def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
     """IoU of a batch's masks and the silhouettes at its cameras: sum of minima over sum of maxima (NaN: both empty)."""
     size = batch.masks.shape[-1]
-    silhouettes = nmr.render_silhouette(shapes.vertices, shapes.faces, batch.cameras, image_size=size).flatten(1)
+    silhouettes = nmr.render_silhouette(
+        shapes.vertices, shapes.faces, batch.cameras, image_size=size
+    ).flatten(1)
     masks = batch.masks.flatten(1)
-    return {"silhouette_iou": torch.minimum(silhouettes, masks).sum(1) / torch.maximum(silhouettes, masks).sum(1)}
+    return {
+        "silhouette_iou": torch.minimum(silhouettes, masks).sum(1)
+        / torch.maximum(silhouettes, masks).sum(1)
+    }
 
 
-def _compare_surfaces(shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator) -> dict[str, Tensor]:
+def _compare_surfaces(
+    shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator
+) -> dict[str, Tensor]:
     """Chamfer-L1 and F-score with the true points [P, 3] of each object; see `MEASURED` for empty surfaces."""
     found = []
     for surface, theirs in zip(shapes.surfaces(), truth, strict=True):
         ours = _sample(surface, generator)
         if len(ours) and len(theirs):
             distance = nmr.metrics.chamfer_distance(ours, theirs, form="l1")
-            found.append((float(distance), float(nmr.metrics.f_score(ours, theirs, F_SCORE_DISTANCE))))
+            found.append(
+                (float(distance), float(nmr.metrics.f_score(ours, theirs, F_SCORE_DISTANCE)))
+            )
         else:
             found.append((math.nan, 0.0 if len(ours) or len(theirs) else math.nan))
     chamfer, f_score = torch.tensor(found).T
@@ -150,7 +195,10 @@ def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Ten
             found += torch.from_numpy(dataset.points[part]).float()
         elif dataset.voxels is not None:
             grids = dataset.convention.to_object(torch.from_numpy(dataset.voxels[part])).float()
-            found += [_sample(grid_surface(grid, box=dataset.convention.cube_side), generator) for grid in grids]
+            found += [
+                _sample(grid_surface(grid, box=dataset.convention.cube_side), generator)
+                for grid in grids
+            ]
     return found
 
 
@@ -158,7 +206,9 @@ def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
     """Points [P, 3] on a surface; [0, 3] if it is empty."""
     if len(surface.faces) == 0:
         return torch.empty(0, 3)
-    return nmr.metrics.sample_surface(surface.vertices, surface.faces, SURFACE_POINTS, generator=generator).points
+    return nmr.metrics.sample_surface(
+        surface.vertices, surface.faces, SURFACE_POINTS, generator=generator
+    ).points
 
 
 def _other_images(object_ids: np.ndarray) -> Tensor:
@@ -238,8 +288,15 @@ def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.nd
         pose = view_poses(torch.zeros(1)) if batch.poses is None else batch.poses[torch.tensor([i])]
         rendering = torch.zeros(MASK_SIZE, MASK_SIZE)
         if len(faces):
-            rendering = nmr.render_silhouette(vertices[None], faces, pose.cameras(), image_size=MASK_SIZE)[0]
-        greys = (torch.stack([batch.masks[i], rendering]).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+            rendering = nmr.render_silhouette(
+                vertices[None], faces, pose.cameras(), image_size=MASK_SIZE
+            )[0]
+        greys = (
+            (torch.stack([batch.masks[i], rendering]).clamp(0, 1) * 255)
+            .round()
+            .to(torch.uint8)
+            .numpy()
+        )
         views = draw_surface(shapes[i], orbit(pose, TURNS_DEG), image_size=TILE)
         rows.append([inputs[i], *np.repeat(greys[..., None], 3, axis=-1), *views])
     return tile(rows, ["input", "target", "rendering", "same view", *AROUND])

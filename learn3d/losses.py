@@ -42,7 +42,10 @@ def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     both = (target > 0) & (depth.detach() < 2 * target)
     error = (depth - target) * both
     rows, columns = both[:, 2:] & both[:, :-2], both[:, :, 2:] & both[:, :, :-2]
-    down, right = (error[:, 2:] - error[:, :-2]).abs() * rows, (error[:, :, 2:] - error[:, :, :-2]).abs() * columns
+    down, right = (
+        (error[:, 2:] - error[:, :-2]).abs() * rows,
+        (error[:, :, 2:] - error[:, :, :-2]).abs() * columns,
+    )
     counts = torch.stack([pixels.sum().float() for pixels in (both, rows, columns)])
     all_pixels, in_rows, in_columns = all_reduce_mean(counts).clamp(min=1)
     return error.abs().sum() / all_pixels, down.sum() / in_rows + right.sum() / in_columns
@@ -85,7 +88,10 @@ def silhouette_energy_distance(silhouettes: Tensor, masks: Tensor) -> Tensor:
 
     silhouettes: float [N,D], N >= 2, differentiable; masks: float [M,D], M >= 1.
     """
-    across, within = _tanimoto_distances(silhouettes, masks), _tanimoto_distances(silhouettes, silhouettes)
+    across, within = (
+        _tanimoto_distances(silhouettes, masks),
+        _tanimoto_distances(silhouettes, silhouettes),
+    )
     pairs = len(silhouettes) * (len(silhouettes) - 1)
     return 2 * across.mean() - (within.sum() - within.diagonal().sum()) / pairs
 
@@ -97,7 +103,9 @@ def _tanimoto_distances(x: Tensor, y: Tensor) -> Tensor:
     return torch.where(union > 0, 1 - product / union.clamp_min(1e-12), 0)
 
 
-def mmd(xx: Tensor, yy: Tensor, xy: Tensor, form: Literal["released", "paper"] = "released") -> Tensor:
+def mmd(
+    xx: Tensor, yy: Tensor, xy: Tensor, form: Literal["released", "paper"] = "released"
+) -> Tensor:
     """Maximum mean discrepancy between two sets of N codes, x and y; 0 for equal sets.
 
     xx, yy, xy: float [N,N], squared distances d^2 within x, within y and from x to y; differentiable. b is the mean of

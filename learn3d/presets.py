@@ -27,10 +27,22 @@ SHORT_NAMES = {
     "plus": ("plus-kato", "the default: proposed, with mirror symmetry and a loss at novel views"),
     "proposed": ("peng2020-kato", "pose-invariant codes from single views (Peng et al. 2020)"),
     "vanilla": ("peng2020-kato-vanilla", "encoder and mesh generator alone, on single views"),
-    "multi-view": ("multi-view-kato", "vanilla on pairs of views of an object (supervision of Kato et al. 2018)"),
-    "many-views": ("many-views-kato", "multi-view supervision: a shape must explain five views of its object"),
-    "vpl": ("peng2020-kato-vpl", "view prior learning: novel views must look real (Kato and Harada 2019)"),
-    "prgan": ("gadelha2017-kato", "a GAN of voxel grids, then an encoder (PrGAN, Gadelha et al. 2017)"),
+    "multi-view": (
+        "multi-view-kato",
+        "vanilla on pairs of views of an object (supervision of Kato et al. 2018)",
+    ),
+    "many-views": (
+        "many-views-kato",
+        "multi-view supervision: a shape must explain five views of its object",
+    ),
+    "vpl": (
+        "peng2020-kato-vpl",
+        "view prior learning: novel views must look real (Kato and Harada 2019)",
+    ),
+    "prgan": (
+        "gadelha2017-kato",
+        "a GAN of voxel grids, then an encoder (PrGAN, Gadelha et al. 2017)",
+    ),
 }
 
 
@@ -146,7 +158,9 @@ _NAMED = {
     # The model in the package: cameras at unknown distances.
     "many-views-around": replace(
         _MANY_VIEWS,
-        settings=ManyViewsSettings(encoder="conv-centred", generator="sphere-small", symmetry="x", lambda_view=1.0),
+        settings=ManyViewsSettings(
+            encoder="conv-centred", generator="sphere-small", symmetry="x", lambda_view=1.0
+        ),
         layout="around",
     ),
     "plus-pascal": replace(  # without "colors", which blanks some images, as resnet18 does not see the mask
@@ -168,7 +182,9 @@ _NAMED = {
     ),
     # Published code of Gadelha et al. 2017: 50 epochs of the 2,831 x 24 training images of airplanes
     # for the GAN, then 50 for the encoder. 24 views: Peng et al. 2020, section 4, who do not give the projection.
-    "gadelha2017-kato": replace(_KATO, label="PrGAN", settings=PrGANSettings(), iterations=106_100, batch_size=64),
+    "gadelha2017-kato": replace(
+        _KATO, label="PrGAN", settings=PrGANSettings(), iterations=106_100, batch_size=64
+    ),
     # Published code of Peng et al. 2020: its VPL for Kato's data.
     "peng2020-kato-vpl": replace(_KATO, label="VPL", settings=VPLSettings()),
     # Published code of Kato and Harada 2019: train_shapenet.sh, shapenet_single_sil_nv1_uvr.
@@ -193,7 +209,9 @@ _NAMED = {
     "peng2020-pascal": _PASCAL,
     "peng2020-pascal-vanilla": _vanilla(_PASCAL),
 }
-PRESETS: dict[str, TrainConfig] = {name: replace(config, preset=name) for name, config in _NAMED.items()}
+PRESETS: dict[str, TrainConfig] = {
+    name: replace(config, preset=name) for name, config in _NAMED.items()
+}
 
 
 def full_name(name: str) -> str:
@@ -251,7 +269,11 @@ def command_line(config: TrainConfig, **placeholders: str) -> str:
     """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of options' values."""
     values = all_options(config)
     usual = all_options(PRESETS[config.preset])
-    names = [n for n in values if n not in (*USUAL_OPTIONS, "device", "threads") and values[n] != usual[n]]
+    names = [
+        n
+        for n in values
+        if n not in (*USUAL_OPTIONS, "device", "threads") and values[n] != usual[n]
+    ]
     words = ["learn3d", "train"]
     for name in (*USUAL_OPTIONS, *names):
         option = name.replace("_", "-")

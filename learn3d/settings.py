@@ -28,7 +28,9 @@ def checked(cls: type[T]) -> type[T]:
 
     `__post_init__` checks fields against each other; it may raise a ValueError, too.
     """
-    cls = dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False))(cls)
+    cls = dataclass(
+        frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    )(cls)
     check: Callable[..., None] = cls.__init__
 
     @functools.wraps(check)

@@ -40,7 +40,9 @@ class Workers:
 
     def __post_init__(self) -> None:
         if self.cluster is not None and self.jobs > 1:
-            raise ValueError(f"--jobs {self.jobs} does not go with --cluster, whose workers decide; leave it out")
+            raise ValueError(
+                f"--jobs {self.jobs} does not go with --cluster, whose workers decide; leave it out"
+            )
 
     @property
     def threads(self) -> int:
@@ -58,7 +60,9 @@ class Task:
     """A function call in its own process."""
 
     name: str  # for messages
-    function: Callable[..., bool]  # importable; returns False if SIGTERM stopped it and it can be resumed
+    function: Callable[
+        ..., bool
+    ]  # importable; returns False if SIGTERM stopped it and it can be resumed
     arguments: tuple[Any, ...]
     log: Path  # file to which its output is appended
 
@@ -80,7 +84,9 @@ def run_tasks(tasks: Sequence[Task], workers: Workers) -> list[str]:
         running = {start(task): task for task in tasks}
         try:
             while running and not asked.name:
-                for future in concurrent.futures.wait(running, 0.1, concurrent.futures.FIRST_COMPLETED).done:
+                for future in concurrent.futures.wait(
+                    running, 0.1, concurrent.futures.FIRST_COMPLETED
+                ).done:
                     task = running.pop(future)
                     status, tail = _outcome(future)
                     died = status < 0 or status == INTERRUPTED
@@ -90,7 +96,9 @@ def run_tasks(tasks: Sequence[Task], workers: Workers) -> list[str]:
                         continue
                     ended = f"[{len(tasks) - len(running)}/{len(tasks)}]"
                     if status == 0 or asked.name:
-                        note(f"{ended} {task.name}: {'stopped' if status else 'done'}; {tail.splitlines()[-1]}")
+                        note(
+                            f"{ended} {task.name}: {'stopped' if status else 'done'}; {tail.splitlines()[-1]}"
+                        )
                     else:
                         failed.append(task.name)
                         note(f"{ended} FAILED {task.name}; the end of its log:\n{tail}")
@@ -111,12 +119,16 @@ def _executor(workers: Workers) -> Iterator[tuple[concurrent.futures.Executor, A
     try:
         from distributed import Client, Event
     except ModuleNotFoundError:
-        raise ValueError("--cluster needs the package distributed; install the extra cluster of this package") from None
+        raise ValueError(
+            "--cluster needs the package distributed; install the extra cluster of this package"
+        ) from None
     try:
         client = Client(workers.cluster, timeout=30, set_as_default=False)
     except (OSError, ValueError) as error:
         advice = "start one (dask scheduler), and give the address that it prints (tcp://HOST:8786)"
-        raise OSError(f"no Dask scheduler answers at {workers.cluster} ({error}); {advice}") from None
+        raise OSError(
+            f"no Dask scheduler answers at {workers.cluster} ({error}); {advice}"
+        ) from None
     with client, client.get_executor(pure=False) as executor:
         yield executor, Event(client=client)
 

@@ -101,7 +101,10 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
 def align(rows: Sequence[Sequence[str]]) -> str:
     """Rows with the same number of cells as lines; each column is as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    lines = (
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        for row in rows
+    )
     return "\n".join(line.rstrip() for line in lines)
 
 

@@ -38,7 +38,9 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     checkpoint cannot be written or another process works in the folder.
     """
     started, folder = time.monotonic(), config.output
-    config = dataclasses.replace(config, precision=resolve_precision(config.precision, config.device))
+    config = dataclasses.replace(
+        config, precision=resolve_precision(config.precision, config.device)
+    )
     check_log(config)
     keep_freed_memory()
     threads = ThreadTuner(config.threads)
@@ -47,15 +49,23 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             run_folder.check_can_start(folder, overwrite)
         train_set, val_set = (load_data(config, split) for split in ("train", config.val_split))
         plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
-        info = train_set.info(plane, train_set.solidity() if config.settings.wants_solidity else None)
-        options = {name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")}
+        info = train_set.info(
+            plane, train_set.solidity() if config.settings.wants_solidity else None
+        )
+        options = {
+            name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")
+        }
         method = create_method(config.settings, info, **options)
-        empty_masks = train_set.check_masks()  # it may raise, like the next line, before `begin` removes an older run
+        empty_masks = (
+            train_set.check_masks()
+        )  # it may raise, like the next line, before `begin` removes an older run
         rows = distributed.own_rows(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
         method.check_batch(next(batches(train_set, config, rows=rows)))
         run = Run(config, method, info, describe_images(train_set), train_set.candidates)
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
-        distributed.check_same(options=config, data=run.data, step=progress.step, versions=run.versions)
+        distributed.check_same(
+            options=config, data=run.data, step=progress.step, versions=run.versions
+        )
         distributed.synchronize(method.networks, method.optimizers.values())
         if progress.step == config.iterations:
             return Summary(folder, progress, True, time.monotonic() - started)
@@ -74,12 +84,18 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             log.say(run.describe(progress, train_set, val_set, threads))
             for step, batch in enumerate(batches(train_set, config, start, rows), start):
                 step_began = time.monotonic()
-                losses, stopped_by = distributed.mean_losses(take_step(method, batch, step), stop.name)
+                losses, stopped_by = distributed.mean_losses(
+                    take_step(method, batch, step), stop.name
+                )
                 if chosen := threads.after_step(time.monotonic() - step_began):
                     log.say(f"step {step}: {chosen}")
-                recent = progress.losses | losses  # the last two steps: some methods alternate between two networks
+                recent = (
+                    progress.losses | losses
+                )  # the last two steps: some methods alternate between two networks
                 state = {"step": step, "losses": losses, "threads": threads.chosen}
-                progress = dataclasses.replace(progress, **state, seconds=before + time.monotonic() - started)
+                progress = dataclasses.replace(
+                    progress, **state, seconds=before + time.monotonic() - started
+                )
                 log.step(step, losses)
 
                 last = step == config.iterations
@@ -87,7 +103,9 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                     log.metrics(step, "train", recent)
                 if step in updates:
                     changed = update_poses(method, train_set)
-                    log.say(f"step {step}: poses reweighted; the best pose of {changed:.0%} of the images changed")
+                    log.say(
+                        f"step {step}: poses reweighted; the best pose of {changed:.0%} of the images changed"
+                    )
                 if last or step % config.validate_every == 0:
                     progress = validate(run, val_set, progress, log)
                 if last or step % config.pictures_every == 0:
@@ -113,7 +131,9 @@ def take_step(method: Method, batch: Batch, step: int) -> dict[str, float]:
             group["lr"] = factor * group.setdefault("initial_lr", group["lr"])
     values: dict[str, float] = {}
     total = 0.0
-    for losses, names in method.phases(batch, step):  # PrGAN's steps have several phases, others have one
+    for losses, names in method.phases(
+        batch, step
+    ):  # PrGAN's steps have several phases, others have one
         values |= loss_values(losses, step)
         total += sum(weight * values[name] for name, (weight, _) in losses.items())
         weighted = sum(weight * loss for weight, loss in losses.values())

@@ -49,7 +49,15 @@ from .render import (
     render_silhouette,
     render_soft_silhouette,
 )
-from .textures import Colors, FaceColors, NormalMap, TextureCubes, UVTexture, VertexColors, sample_texture
+from .textures import (
+    Colors,
+    FaceColors,
+    NormalMap,
+    TextureCubes,
+    UVTexture,
+    VertexColors,
+    sample_texture,
+)
 from .voxels import voxelize
 
 __version__ = "0.1.0"

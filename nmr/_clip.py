@@ -38,7 +38,9 @@ class Clipped(NamedTuple):
         drawn, num_faces = self.mesh.num_faces.view(one), self.num_faces
         num_faces = num_faces.view(one) if isinstance(num_faces, Tensor) else num_faces
         back = face_index >= drawn
-        face = torch.where(back, face_index - drawn, face_index).long() + self.mesh.first_faces(0).view(one)
+        face = torch.where(back, face_index - drawn, face_index).long() + self.mesh.first_faces(
+            0
+        ).view(one)
         source = self.source[torch.where(face_index < 0, len(self.source) - 1, face)]
         return torch.where(back, source + num_faces, source)
 
@@ -56,7 +58,9 @@ def clip_plane(near: float, far: float) -> float:
     return max(float(near), (_SMALLEST if near else _NEAREST) * float(far))
 
 
-def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float) -> Clipped | None:
+def clip_near(
+    world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float
+) -> Clipped | None:
     """Cuts the faces that cross z = plane and leaves out those behind it; None if the meshes may stay as they are.
 
     ``world`` and ``mesh`` are the meshes before and after the camera. The new vertices are interpolated in the world
@@ -67,12 +71,19 @@ def clip_near(world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: floa
         return None
     num_new, num_drawn = zip(*room, strict=True)
     new_starts = packed_starts(num_new, num_drawn)
-    faces, source, corners, ends = ops.clip_faces(*mesh[:3], plane, new_starts, sum(num_new), sum(num_drawn))
+    faces, source, corners, ends = ops.clip_faces(
+        *mesh[:3], plane, new_starts, sum(num_new), sum(num_drawn)
+    )
     share, new = _new_vertices(world, mesh, camera, plane, ends[:, :2], new_starts)
-    own, own_counts = mesh.each_vertices(), mesh.vertex_counts or (mesh.vertices.shape[-2],) * mesh.batch
+    own, own_counts = (
+        mesh.each_vertices(),
+        mesh.vertex_counts or (mesh.vertices.shape[-2],) * mesh.batch,
+    )
     vertices = torch.cat([x for pair in zip(own, new.split(num_new), strict=True) for x in pair])
     vertex_counts = tuple(v + n for v, n in zip(own_counts, num_new, strict=True))
-    drawn = MeshBatch(vertices, faces, packed_starts(vertex_counts, num_drawn), vertex_counts, num_drawn)
+    drawn = MeshBatch(
+        vertices, faces, packed_starts(vertex_counts, num_drawn), vertex_counts, num_drawn
+    )
     eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
     places = (1 - share) * eye[ends[:, 2]] + share * eye[ends[:, 3]]
     places = torch.cat([x for part in places.split(num_new) for x in (eye, part)])
@@ -93,10 +104,17 @@ def _room(mesh: MeshBatch, plane: float) -> list[tuple[int, int]] | None:
 
 
 def _new_vertices(
-    world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float, rows: Tensor, starts: Tensor
+    world: Tensor,
+    mesh: MeshBatch,
+    camera: Camera | None,
+    plane: float,
+    rows: Tensor,
+    starts: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The new vertices between two rows of the vertices: how far from the first ``[P, 1]``, and in renderer space."""
-    if camera is None:  # the perspective image (x, y, z) of a point is linear in space as (x z, y z, z)
+    if (
+        camera is None
+    ):  # the perspective image (x, y, z) of a point is linear in space as (x z, y z, z)
         ends = F.embedding(rows, mesh.vertices.reshape(-1, 3))
         finite = _moderate(ends).view(-1, 1, 1)
         ends = torch.where(finite, ends, torch.zeros_like(ends))  # no gradient is 0 * inf
@@ -130,10 +148,14 @@ def _moderate(ends: Tensor) -> Tensor:
     return (ends.abs() < LARGEST_COORDINATE).flatten(1).all(1, keepdim=True)
 
 
-def _transform_padded(points: Tensor, world: Tensor, batch: int, camera: Camera, starts: Tensor) -> Tensor:
+def _transform_padded(
+    points: Tensor, world: Tensor, batch: int, camera: Camera, starts: Tensor
+) -> Tensor:
     """Packed points through a camera that takes batches ``[B, V, 3]`` only; vertices of the mesh fill the gaps."""
     counts = starts[:, 0].diff().tolist()
     fill = world[:, :1].expand(batch, max(counts), 3)
-    parts = [torch.cat([x, gap[len(x) :]]) for x, gap in zip(points.split(counts), fill, strict=True)]
+    parts = [
+        torch.cat([x, gap[len(x) :]]) for x, gap in zip(points.split(counts), fill, strict=True)
+    ]
     transformed = camera.transform(torch.stack(parts))
     return torch.cat([part[:n] for part, n in zip(transformed, counts, strict=True)])

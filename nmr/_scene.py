@@ -58,11 +58,15 @@ class Scene(NamedTuple):
 
     def rasterize(self) -> Tensor:
         settings = self.settings
-        return ops.rasterize(*self.drawn[:3], *settings.raster, *settings[3:6], settings.perspective)
+        return ops.rasterize(
+            *self.drawn[:3], *settings.raster, *settings[3:6], settings.perspective
+        )
 
     def rasterize_layers(self, layers: int) -> Tensor:
         settings = self.settings
-        return ops.rasterize_layers(*self.drawn[:3], *settings.raster, layers, *settings[3:6], settings.perspective)
+        return ops.rasterize_layers(
+            *self.drawn[:3], *settings.raster, layers, *settings[3:6], settings.perspective
+        )
 
     def silhouette(self, gradient: str) -> tuple[Tensor, Tensor]:
         vertices, faces, starts = self.drawn[:3]
@@ -71,12 +75,16 @@ class Scene(NamedTuple):
 
     def soft_silhouette(self, sigma: Tensor, dist_eps: float) -> Tensor:
         settings, reach = self.settings, math.log(1 / dist_eps - 1)
-        transmittance = ops.soft_silhouette(*self.drawn[:3], *settings.raster, sigma.double(), *settings[3:6], reach)
+        transmittance = ops.soft_silhouette(
+            *self.drawn[:3], *settings.raster, sigma.double(), *settings[3:6], reach
+        )
         return 1 - average(transmittance.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
     def depth(self, face_index: Tensor) -> Tensor:
         settings = self.settings
-        return ops.depth_image(*self.drawn[:3], face_index, settings.anti_aliasing, settings.far, settings.perspective)
+        return ops.depth_image(
+            *self.drawn[:3], face_index, settings.anti_aliasing, settings.far, settings.perspective
+        )
 
     def fragments(self, face_index: Tensor) -> Fragments:
         """Those of a face index map ``[B, H, W]``, or of layers ``[B, H, W, K]``."""
@@ -96,23 +104,33 @@ class Scene(NamedTuple):
         """The nearest faces whose border is at a squared distance of less than ``sigma * reach``."""
         settings = self.settings
         how = *settings[3:6], settings.perspective
-        drawn_index = ops.soft_layers(*self.drawn[:3], *settings.raster, layers, sigma.detach().double(), *how, reach)
-        of_drawn = ops.soft_fragments(*self.drawn[:3], drawn_index, settings.far, settings.perspective)
+        drawn_index = ops.soft_layers(
+            *self.drawn[:3], *settings.raster, layers, sigma.detach().double(), *how, reach
+        )
+        of_drawn = ops.soft_fragments(
+            *self.drawn[:3], drawn_index, settings.far, settings.perspective
+        )
         face_index, (weights, depth, distances) = drawn_index, of_drawn
         if self.clipped is not None:
-            weights = self.clipped.weights(drawn_index.flatten(2), weights.flatten(2, 3)).view_as(weights)
+            weights = self.clipped.weights(drawn_index.flatten(2), weights.flatten(2, 3)).view_as(
+                weights
+            )
             face_index = self.clipped.face_index(drawn_index)
         shown = face_index, weights, depth, self.mesh, self.world, self.camera
         return Fragments(*shown, settings.anti_aliasing, settings.eps, self.drawn, None, distances)
 
     def _weights_and_depth(self, face_index: Tensor) -> tuple[Tensor, Tensor]:
-        weights, depth = ops.fragments(*self.drawn[:3], face_index, self.settings.far, self.settings.perspective)
+        weights, depth = ops.fragments(
+            *self.drawn[:3], face_index, self.settings.far, self.settings.perspective
+        )
         return weights if self.clipped is None else self.clipped.weights(face_index, weights), depth
 
     def face_index(self, face_index: Tensor) -> Tensor:
         if self.clipped is not None:
             face_index = self.clipped.face_index(face_index)
-        return torch.where(face_index >= self.mesh.num_faces, face_index - self.mesh.num_faces, face_index)
+        return torch.where(
+            face_index >= self.mesh.num_faces, face_index - self.mesh.num_faces, face_index
+        )
 
 
 def make_scene(
@@ -156,7 +174,13 @@ def make_scene(
                 "them may show single open pixels; take a larger near, or float64",
                 stacklevel=callers_level(),
             )
-    how = check_flag(anti_aliasing, "anti_aliasing"), check_flag(fill_back, "fill_back"), near, float(far), float(eps)
+    how = (
+        check_flag(anti_aliasing, "anti_aliasing"),
+        check_flag(fill_back, "fill_back"),
+        near,
+        float(far),
+        float(eps),
+    )
     settings = ops.RasterSettings(height, width, *how, has_perspective(camera))
     return Scene(world, mesh, camera, settings, clipped)
 
@@ -182,14 +206,20 @@ def shade(
         image = fragments.weights.new_ones(1).expand(*shape, 3)
     elif colors is not None:
         if not callable(getattr(colors, "sample", None)):
-            remedy = "; nmr.VertexColors(x) makes colours of a tensor x [V, C]" if isinstance(colors, Tensor) else ""
+            remedy = (
+                "; nmr.VertexColors(x) makes colours of a tensor x [V, C]"
+                if isinstance(colors, Tensor)
+                else ""
+            )
             raise TypeError(
                 "colors must be nmr.VertexColors, FaceColors, TextureCubes, UVTexture or have sample(fragments), "
                 f"got {describe(colors)}{remedy}"
             )
         image = colors.sample(fragments)
         if not isinstance(image, Tensor) or image.shape[:-1] != shape or not image.shape[-1]:
-            raise ValueError(f"colors.sample must return a tensor {[*shape, 'C']}, got {describe(image)}")
+            raise ValueError(
+                f"colors.sample must return a tensor {[*shape, 'C']}, got {describe(image)}"
+            )
     if lights is not None:
         if image is not None and image.shape[-1] not in (1, 3):
             raise ValueError(f"lights need colours of 3 channels (or 1), got {image.shape[-1]}")
@@ -202,7 +232,9 @@ def background_rows(background: object, channels: int, batch: int, like: Tensor)
     """The background of ``batch`` images as ``[B | 1, channels]``, in the dtype and on the device of ``like``."""
     wanted = f"a number, [{channels}] or [{batch}, {channels}]"
     behind = as_floats(background, "background", wanted).to(like)
-    if behind.ndim > 2 or any(n not in (1, m) for n, m in zip(behind.shape[::-1], (channels, batch), strict=False)):
+    if behind.ndim > 2 or any(
+        n not in (1, m) for n, m in zip(behind.shape[::-1], (channels, batch), strict=False)
+    ):
         raise ValueError(
             f"background must be {wanted}, got {describe(behind)}; for a picture behind the meshes render rgb and "
             "alpha with background 0, and add (1 - alpha)[..., None] * picture"

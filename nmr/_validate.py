@@ -11,7 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64, torch.uint16, torch.uint32, torch.uint64)
+_INTEGERS = (
+    torch.uint8,
+    torch.int8,
+    torch.int16,
+    torch.int32,
+    torch.int64,
+    torch.uint16,
+    torch.uint32,
+    torch.uint64,
+)
 _FLOATS = (torch.float32, torch.float64)
 GRADIENTS = ("nmr", "local", "none")  # definitions of the gradient at edges
 
@@ -26,7 +35,10 @@ def describe(value: object) -> str:
 def callers_level() -> int:
     """``stacklevel`` for a warning that is to name the line outside of this package which called it."""
     level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == __package__:
+    while (
+        frame.f_back is not None
+        and frame.f_globals.get("__name__", "").partition(".")[0] == __package__
+    ):
         level, frame = level + 1, frame.f_back
     return level
 
@@ -42,7 +54,11 @@ def cast_under_autocast(tensor: object) -> object:
 def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
     """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: other accepted types, for the error."""
     if not isinstance(vertices, Tensor):
-        remedy = ", or one call for each mesh if their sizes differ" if isinstance(vertices, (list, tuple)) else ""
+        remedy = (
+            ", or one call for each mesh if their sizes differ"
+            if isinstance(vertices, (list, tuple))
+            else ""
+        )
         raise TypeError(
             f"vertices must be a float tensor [B, V, 3] or [V, 3]{otherwise}, got {describe(vertices)}; "
             f"use torch.as_tensor(){remedy}"
@@ -50,11 +66,17 @@ def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3:
         raise ValueError(f"vertices must have shape [B, V, 3] or [V, 3], got {describe(vertices)}")
     if vertices.layout != torch.strided or vertices.device.type == "meta":
-        kind = "without values (device meta)" if vertices.device.type == "meta" else f"of layout {vertices.layout}"
+        kind = (
+            "without values (device meta)"
+            if vertices.device.type == "meta"
+            else f"of layout {vertices.layout}"
+        )
         raise TypeError(f"vertices must be an ordinary tensor, got one {kind}")
     vertices = cast_under_autocast(vertices)
     if vertices.dtype not in _FLOATS:
-        raise TypeError(f"vertices must be float32 or float64, got {describe(vertices)}; call vertices.float()")
+        raise TypeError(
+            f"vertices must be float32 or float64, got {describe(vertices)}; call vertices.float()"
+        )
     return vertices if vertices.ndim == 3 else vertices.unsqueeze(0)
 
 
@@ -90,7 +112,9 @@ def check_camera(camera: object, packed: bool) -> None:
             f"camera must be an instance, got the class {camera.__name__}; create one: {camera.__name__}(...)"
         )
     if not callable(getattr(camera, "transform", None)):
-        raise TypeError(f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}")
+        raise TypeError(
+            f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}"
+        )
     if packed and "starts" not in inspect.signature(camera.transform).parameters:
         raise TypeError(
             f"for a list of meshes, {type(camera).__name__}.transform must take (vertices [N, 3], starts [B + 1, 2]), "
@@ -100,9 +124,16 @@ def check_camera(camera: object, packed: bool) -> None:
 
 def check_transformed(vertices: object, world: Tensor, packed: bool) -> None:
     """The vertices that a camera returned must have type, device and shape of ``world`` (one mesh may become B)."""
-    like = isinstance(vertices, Tensor) and (vertices.dtype, vertices.device) == (world.dtype, world.device)
+    like = isinstance(vertices, Tensor) and (vertices.dtype, vertices.device) == (
+        world.dtype,
+        world.device,
+    )
     grown = not packed and world.shape[0] == 1
-    if not like or vertices.ndim != world.ndim or vertices.shape[int(grown) :] != world.shape[int(grown) :]:
+    if (
+        not like
+        or vertices.ndim != world.ndim
+        or vertices.shape[int(grown) :] != world.shape[int(grown) :]
+    ):
         shape = ["B", *world.shape[1:]] if grown else list(world.shape)
         wanted = f"{str(world.dtype).removeprefix('torch.')} [{', '.join(map(str, shape))}]"
         raise ValueError(
@@ -123,10 +154,18 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
         for value in values:
             if not isinstance(value, Tensor) or value.dtype not in _FLOATS:
                 raise TypeError(f"{wanted}; the list holds {describe(value)}")
-            if value.ndim != ndim or value.shape[-1] != values[0].shape[-1] or value.dtype != values[0].dtype:
-                raise ValueError(f"{wanted}; the list holds {describe(values[0])} and {describe(value)}")
+            if (
+                value.ndim != ndim
+                or value.shape[-1] != values[0].shape[-1]
+                or value.dtype != values[0].dtype
+            ):
+                raise ValueError(
+                    f"{wanted}; the list holds {describe(values[0])} and {describe(value)}"
+                )
             if value.shape[-1] == 0:
-                raise ValueError(f"{wanted}, with at least one channel; the list holds {describe(value)}")
+                raise ValueError(
+                    f"{wanted}, with at least one channel; the list holds {describe(value)}"
+                )
         return values
     values = cast_under_autocast(values)
     if not isinstance(values, Tensor) or values.dtype not in _FLOATS:
@@ -156,7 +195,9 @@ def _joined(value: object) -> Tensor:
     if isinstance(value, Tensor):
         return value
     # torch.as_tensor would detach the tensors in a sequence.
-    if isinstance(value, (list, tuple)) and any(isinstance(part, (Tensor, np.ndarray, list, tuple)) for part in value):
+    if isinstance(value, (list, tuple)) and any(
+        isinstance(part, (Tensor, np.ndarray, list, tuple)) for part in value
+    ):
         return torch.stack([_joined(part) for part in value])
     return torch.tensor(value, dtype=torch.float64, device="cpu")  # a copy, also of an array
 
@@ -186,7 +227,9 @@ def check_image_size(value: object, largest: int) -> tuple[int, int]:
         value = value.tolist()
     if isinstance(value, (list, tuple)):
         if len(value) != 2:
-            raise ValueError(f"image_size must be an integer or a pair (height, width), got {value!r}")
+            raise ValueError(
+                f"image_size must be an integer or a pair (height, width), got {value!r}"
+            )
         height, width = (check_size(size, "image_size", largest) for size in value)
         return height, width
     size = check_size(value, "image_size", largest, "an integer or a pair (height, width)")

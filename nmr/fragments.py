@@ -11,7 +11,14 @@ from torch import Tensor
 
 from . import ops
 from ._packing import LARGEST_COORDINATE, MeshBatch
-from ._validate import GRADIENTS, as_floats, cast_under_autocast, check_choice, check_values, describe
+from ._validate import (
+    GRADIENTS,
+    as_floats,
+    cast_under_autocast,
+    check_choice,
+    check_values,
+    describe,
+)
 from .cameras.projection import ProjectingCamera, has_perspective
 from .mesh import _unit
 
@@ -68,7 +75,9 @@ class Fragments:
     anti_aliasing: bool
     eps: float
     _drawn: MeshBatch  # the meshes as drawn: faces that cross the near plane are cut
-    _drawn_face_index: Tensor | None  # None: surfaces behind others, or blurred, which have no edge gradient
+    _drawn_face_index: (
+        Tensor | None
+    )  # None: surfaces behind others, or blurred, which have no edge gradient
     distances: Tensor | None = None
 
     @property
@@ -91,21 +100,33 @@ class Fragments:
         that are seen.
         """
         if self.layers is None or not -self.layers <= k < self.layers:
-            have = "one layer without an axis for it" if self.layers is None else f"layers 0..{self.layers - 1}"
-            raise IndexError(f"layer {k} was requested of fragments with {have}; see faces_per_pixel")
+            have = (
+                "one layer without an axis for it"
+                if self.layers is None
+                else f"layers 0..{self.layers - 1}"
+            )
+            raise IndexError(
+                f"layer {k} was requested of fragments with {have}; see faces_per_pixel"
+            )
         index = self._drawn_face_index
         return replace(
             self,
             sided_face_index=self.sided_face_index[..., k],
             weights=self.weights[..., k, :],
             depth=self.depth[..., k],
-            _drawn_face_index=None if index is None or k not in (0, -self.layers) else index[..., k],
+            _drawn_face_index=None
+            if index is None or k not in (0, -self.layers)
+            else index[..., k],
             distances=None if self.distances is None else self.distances[..., k],
         )
 
     def _wide(self) -> Fragments:
         """All layers side by side, as one raster ``[B, H, W K]``."""
-        index, weights, depth = self.sided_face_index.flatten(2), self.weights.flatten(2, 3), self.depth.flatten(2)
+        index, weights, depth = (
+            self.sided_face_index.flatten(2),
+            self.weights.flatten(2, 3),
+            self.depth.flatten(2),
+        )
         return replace(self, sided_face_index=index, weights=weights, depth=depth)
 
     def _each_layer(self, raster: Tensor) -> Tensor:
@@ -125,14 +146,20 @@ class Fragments:
     @property
     def face_index(self) -> Tensor:
         """int32 ``[B, H, W]``: index of the nearest face, seen from either side; -1 is background."""
-        return torch.where(self.is_back, self.sided_face_index - self._num_faces, self.sided_face_index)
+        return torch.where(
+            self.is_back, self.sided_face_index - self._num_faces, self.sided_face_index
+        )
 
     @property
     def _num_faces(self) -> int | Tensor:
         num_faces = self.mesh.num_faces
-        return num_faces.unsqueeze(-1) if isinstance(num_faces, Tensor) and self.layers else num_faces
+        return (
+            num_faces.unsqueeze(-1) if isinstance(num_faces, Tensor) and self.layers else num_faces
+        )
 
-    def interpolate(self, attributes: Tensor | list[Tensor], corners: Tensor | list[Tensor] | None = None) -> Tensor:
+    def interpolate(
+        self, attributes: Tensor | list[Tensor], corners: Tensor | list[Tensor] | None = None
+    ) -> Tensor:
         """Values given at vertices, interpolated at each pixel: ``[B, H, W, C]``, 0 on background.
 
         Parameters
@@ -145,9 +172,13 @@ class Fragments:
         """
         return self._interpolate(attributes, corners, "attributes", "corners")
 
-    def _interpolate(self, attributes: object, corners: object, name: str, corners_name: str) -> Tensor:
+    def _interpolate(
+        self, attributes: object, corners: object, name: str, corners_name: str
+    ) -> Tensor:
         if self.layers:
-            return self._each_layer(self._wide()._interpolate(attributes, corners, name, corners_name))
+            return self._each_layer(
+                self._wide()._interpolate(attributes, corners, name, corners_name)
+            )
         attributes, faces, starts = self._corner_values(attributes, corners, name, corners_name)
         return ops.interpolate(attributes, faces, self.sided_face_index, self.weights, starts)
 
@@ -199,7 +230,9 @@ class Fragments:
                 "rotate those in world space"
             )
         matrix, intrinsics, *_ = self.camera.projection(normals.dtype).parameters()
-        turn = (_image_axes(intrinsics.to(normals)) @ torch.linalg.inv(matrix[:, :, :3].to(normals)).mT)[:, None]
+        turn = (
+            _image_axes(intrinsics.to(normals)) @ torch.linalg.inv(matrix[:, :, :3].to(normals)).mT
+        )[:, None]
         return _unit(normals @ turn.mT)
 
     def _lit(
@@ -225,7 +258,10 @@ class Fragments:
             number = torch.arange(count, dtype=torch.int32, device=own.device)
             index = number.view(1, *own.shape[1:3]) + count * self.is_back
             index = torch.where(self.covered, index, -1).int()
-            faces, weights = number.long().view(-1, 1).expand(-1, 3), own.new_tensor([1.0, 0.0, 0.0]).expand_as(own)
+            faces, weights = (
+                number.long().view(-1, 1).expand(-1, 3),
+                own.new_tensor([1.0, 0.0, 0.0]).expand_as(own),
+            )
             at = viewer, points.flatten(1, 2), faces, index, weights, None, True
             return ops.lit(colors, -own.flatten(1, 2), parameters, layout, *at)
         world = self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world
@@ -252,7 +288,11 @@ class Fragments:
                 "highlights need the eye of the camera: "
                 f"give {type(self.camera).__name__} an attribute eye, [3] or [B, 3], in world space"
             )
-        eye = as_floats((0.0, 0.0, 0.0) if eye is None else eye, "eye", "[3] or [B, 3]").detach().to(self.weights)
+        eye = (
+            as_floats((0.0, 0.0, 0.0) if eye is None else eye, "eye", "[3] or [B, 3]")
+            .detach()
+            .to(self.weights)
+        )
         eye = eye.reshape(-1, 3).expand(batch, 3)
         side = -1.0 if getattr(self.camera, "right_handed", False) else 1.0
         return torch.cat([eye, eye.new_tensor([1.0, side]).expand(batch, 2)], dim=1)
@@ -282,7 +322,9 @@ class Fragments:
                 f"image must be a tensor of {self.vertices.dtype}, as the vertices are, got {describe(image)}"
             )
         if image.ndim != 4 or image.shape[:3] != self.sided_face_index.shape:
-            raise ValueError(f"image must have shape {[*self.sided_face_index.shape, 'C']}, got {describe(image)}")
+            raise ValueError(
+                f"image must have shape {[*self.sided_face_index.shape, 'C']}, got {describe(image)}"
+            )
         return self._resolve(image, None, gradient)
 
     def _resolve(self, image: Tensor, background: Tensor | None, gradient: str) -> Tensor:
@@ -290,7 +332,9 @@ class Fragments:
         vertices, faces, starts = self._drawn[:3]
         vertices = vertices.detach() if gradient == "none" else vertices
         edges = self.anti_aliasing, self.eps, gradient == "local", has_perspective(self.camera)
-        return ops.resolve(image, background, vertices, faces, starts, self._drawn_face_index, *edges)
+        return ops.resolve(
+            image, background, vertices, faces, starts, self._drawn_face_index, *edges
+        )
 
 
 def _image_axes(intrinsics: Tensor) -> Tensor:
@@ -304,4 +348,6 @@ def _image_axes(intrinsics: Tensor) -> Tensor:
 
 def usable(points: Tensor) -> Tensor:
     """Puts points that are not finite, or so large that a product overflows, at the origin, without gradient."""
-    return torch.where((points.abs() < LARGEST_COORDINATE).all(-1, keepdim=True), points, torch.zeros_like(points))
+    return torch.where(
+        (points.abs() < LARGEST_COORDINATE).all(-1, keepdim=True), points, torch.zeros_like(points)
+    )

@@ -35,7 +35,9 @@ class Images:
     fragments: Fragments
 
     def __init__(self, outputs: dict[str, Tensor | Fragments]) -> None:
-        object.__setattr__(self, "_names", tuple(outputs))  # torch.compile cannot follow self.__dict__ in every torch
+        object.__setattr__(
+            self, "_names", tuple(outputs)
+        )  # torch.compile cannot follow self.__dict__ in every torch
         for name, value in outputs.items():
             object.__setattr__(self, name, value)
 
@@ -43,7 +45,9 @@ class Images:
         if name.startswith("_"):  # copy and pickle ask before there are names
             raise AttributeError(f"Images has no attribute {name!r}")
         if name in OUTPUTS:
-            raise AttributeError(f"{name} was not rendered; request it with outputs={(*self._names, name)}")
+            raise AttributeError(
+                f"{name} was not rendered; request it with outputs={(*self._names, name)}"
+            )
         if name == "silhouette":
             raise AttributeError("Images has no attribute 'silhouette': it is the output alpha")
         raise AttributeError(f"Images has no attribute {name!r}; it has {', '.join(self._names)}")

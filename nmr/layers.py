@@ -110,10 +110,15 @@ def render_soft(
     >>> camera, colors = nmr.LookAt([0.0, 0.0, -3.0]), nmr.VertexColors((vertices + 1) / 2)
     >>> rgb, alpha = nmr.render_soft(vertices, faces, camera, colors=colors, sigma=1e-3, image_size=32)
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip
+    )
     dtype, layers = scene.mesh.vertices.dtype, check_size(faces_per_pixel, "faces_per_pixel", 1024)
     sigma, gamma = as_positive(sigma, "sigma", dtype), as_positive(gamma, "gamma", dtype)
-    reach, least = math.log(1 / check_dist_eps(dist_eps) - 1), check_number(background_eps, "background_eps")
+    reach, least = (
+        math.log(1 / check_dist_eps(dist_eps) - 1),
+        check_number(background_eps, "background_eps"),
+    )
     fragments = scene.soft_fragments(layers, sigma, reach)
     image, behind = shade(fragments, colors, lights, background, True)
     rgb, alpha = _blend(fragments, image, behind, sigma, gamma, least, float(near), float(far))
@@ -135,7 +140,9 @@ def _blend(
     sigma, gamma, zero = sigma.to(colors), gamma.to(colors), colors.new_zeros(())
     covers = torch.where(fragments.covered, torch.sigmoid(-fragments.distances / sigma), zero)
     closeness = (far - fragments.depth) / (far - near)
-    nearest = closeness.detach().amax(-1, keepdim=True).clamp_min(least)  # the result does not depend on it
+    nearest = (
+        closeness.detach().amax(-1, keepdim=True).clamp_min(least)
+    )  # the result does not depend on it
     share = covers * torch.exp((closeness - nearest) / gamma)
     behind = torch.exp((least - nearest) / gamma)
     colors = torch.where(fragments.covered.unsqueeze(-1), colors, zero)
@@ -225,15 +232,23 @@ def render_transparent(
     >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
     >>> rgb, alpha = nmr.render_transparent(vertices, faces, camera, opacity=0.3, lights=nmr.Lights(), image_size=64)
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
-    fragments = scene.fragments(scene.rasterize_layers(check_size(faces_per_pixel, "faces_per_pixel", 1024)))
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
+    )
+    fragments = scene.fragments(
+        scene.rasterize_layers(check_size(faces_per_pixel, "faces_per_pixel", 1024))
+    )
     image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
     opacity = torch.where(fragments.covered, _opacity_at(fragments, opacity), image.new_zeros(()))
     transmittance = _running_products(1 - opacity)
     before = torch.cat([torch.ones_like(transmittance[..., :1]), transmittance[..., :-1]], dim=-1)
     image = torch.where(fragments.covered.unsqueeze(-1), image, image.new_zeros(()))
-    rgb = ((before * opacity).unsqueeze(-1) * image).sum(-2) + transmittance[..., -1:] * behind[:, None, None]
-    both = fragments.layer(0)._resolve(torch.cat([rgb, 1 - transmittance[..., -1:]], dim=-1), None, "nmr")
+    rgb = ((before * opacity).unsqueeze(-1) * image).sum(-2) + transmittance[..., -1:] * behind[
+        :, None, None
+    ]
+    both = fragments.layer(0)._resolve(
+        torch.cat([rgb, 1 - transmittance[..., -1:]], dim=-1), None, "nmr"
+    )
     return Images({"rgb": both[..., :-1], "alpha": both[..., -1]})
 
 
@@ -248,9 +263,13 @@ def _opacity_at(fragments: Fragments, opacity: float | Tensor | Colors) -> Tenso
     if callable(getattr(opacity, "sample", None)):
         values = opacity.sample(fragments)
         if not isinstance(values, Tensor) or values.shape != (*shape, 1):
-            raise ValueError(f"opacity must have one channel and give {[*shape, 1]}, got {describe(values)}")
+            raise ValueError(
+                f"opacity must have one channel and give {[*shape, 1]}, got {describe(values)}"
+            )
         return values.squeeze(-1).to(fragments.weights)
-    values = as_floats(opacity, "opacity", "a number, [] or [B], or colours of one channel").to(fragments.weights)
+    values = as_floats(opacity, "opacity", "a number, [] or [B], or colours of one channel").to(
+        fragments.weights
+    )
     if values.ndim > 1 or values.numel() not in (1, shape[0]):
         raise ValueError(f"opacity must be a number, [] or [{shape[0]}], got {describe(values)}")
     if not holds_for_all((values >= 0) & (values <= 1)):

@@ -144,7 +144,11 @@ class Lights:
             if name in unused:
                 continue
             value = as_floats(getattr(self, name), name, shape)
-            if value.ndim not in dimensions or 0 in value.shape or ("3" in shape and value.shape[-1] != 3):
+            if (
+                value.ndim not in dimensions
+                or 0 in value.shape
+                or ("3" in shape and value.shape[-1] != 3)
+            ):
                 raise ValueError(f"{name} must have shape {shape}, got {describe(value)}")
             if not holds_for_all(value.isfinite()):
                 raise ValueError(f"{name} must be finite, got {value}")
@@ -166,8 +170,13 @@ class Lights:
                 continue
             counts = {_rows(getattr(self, name), name).shape[1] for name in group} - {1}
             if len(counts) > 1:
-                names, shapes = ", ".join(group), ", ".join(describe(getattr(self, name)) for name in group)
-                raise ValueError(f"{names} must have the same number of lights (or one light), got {shapes}")
+                names, shapes = (
+                    ", ".join(group),
+                    ", ".join(describe(getattr(self, name)) for name in group),
+                )
+                raise ValueError(
+                    f"{names} must have the same number of lights (or one light), got {shapes}"
+                )
 
     def shade(self, fragments: Fragments, colors: Tensor | None = None) -> Tensor:
         """``colors`` ``[B, H, W, 3 or 1]``, lit: ``[B, H, W, 3]``; 0 on background. Without colours a white surface.
@@ -201,7 +210,9 @@ class Lights:
         if self.harmonics is None:
             return lit
         x, y, z = fragments._lit(None, None, layout[:0], smooth, own=own).unbind(-1)
-        basis = torch.stack([torch.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], dim=-1)
+        basis = torch.stack(
+            [torch.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], dim=-1
+        )
         harmonics = self.harmonics.to(x).reshape(-1, 9, 3)
         _check_images(harmonics, "harmonics", batch)
         light = (basis * basis.new_tensor(_HARMONICS)) @ harmonics.unsqueeze(1)
@@ -213,10 +224,14 @@ class Lights:
         if self.normals is None:
             return None
         if isinstance(self.normals, Tensor) or is_list(self.normals):
-            return fragments.mesh.values(check_values(self.normals, "normals", "V, 3"), "normals", "vertex")
+            return fragments.mesh.values(
+                check_values(self.normals, "normals", "V, 3"), "normals", "vertex"
+            )
         normals, shape = self.normals.sample(fragments), (*fragments.sided_face_index.shape, 3)
         if not isinstance(normals, Tensor) or normals.shape != shape:
-            raise ValueError(f"normals.sample must return a tensor {list(shape)}, got {describe(normals)}")
+            raise ValueError(
+                f"normals.sample must return a tensor {list(shape)}, got {describe(normals)}"
+            )
         return normals.to(fragments.weights)
 
 

@@ -54,7 +54,11 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     >>> nmr.losses.soft_iou_loss(torch.tensor([[0.5, 1.0, 0.0]]), target)
     tensor(0.6000)
     """
-    if not isinstance(prediction, Tensor) or not isinstance(target, Tensor) or not prediction.is_floating_point():
+    if (
+        not isinstance(prediction, Tensor)
+        or not isinstance(target, Tensor)
+        or not prediction.is_floating_point()
+    ):
         raise TypeError(
             "prediction and target must be tensors, and prediction a float tensor, "
             f"got {describe(prediction)} and {describe(target)}"
@@ -67,7 +71,9 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     dtype = torch.float64 if prediction.dtype == torch.float64 else torch.float32
     prediction, target = prediction.to(dtype), target.to(dtype)
     compiling = torch.compiler.is_compiling()
-    forward_mode = not compiling and any(unpack_dual(x).tangent is not None for x in (prediction, target))
+    forward_mode = not compiling and any(
+        unpack_dual(x).tangent is not None for x in (prediction, target)
+    )
     if prediction.is_cpu and target.is_cpu and not forward_mode:
         return ops.soft_iou_loss(prediction, target)[0]
     return 1 - _soft_iou(prediction.flatten(1), target.flatten(1)).mean()
@@ -147,7 +153,9 @@ def laplacian_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     v0, v1 = _check_edges(edges, vertices)
     rows = _batch_last(vertices)
     difference = rows.index_select(0, v1) - rows.index_select(0, v0)
-    sums = torch.zeros_like(rows).index_add(0, v0, difference).index_add(0, v1, difference, alpha=-1)
+    sums = (
+        torch.zeros_like(rows).index_add(0, v0, difference).index_add(0, v1, difference, alpha=-1)
+    )
     one = vertices.new_ones(len(v0))
     degree = vertices.new_zeros(len(rows)).index_add(0, v0, one).index_add(0, v1, one)
     return (sums / degree.clamp_min(1)[:, None, None]).square().sum((0, 1)).mean()
@@ -186,7 +194,9 @@ def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = Non
     vertices = _check_meshes(vertices)
     v0, v1 = _check_edges(edges, vertices)
     if target is not None and not (0 <= check_number(target, "target") < math.inf):
-        raise ValueError(f"target must be a finite length >= 0, got {target}; leave it out for the mean length")
+        raise ValueError(
+            f"target must be a finite length >= 0, got {target}; leave it out for the mean length"
+        )
     rows = _batch_last(vertices)
     length = _length(rows.index_select(0, v1) - rows.index_select(0, v0))
     goal = length.mean(0) if target is None else target
@@ -356,7 +366,12 @@ def _check_meshes(vertices: object) -> Tensor:
 
 
 def _check_edge_table(edges: object) -> Tensor:
-    if not isinstance(edges, Tensor) or edges.dtype != torch.int64 or edges.ndim != 2 or edges.shape[1] != 4:
+    if (
+        not isinstance(edges, Tensor)
+        or edges.dtype != torch.int64
+        or edges.ndim != 2
+        or edges.shape[1] != 4
+    ):
         raise ValueError(
             f"edges must be an int64 tensor [E, 4] as made by nmr.edge_table(faces), got {describe(edges)}"
         )
@@ -365,7 +380,12 @@ def _check_edge_table(edges: object) -> Tensor:
 
 def _check_edges(edges: object, vertices: Tensor) -> tuple[Tensor, Tensor]:
     """First and second vertices of the edges, [E] each, on the device of the vertices."""
-    if not isinstance(edges, Tensor) or edges.dtype != torch.int64 or edges.ndim != 2 or edges.shape[1] not in (2, 4):
+    if (
+        not isinstance(edges, Tensor)
+        or edges.dtype != torch.int64
+        or edges.ndim != 2
+        or edges.shape[1] not in (2, 4)
+    ):
         raise ValueError(
             "edges must be an int64 tensor [E, 2] or [E, 4] as made by nmr.unique_edges(faces) or "
             f"nmr.edge_table(faces), got {describe(edges)}"

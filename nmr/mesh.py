@@ -44,7 +44,13 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
     # The 20 triples of mutually nearest corners (distance 2), wound outwards.
     near = torch.cdist(vertices, vertices) < 2.1
     faces = torch.tensor(
-        [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]],
+        [
+            (i, j, k)
+            for i in range(12)
+            for j in range(i)
+            for k in range(j)
+            if near[i, j] and near[j, k] and near[i, k]
+        ],
         device="cpu",
     )
     a, b, c = vertices[faces].unbind(1)
@@ -124,18 +130,30 @@ def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) ->
     materials, folder = {}, os.path.dirname(filename)
     for library in find_libraries(folder, libraries):
         if not os.path.isfile(library):
-            warnings.warn(f"{filename} names the materials {library}, which is missing", stacklevel=2)
+            warnings.warn(
+                f"{filename} names the materials {library}, which is missing", stacklevel=2
+            )
             continue
         kd, map_kd = read_mtl(library)
         for name in {**kd, **map_kd}:
             image = find_image(folder, map_kd[name]) if name in map_kd else None
-            materials[name] = Material(name, tuple(kd[name].tolist()) if name in kd else None, image)
+            materials[name] = Material(
+                name, tuple(kd[name].tolist()) if name in kd else None, image
+            )
     numbers = {name: number for number, name in enumerate(materials)}
-    matched = match_materials(names, face_material, materials, filename) if libraries else [""] * len(names)
-    face_material = torch.tensor([numbers.get(name, -1) for name in matched])[torch.from_numpy(face_material)]
+    matched = (
+        match_materials(names, face_material, materials, filename)
+        if libraries
+        else [""] * len(names)
+    )
+    face_material = torch.tensor([numbers.get(name, -1) for name in matched])[
+        torch.from_numpy(face_material)
+    ]
     if colors is not None:
         colors = np.where(np.isfinite(colors).all(axis=1, keepdims=True), colors, np.nan)
-        colors = np.nan_to_num(colors / (255 if np.nanmax(colors, initial=0) > 1 else 1), nan=0.5).clip(0, 1)
+        colors = np.nan_to_num(
+            colors / (255 if np.nanmax(colors, initial=0) > 1 else 1), nan=0.5
+        ).clip(0, 1)
         colors = torch.tensor(colors, dtype=dtype)
     # Each array is freed as soon as its tensor exists.
     vertices, uv = torch.tensor(vertices, dtype=dtype), torch.tensor(uv, dtype=dtype)
@@ -203,7 +221,9 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
     order = torch.argsort(torch.arange(len(faces), device="cpu").repeat(3), stable=True)
     sides, opposite = _sides(faces)[order], opposite[order]
-    edges, edge_of_side, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
+    edges, edge_of_side, counts = torch.unique(
+        sides, dim=0, return_inverse=True, return_counts=True
+    )
     if open_mesh:
         wrong, wanted = counts > 2, "at most two faces"
     else:
@@ -304,7 +324,9 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     batched = check_vertices(vertices)
     faces = check_faces(faces, batched.shape[0], batched.device)
     cross = _face_cross(face_vertices(batched, faces))  # twice the area long
-    normals = _unit(_scatter_sum(cross.repeat_interleave(3, dim=1), faces.flatten(-2), batched.shape[1]))
+    normals = _unit(
+        _scatter_sum(cross.repeat_interleave(3, dim=1), faces.flatten(-2), batched.shape[1])
+    )
     return normals if vertices.ndim == 3 else normals.squeeze(0)
 
 
@@ -328,7 +350,9 @@ def _one_mesh(faces: Tensor) -> Tensor:
     """``faces`` as int64 [F, 3] in host memory."""
     faces = check_faces(faces, 1, torch.device("cpu"))
     if faces.ndim != 2:
-        raise ValueError(f"faces must have shape [F, 3], got {list(faces.shape)}; pass the faces of one mesh")
+        raise ValueError(
+            f"faces must have shape [F, 3], got {list(faces.shape)}; pass the faces of one mesh"
+        )
     return faces
 
 

@@ -16,7 +16,14 @@ from torch import Tensor
 from ._validate import cast_under_autocast, check_number, check_size, check_vertices, describe
 from .mesh import _face_cross, _gather, _unit, face_vertices
 
-__all__ = ["SurfacePoints", "chamfer_distance", "f_score", "sample_surface", "voxel_iou", "voxel_precision_recall"]
+__all__ = [
+    "SurfacePoints",
+    "chamfer_distance",
+    "f_score",
+    "sample_surface",
+    "voxel_iou",
+    "voxel_precision_recall",
+]
 
 try:
     from scipy.spatial import cKDTree
@@ -79,7 +86,9 @@ def sample_surface(
     if len(bad):
         raise ValueError(f"every mesh must have a finite area above 0, mesh {int(bad[0])} does not")
     face_index = torch.multinomial(area, count, replacement=True, generator=generator)
-    random = torch.rand(2, *face_index.shape, 1, generator=generator, dtype=batched.dtype, device=batched.device)
+    random = torch.rand(
+        2, *face_index.shape, 1, generator=generator, dtype=batched.dtype, device=batched.device
+    )
     r, s = random[0].sqrt(), random[1]
     p0, p1, p2 = (_gather(corner, face_index) for corner in corners.unbind(2))
     points = (1 - r) * p0 + r * (1 - s) * p1 + r * s * p2
@@ -89,7 +98,9 @@ def sample_surface(
     return SurfacePoints(points, normals, face_index)
 
 
-def chamfer_distance(points_a: Tensor, points_b: Tensor, form: Literal["squared", "l1"] = "squared") -> Tensor:
+def chamfer_distance(
+    points_a: Tensor, points_b: Tensor, form: Literal["squared", "l1"] = "squared"
+) -> Tensor:
     """How far two sets of points are from each other, in both directions.
 
     With ``d(x, Y) = min_{y in Y} |x - y|``:
@@ -270,7 +281,9 @@ def _check_points(a: object, b: object) -> tuple[Tensor, Tensor]:
             f"least one point each, got {describe(a)} and {describe(b)}"
         )
     if not (a.isfinite().all() and b.isfinite().all()):
-        raise ValueError("points_a and points_b must be finite, but have coordinates that are infinite or NaN")
+        raise ValueError(
+            "points_a and points_b must be finite, but have coordinates that are infinite or NaN"
+        )
     return (a, b) if a.ndim == 3 else (a.unsqueeze(0), b.unsqueeze(0))
 
 

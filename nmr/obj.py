@@ -21,7 +21,9 @@ class Obj(NamedTuple):
     """The triangles of an OBJ file, in the order of its polygons. Indices count from 0."""
 
     vertices: np.ndarray  # float64 [V, 3]
-    colors: np.ndarray | None  # float64 [V, 3] as written, NaN at vertices without; None if no vertex has a colour
+    colors: (
+        np.ndarray | None
+    )  # float64 [V, 3] as written, NaN at vertices without; None if no vertex has a colour
     uv: np.ndarray  # float64 [T, 2]
     faces: np.ndarray  # int32 [F, 3]
     uv_faces: np.ndarray  # int32 [F, 3]; -1, -1, -1 at a face without texture coordinates
@@ -48,7 +50,9 @@ def _open(filename: str) -> BinaryIO:
     if os.path.exists(filename) and not os.path.isfile(filename):
         raise ValueError(f"{filename} is not a regular file")
     if os.path.exists(filename) and os.path.getsize(filename) > _MOST_BYTES:
-        raise ValueError(f"{filename} has {os.path.getsize(filename)} bytes; at most {_MOST_BYTES} are read")
+        raise ValueError(
+            f"{filename} has {os.path.getsize(filename)} bytes; at most {_MOST_BYTES} are read"
+        )
     return open(filename, "rb")
 
 
@@ -104,7 +108,10 @@ class _Lines:
         self.corners, self.uv_corners, self.sizes = [], [], []
         self.num_vertices = self.num_uv = self.num_polygons = 0
         self.materials, self.first_polygons, self.libraries = [""], [0], []
-        self.largest = {"vertex": (-1, ""), "texture coordinate": (-1, "")}  # index of a corner, and its line
+        self.largest = {
+            "vertex": (-1, ""),
+            "texture coordinate": (-1, ""),
+        }  # index of a corner, and its line
 
     def take(self, text: bytes, number: int) -> None:
         """Add complete lines, the first of which has this number. The first wrong one is found by bisection."""
@@ -119,7 +126,11 @@ class _Lines:
             self.take(text[end:], number + _count_lines(text[:end]))
 
     def _parse(self, text: bytes, number: int) -> None:
-        plain = re.sub(rb"#[^\n]*", lambda comment: b" " * len(comment[0]), text) if b"#" in text else text
+        plain = (
+            re.sub(rb"#[^\n]*", lambda comment: b" " * len(comment[0]), text)
+            if b"#" in text
+            else text
+        )
         content = np.frombuffer(plain, np.uint8)
         gap = _is_gap(content)
         ends = np.flatnonzero(content == ord("\n"))
@@ -128,7 +139,9 @@ class _Lines:
         first = np.flatnonzero(np.diff(rows, prepend=-1))  # the words that begin a line
         keys, rows = words[first], rows[first]
         counts = np.diff(first, append=len(words)) - 1  # words behind the keyword
-        a, b, _ = (content[np.minimum(keys + i, len(content) - 1)] | 32 for i in range(3))  # in lower case
+        a, b, _ = (
+            content[np.minimum(keys + i, len(content) - 1)] | 32 for i in range(3)
+        )  # in lower case
         one, two = (gap[np.minimum(keys + i, len(content) - 1)] for i in (1, 2))
         is_vertex = (a == ord("v")) & one
         is_uv = (a == ord("v")) & (b == ord("t")) & two & self.with_uv
@@ -148,7 +161,9 @@ class _Lines:
         sizes, before = counts[is_face], (np.cumsum(is_vertex)[is_face], np.cumsum(is_uv)[is_face])
         corners = _corners(behind_keywords(is_face), sizes)
         corners[1] *= self.with_uv
-        for k, (name, total) in enumerate(zip(self.largest, (self.num_vertices, self.num_uv), strict=True)):
+        for k, (name, total) in enumerate(
+            zip(self.largest, (self.num_vertices, self.num_uv), strict=True)
+        ):
             corners[k] = _absolute(corners[k], np.repeat(total + before[k], sizes), optional=k == 1)
             at = int(corners[k].argmax()) if len(corners[k]) else 0
             if len(corners[k]) and corners[k][at] > self.largest[name][0]:
@@ -177,11 +192,19 @@ class _Lines:
         for name, count in (("vertex", self.num_vertices), ("texture coordinate", self.num_uv)):
             index, line = self.largest[name]
             if index >= count and (name == "vertex" or count):
-                raise ValueError(f"{line} cannot be read: it refers to {name} {index + 1}, but there are {count}")
+                raise ValueError(
+                    f"{line} cannot be read: it refers to {name} {index + 1}, but there are {count}"
+                )
         has_colors = any(part.shape[1] for part in self.colors)
-        colors = [part if part.shape[1] else np.full((len(part), 3), np.nan) for part in self.colors if has_colors]
+        colors = [
+            part if part.shape[1] else np.full((len(part), 3), np.nan)
+            for part in self.colors
+            if has_colors
+        ]
         vertices, uv = _joined(self.vertices, 3), _joined(self.uv, 2)
-        corners, uv_corners, sizes = (_joined(parts, 1)[:, 0] for parts in (self.corners, self.uv_corners, self.sizes))
+        corners, uv_corners, sizes = (
+            _joined(parts, 1)[:, 0] for parts in (self.corners, self.uv_corners, self.sizes)
+        )
         if (sizes == 3).all():
             faces, uv_faces = corners.reshape(-1, 3), uv_corners.reshape(-1, 3)
         else:
@@ -322,13 +345,19 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) ->
 def _cut(points: np.ndarray) -> np.ndarray:
     """The triangles int64 [P, N - 2, 3] of polygons [P, N, 3]."""
     count, size = points.shape[:2]
-    fan = np.stack([np.zeros(size - 2, np.int32), np.arange(1, size - 1), np.arange(2, size)], axis=1, dtype=np.int32)
+    fan = np.stack(
+        [np.zeros(size - 2, np.int32), np.arange(1, size - 1), np.arange(2, size)],
+        axis=1,
+        dtype=np.int32,
+    )
     triangles = np.repeat(fan[None], count, axis=0)
     left = np.arange(count)
     for shift in range(min(size, 8)):
         turned = np.roll(points[left], -shift, axis=1)
         turned -= turned[:, :1].copy()
-        areas = np.cross(turned[:, 1:-1], turned[:, 2:])  # their sum is Newell's normal, right for concave polygons
+        areas = np.cross(
+            turned[:, 1:-1], turned[:, 2:]
+        )  # their sum is Newell's normal, right for concave polygons
         folded = (np.einsum("pij,pj->pi", areas, areas.sum(axis=1)) < 0).any(axis=1)
         triangles[left[~folded]] = (fan + shift) % size
         left = left[folded]
@@ -343,7 +372,9 @@ def _cut_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
     """N - 2 triangles of a polygon [N, 3], by ear clipping in the coordinate plane of its largest projection."""
     size = len(points)
     if size > _MOST_EARS:
-        raise ValueError(f"a polygon of {size} corners is not convex; at most {_MOST_EARS} are cut into triangles")
+        raise ValueError(
+            f"a polygon of {size} corners is not convex; at most {_MOST_EARS} are cut into triangles"
+        )
     points = points - points[0]
     normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
@@ -413,7 +444,9 @@ def read_mtl(filename: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
             words = _without_comment(rest).split()[:3]
             try:
                 data = np.frombuffer(" ".join(words).encode(), np.uint8)
-                colors[material] = _table(data, np.array([len(words)]), 3, 3, 3)[0].astype(np.float32)
+                colors[material] = _table(data, np.array([len(words)]), 3, 3, 3)[0].astype(
+                    np.float32
+                )
             except ValueError as error:
                 raise ValueError(
                     f"{filename}, line {number}: {_shown(line.encode())} cannot be read: {error}"
@@ -438,7 +471,9 @@ def find_image(folder: str, line: str) -> str:
     """
     names = [re.sub("^" + _OPTIONS, "", text) for text in (line, _without_comment(line))]
     names = [line, *names, (names[1].split() or [""])[-1]]
-    return next((path for name in names if (path := _find(folder, name))), os.path.join(folder, names[2]))
+    return next(
+        (path for name in names if (path := _find(folder, name))), os.path.join(folder, names[2])
+    )
 
 
 def _find(folder: str, name: str) -> str | None:
@@ -461,18 +496,26 @@ def _find(folder: str, name: str) -> str | None:
     return None
 
 
-def match_materials(names: list[str], face_material: np.ndarray, known: Collection[str], filename: str) -> list[str]:
+def match_materials(
+    names: list[str], face_material: np.ndarray, known: Collection[str], filename: str
+) -> list[str]:
     """The material of each name of a line `usemtl`: itself, or its first word (as published); "" if neither is known.
 
     Warns of faces without a known material.
     """
     firsts = [(name.split() or [""])[0] for name in names]
-    matched = [next((one for one in pair if one in known), "") for pair in zip(names, firsts, strict=True)]
+    matched = [
+        next((one for one in pair if one in known), "") for pair in zip(names, firsts, strict=True)
+    ]
     unknown = np.array([name == "" for name in matched])[face_material]
     if unknown.any():
         missing = {names[i] for i in np.unique(face_material[unknown])}
         named = ", ".join(repr(name[:60]) for name in sorted(missing - {""})[:3])
-        why = f"their materials ({named}) are in no library" if named else "no line `usemtl` gives them a material"
+        why = (
+            f"their materials ({named}) are in no library"
+            if named
+            else "no line `usemtl` gives them a material"
+        )
         warnings.warn(
             f"{filename}: {int(unknown.sum())} of {len(unknown)} faces stay grey, for {why}; "
             f"the libraries have {', '.join(repr(name[:60]) for name in list(known)[:5]) or 'no materials'}",

@@ -119,7 +119,9 @@ def render(
     outputs = _check_outputs(outputs)
     check_choice(gradient, "gradient", GRADIENTS)
 
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
+    )
     how = interpolation_gradient, gradient, smooth, space
     return Images(_draw(scene, outputs, background, colors, lights, *how))
 
@@ -129,7 +131,9 @@ def _check_outputs(outputs: object) -> tuple[str, ...]:
     listed = is_list(names) and all(name in OUTPUTS for name in names)
     if not listed or not names or len(set(names)) != len(names):
         hint = '; the silhouette is "alpha"' if is_list(names) and "silhouette" in names else ""
-        raise ValueError(f"outputs must be one or more different names out of {OUTPUTS}, got {outputs!r}{hint}")
+        raise ValueError(
+            f"outputs must be one or more different names out of {OUTPUTS}, got {outputs!r}{hint}"
+        )
     return tuple(names)
 
 
@@ -176,11 +180,15 @@ def _draw(
                 image, images["alpha"] = image[..., :-1], image[..., -1]
             images["rgb"] = image
         if "depth" in images and local:
-            images["depth"] = fragments._resolve(fragments.depth.unsqueeze(-1), None, gradient).squeeze(-1)
+            images["depth"] = fragments._resolve(
+                fragments.depth.unsqueeze(-1), None, gradient
+            ).squeeze(-1)
         if "normals" in images:
             normals = fragments.normals(smooth, space)
             images["normals"] = (
-                fragments._resolve(normals, None, gradient) if local else average(normals, anti_aliasing)
+                fragments._resolve(normals, None, gradient)
+                if local
+                else average(normals, anti_aliasing)
             )
         if "fragments" in images:
             images["fragments"] = fragments
@@ -385,7 +393,9 @@ def render_silhouette(
     torch.Size([2, 64, 64])
     """
     check_choice(gradient, "gradient", GRADIENTS)
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
+    )
     alpha, _ = scene.silhouette(gradient)
     return alpha
 
@@ -455,7 +465,9 @@ def render_soft_silhouette(
     >>> camera = nmr.LookAt([0.0, 0.0, -5.0])
     >>> soft = nmr.render_soft_silhouette(vertices, faces, camera, sigma=1e-3, image_size=64)
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip
+    )
     sigma = as_positive(sigma, "sigma", scene.mesh.vertices.dtype)
     return scene.soft_silhouette(sigma, check_dist_eps(dist_eps))
 
@@ -522,7 +534,9 @@ def render_depth(
     >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
     >>> depth = nmr.render_depth(vertices, faces, camera, anti_aliasing=False)  # 2 in the middle
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip
+    )
     return scene.depth(scene.rasterize())
 
 
@@ -588,7 +602,9 @@ def render_normals(
     >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
     >>> picture = (1 + nmr.render_normals(vertices, faces, camera, smooth=True)) / 2
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip)
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip
+    )
     fragments = scene.fragments(scene.rasterize())
     return average(fragments.normals(smooth, space), anti_aliasing)
 
@@ -665,12 +681,19 @@ def render_fragments(
     >>> layers = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.0, -3.0]), faces_per_pixel=2)
     >>> thickness = layers.depth[..., 1] - layers.depth[..., 0]
     """
-    scene = make_scene(vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps)
-    layers, blur_radius = check_size(faces_per_pixel, "faces_per_pixel", 1024), check_number(blur_radius, "blur_radius")
+    scene = make_scene(
+        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
+    )
+    layers, blur_radius = (
+        check_size(faces_per_pixel, "faces_per_pixel", 1024),
+        check_number(blur_radius, "blur_radius"),
+    )
     if not 0 <= blur_radius < float("inf"):
         raise ValueError(f"blur_radius must be 0 or more and finite, got {blur_radius}")
     if blur_radius > 0:
-        return scene.soft_fragments(layers, torch.tensor(blur_radius, dtype=torch.float64, device="cpu"), 1.0)
+        return scene.soft_fragments(
+            layers, torch.tensor(blur_radius, dtype=torch.float64, device="cpu"), 1.0
+        )
     return scene.fragments(scene.rasterize() if layers == 1 else scene.rasterize_layers(layers))
 
 

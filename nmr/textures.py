@@ -22,7 +22,15 @@ from .mesh import _unit
 if TYPE_CHECKING:
     from .fragments import Fragments
 
-__all__ = ["Colors", "FaceColors", "NormalMap", "TextureCubes", "UVTexture", "VertexColors", "sample_texture"]
+__all__ = [
+    "Colors",
+    "FaceColors",
+    "NormalMap",
+    "TextureCubes",
+    "UVTexture",
+    "VertexColors",
+    "sample_texture",
+]
 
 
 class Colors(Protocol):
@@ -132,7 +140,11 @@ class TextureCubes:
     def __post_init__(self) -> None:
         for cubes in _each(check_values(self.textures, "textures", "F, ts, ts, ts, C")):
             sides = cubes.shape[-4:-1]
-            if len(set(sides)) != 1 or sides[0] < 2 or sides != _each(self.textures)[0].shape[-4:-1]:
+            if (
+                len(set(sides)) != 1
+                or sides[0] < 2
+                or sides != _each(self.textures)[0].shape[-4:-1]
+            ):
                 raise ValueError(
                     "textures must be cubes [ts, ts, ts, C] of one size ts >= 2, "
                     f"got {', '.join(describe(part) for part in _each(self.textures))}"
@@ -145,7 +157,11 @@ class TextureCubes:
         textures = check_values(self.textures, "textures", "F, ts, ts, ts, C")
         textures = fragments.mesh.values(textures, "textures", "face")
         return ops.texture_cubes(
-            textures, fragments.sided_face_index, fragments.weights, fragments.mesh.starts, fragments.eps
+            textures,
+            fragments.sided_face_index,
+            fragments.weights,
+            fragments.mesh.starts,
+            fragments.eps,
         )
 
 
@@ -220,11 +236,17 @@ class UVTexture:
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
-        if fragments.layers and self.filter == "mipmap":  # the level depends on the place of a pixel in the image
-            return torch.stack([self.sample(fragments.layer(k)) for k in range(fragments.layers)], dim=3)
+        if (
+            fragments.layers and self.filter == "mipmap"
+        ):  # the level depends on the place of a pixel in the image
+            return torch.stack(
+                [self.sample(fragments.layer(k)) for k in range(fragments.layers)], dim=3
+            )
         if fragments.layers:
             return fragments._each_layer(self.sample(fragments._wide()))
-        attributes, corners, starts = fragments._corner_values(self.uv, self.uv_faces, "uv", "uv_faces")
+        attributes, corners, starts = fragments._corner_values(
+            self.uv, self.uv_faces, "uv", "uv_faces"
+        )
         at = attributes, corners, fragments.sided_face_index, fragments.weights, starts
         texels, grids, count = self._texels(fragments)
         level = None
@@ -232,8 +254,12 @@ class UVTexture:
             texels = ops.mipmaps(texels, grids, count)
             vertices = fragments.vertices
             if not has_perspective(fragments.camera):  # as at one depth
-                vertices = torch.cat([vertices[..., :2], torch.ones_like(vertices[..., 2:])], dim=-1)
-            values = (x if x is None else x.detach() for x in (vertices, *fragments.mesh[1:3], *at, grids))
+                vertices = torch.cat(
+                    [vertices[..., :2], torch.ones_like(vertices[..., 2:])], dim=-1
+                )
+            values = (
+                x if x is None else x.detach() for x in (vertices, *fragments.mesh[1:3], *at, grids)
+            )
             level = ops.uv_levels(*values)
         return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(self.wrap))
 
@@ -242,10 +268,14 @@ class UVTexture:
         image = check_values(self.image, "image", "H, W, C")
         batch = fragments.mesh.batch
         if len(image) not in (1, batch):
-            raise ValueError(f"image must be one for all {batch} images drawn, or one for each, got {len(image)}")
+            raise ValueError(
+                f"image must be one for all {batch} images drawn, or one for each, got {len(image)}"
+            )
         image = _once(image)
         sizes = [tuple(part.shape[:2]) for part in image]
-        levels = max([1, *(max(size).bit_length() for size in sizes)]) if self.filter == "mipmap" else 1
+        levels = (
+            max([1, *(max(size).bit_length() for size in sizes)]) if self.filter == "mipmap" else 1
+        )
         grids, count = level_grids(sizes, levels)
         if isinstance(image, Tensor):
             texels = image.reshape(-1, image.shape[-1])
@@ -291,16 +321,24 @@ def sample_texture(
     """
     image = check_values(image, "image", "h, w, C")
     if is_list(image) or 0 in image.shape[1:]:
-        raise ValueError(f"image must be a tensor [h, w, C] or [B, h, w, C] with texels, got {describe(image)}")
+        raise ValueError(
+            f"image must be a tensor [h, w, C] or [B, h, w, C] with texels, got {describe(image)}"
+        )
     for values, name, channels in ((uv, "uv", 2), (derivatives, "derivatives", 4)):
         if values is None and name == "derivatives":
             continue
         if not isinstance(values, Tensor) or not values.is_floating_point():
-            raise TypeError(f"{name} must be a float tensor [B, H, W, {channels}], got {describe(values)}")
+            raise TypeError(
+                f"{name} must be a float tensor [B, H, W, {channels}], got {describe(values)}"
+            )
         if values.ndim != 4 or values.shape[:3] != uv.shape[:3] or values.shape[3] != channels:
-            raise ValueError(f"{name} must have shape [B, H, W, {channels}], got {describe(values)}")
+            raise ValueError(
+                f"{name} must have shape [B, H, W, {channels}], got {describe(values)}"
+            )
     if len(image) not in (1, len(uv)):
-        raise ValueError(f"image must be one for all {len(uv)} images drawn, or one for each, got {len(image)}")
+        raise ValueError(
+            f"image must be one for all {len(uv)} images drawn, or one for each, got {len(image)}"
+        )
     image = _once(image)
     check_choice(wrap, "wrap", ops.WRAPS)
     height, width = image.shape[1:3]
@@ -309,7 +347,9 @@ def sample_texture(
     texels, level = image.reshape(-1, image.shape[-1]), None
     if derivatives is not None:
         texels = ops.mipmaps(texels, grids, count)
-        steps = derivatives.detach().to(image).unflatten(-1, (2, 2)) * image.new_tensor([[width], [height]])
+        steps = derivatives.detach().to(image).unflatten(-1, (2, 2)) * image.new_tensor(
+            [[width], [height]]
+        )
         level = steps.square().sum(-2).amax(-1).clamp(min=1).log2() / 2
         level = level.nan_to_num(0).clamp(max=levels - 1)
     return sample_places(texels, grids, level, uv.to(image), wrap)
@@ -327,8 +367,13 @@ def _once(image: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
     whole = image._base
     if image.retains_grad or whole is None or whole.numel() != image[0].numel():
         return image
-    same = whole.stride()[-3:] == image.stride()[1:] and whole.storage_offset() == image.storage_offset()
-    return whole.view(1, *image.shape[1:]) if same and whole.shape[-3:] == image.shape[1:] else image
+    same = (
+        whole.stride()[-3:] == image.stride()[1:]
+        and whole.storage_offset() == image.storage_offset()
+    )
+    return (
+        whole.view(1, *image.shape[1:]) if same and whole.shape[-3:] == image.shape[1:] else image
+    )
 
 
 def level_grids(sizes: list[tuple[int, int]], levels: int) -> tuple[Tensor, int]:
@@ -342,12 +387,20 @@ def level_grids(sizes: list[tuple[int, int]], levels: int) -> tuple[Tensor, int]
     return torch.tensor(grids, dtype=torch.int64, device="cpu").view(len(sizes), levels, 3), first
 
 
-def sample_places(texels: Tensor, grids: Tensor, level: Tensor | None, uv: Tensor, wrap: str) -> Tensor:
+def sample_places(
+    texels: Tensor, grids: Tensor, level: Tensor | None, uv: Tensor, wrap: str
+) -> Tensor:
     """Colours ``[B, H, W, C]`` of checked textures at ``uv [B, H, W, 2]``."""
     # One face with uv (1, 0), (0, 1) and (0, 0) at its corners: its weights are the coordinates.
     corners = torch.eye(3, 2, dtype=uv.dtype, device=uv.device).unsqueeze(0)
     face_index = torch.zeros(uv.shape[:3], dtype=torch.int32, device=uv.device)
-    at = corners, torch.arange(3, device=uv.device).unsqueeze(0), face_index, F.pad(uv, (0, 1)), None
+    at = (
+        corners,
+        torch.arange(3, device=uv.device).unsqueeze(0),
+        face_index,
+        F.pad(uv, (0, 1)),
+        None,
+    )
     return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(wrap))
 
 
@@ -373,14 +426,20 @@ class NormalMap(UVTexture):
         super().__post_init__()
         for image in _each(self.image):
             if image.shape[-1] != 3:
-                raise ValueError(f"the image of normals must have 3 channels, got {describe(image)}")
+                raise ValueError(
+                    f"the image of normals must have 3 channels, got {describe(image)}"
+                )
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Outward normals in world space ``[B, H, W, 3]`` of fragments, 0 on background."""
         if fragments.layers:
-            return torch.stack([self.sample(fragments.layer(k)) for k in range(fragments.layers)], dim=3)
+            return torch.stack(
+                [self.sample(fragments.layer(k)) for k in range(fragments.layers)], dim=3
+            )
         texel, world = super().sample(fragments), fragments.world
-        all_vertices = world.expand(len(fragments.faces), -1, -1) if fragments.faces.ndim == 3 else world
+        all_vertices = (
+            world.expand(len(fragments.faces), -1, -1) if fragments.faces.ndim == 3 else world
+        )
         normals = -ops.normals(all_vertices, fragments.faces, fragments.mesh.starts, True)
         n = _unit(ops.interpolate(normals, fragments.faces, *fragments._at))
         sides, changes = [], []  # from corner 0 to corners 1 and 2, in space and in uv

@@ -11,7 +11,11 @@ from ._validate import check_choice, check_faces, check_size, check_vertices
 
 @torch.no_grad()
 def voxelize(
-    vertices: Tensor, faces: Tensor, size: int = 32, normalize: bool = False, definition: str = "kato18"
+    vertices: Tensor,
+    faces: Tensor,
+    size: int = 32,
+    normalize: bool = False,
+    definition: str = "kato18",
 ) -> Tensor:
     """Filled occupancy grids, in one of the two definitions behind the published voxel IoU figures.
 

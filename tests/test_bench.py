@@ -23,13 +23,17 @@ def test_deodr_must_draw_what_we_draw(monkeypatch):
         (program,) = bench.deodr_programs(work, 1, stack).values()
         assert 0 < program()[0]
         monkeypatch.setattr(
-            bench, "deodr", lambda work, draw=bench.deodr: draw(replace(work, faces=work.faces.flip(1)))
+            bench,
+            "deodr",
+            lambda work, draw=bench.deodr: draw(replace(work, faces=work.faces.flip(1))),
         )
         with pytest.raises(SystemExit, match="nmr and deodr draw different images"):  # the far side
             bench.deodr_programs(work, 1, stack)
 
 
-@pytest.mark.parametrize(("workload", "rows"), [("w1", 2), ("w4", 2), ("white", 2), ("uv-lights", 4), ("voxels", 1)])
+@pytest.mark.parametrize(
+    ("workload", "rows"), [("w1", 2), ("w4", 2), ("white", 2), ("uv-lights", 4), ("voxels", 1)]
+)
 def test_every_program_of_a_workload_is_timed(monkeypatch, capsys, workload, rows):
     threads = torch.get_num_threads()
     monkeypatch.setattr(bench.importlib.util, "find_spec", lambda name: None)  # without deodr
@@ -46,7 +50,9 @@ def test_every_program_of_a_workload_is_timed(monkeypatch, capsys, workload, row
 @pytest.mark.parametrize("kind", bench.COLORS)
 def test_every_kind_of_colour_draws_its_own_image_and_reaches_its_values(kind):
     work = bench.spheres(2, 3, 32, output="rgb", colors=kind)
-    leaves = [leaf.clone().requires_grad_() for leaf in (work.vertices, work.values) if leaf is not None]
+    leaves = [
+        leaf.clone().requires_grad_() for leaf in (work.vertices, work.values) if leaf is not None
+    ]
     image = work.draw(*leaves)
     (image - 0.5).square().mean().backward()
     assert all(leaf.grad.any() for leaf in leaves)

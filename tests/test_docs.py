@@ -44,7 +44,10 @@ def test_readme_fits_a_mesh_that_is_right_from_all_sides(tmp_path, monkeypatch, 
     names = run(README)
     assert capsys.readouterr().out.startswith("IoU of the silhouettes: 0.9")
     nmr, vertices, faces = names["nmr"], names["vertices"].detach(), names["faces"]
-    sides = [0.0, 60.0, -5.0] * 5, [24.0 * k + 11 for k in range(15)]  # cameras that the fit did not have
+    sides = (
+        [0.0, 60.0, -5.0] * 5,
+        [24.0 * k + 11 for k in range(15)],
+    )  # cameras that the fit did not have
     new = nmr.LookAt.from_angles(2.732, *sides, half_fov_deg=12.0, right_handed=True)
     ours = nmr.render_silhouette(vertices, faces, new, fill_back=False, image_size=128)
     theirs = nmr.render_silhouette(names["points"], names["triangles"], new, image_size=128)
@@ -60,13 +63,19 @@ def test_what_it_is_for_solves_its_five_tasks(tmp_path, monkeypatch):
     page = ROOT / "docs" / "what-for.md"
     names = run(page)
     nmr = names["nmr"]
-    fitted = nmr.render_silhouette(names["shape"], names["triangles"], names["cameras"], image_size=64)
+    fitted = nmr.render_silhouette(
+        names["shape"], names["triangles"], names["cameras"], image_size=64
+    )
     assert nmr.losses.soft_iou_loss(fitted, names["masks"]) < 0.1
     assert names["color_loss"]() < 0.01
     true_eye = nmr.cameras.points_from_angles(2.732, 30.0, 30.0)
     assert (names["eye"] - true_eye).norm() < 0.05
     monkeypatch.setattr(sys, "argv", ["learn3d"])
-    text = page.read_text().replace("procedural 250", "procedural 12").replace("iterations 1600", "iterations 2")
+    text = (
+        page.read_text()
+        .replace("procedural 250", "procedural 12")
+        .replace("iterations 1600", "iterations 2")
+    )
     for line in "".join(re.findall(r"```sh\n(.*?)```", text, flags=re.DOTALL)).splitlines():
         assert not main(*shlex.split(line)[1:]), line
     assert len(list((tmp_path / "meshes").glob("*.glb"))) == 4
@@ -77,15 +86,23 @@ def test_from_pytorch3d_draws_the_same_picture_both_ways():
     rgb, alpha, same = names["rgb"], names["alpha"], names["same"]
     assert rgb.shape == (1, 256, 256, 3) and alpha.shape == (1, 256, 256)
     assert 0.2 < alpha.mean() < 0.8
-    assert (rgb - same).abs().max(-1).values.gt(1e-3).float().mean() < 1e-3  # but for edges that round differently
+    assert (rgb - same).abs().max(-1).values.gt(
+        1e-3
+    ).float().mean() < 1e-3  # but for edges that round differently
     # The sphere's colours are its coordinates: in both worlds x grows to the right, y to the top.
     assert rgb[0, 128, 180, 0] > rgb[0, 128, 70, 0] and rgb[0, 70, 128, 1] > rgb[0, 180, 128, 1]
     # Nearest to the eye, which is at z = 2.7, is the greatest z.
     assert rgb[0, 128, 128, 2] > 0.9
     names["uv"] = torch.tensor([[0.0, 0.0], [1.0, 1.0], [3 / 127, 5 / 63]])
-    exec(re.findall(r"^uv = \(.*$", MIGRATING["pytorch3d"].read_text(), flags=re.MULTILINE)[0], names)
-    texels = names["uv"] * torch.tensor([128, 64]) - 0.5  # a texel centre of align_corners=True is one of ours
-    torch.testing.assert_close(texels, torch.tensor([[0.0, 0.0], [127.0, 63.0], [3.0, 5.0]]), atol=1e-4, rtol=0)
+    exec(
+        re.findall(r"^uv = \(.*$", MIGRATING["pytorch3d"].read_text(), flags=re.MULTILINE)[0], names
+    )
+    texels = (
+        names["uv"] * torch.tensor([128, 64]) - 0.5
+    )  # a texel centre of align_corners=True is one of ours
+    torch.testing.assert_close(
+        texels, torch.tensor([[0.0, 0.0], [127.0, 63.0], [3.0, 5.0]]), atol=1e-4, rtol=0
+    )
 
 
 def test_from_nvdiffrast_draws_the_same_picture_three_ways():
@@ -95,7 +112,9 @@ def test_from_nvdiffrast_draws_the_same_picture_three_ways():
     torch.testing.assert_close(names["same"], image, atol=0, rtol=0)
     assert (names["also"] - image).abs().max(-1).values.gt(1e-3).float().mean() < 1e-3
     assert names["dr"].__name__ == "nmr.nvdiffrast.torch" and names["pos"].grad.abs().sum() > 0
-    assert names["drawn"][0, 30, 30].argmax() == 0 and names["drawn"][0, 200, 30].argmax() == 2  # row 0 is the bottom
+    assert (
+        names["drawn"][0, 30, 30].argmax() == 0 and names["drawn"][0, 200, 30].argmax() == 2
+    )  # row 0 is the bottom
     assert names["zeros"].device.type == "cpu"
 
 
@@ -124,16 +143,22 @@ def test_pages_run_and_what_they_name_exists(page, tmp_path, monkeypatch):
     ):  # above, and in learn3d/methods/test_development.py
         run(page)
     text = page.read_text()
-    named = re.findall(r"(?:tools|docs|csrc|nmr|learn3d|tests)/[\w./-]*\w\.(?:py|sh|md|png|cpp|ipynb)", text)
+    named = re.findall(
+        r"(?:tools|docs|csrc|nmr|learn3d|tests)/[\w./-]*\w\.(?:py|sh|md|png|cpp|ipynb)", text
+    )
     links = re.findall(r"\]\(([^)#]+)[^)]*\)", text)
     missing = [name for name in {*named} if not (ROOT / name).exists()]
-    missing += [link for link in {*links} if "://" not in link and not (page.parent / link).exists()]
+    missing += [
+        link for link in {*links} if "://" not in link and not (page.parent / link).exists()
+    ]
     assert missing == []
     assert page != README or len(named) > 5
 
 
 def test_presets_schedules_and_layouts_are_on_their_pages():
-    methods, data_sets = ((ROOT / "docs" / page).read_text() for page in ("methods/README.md", "data-sets.md"))
+    methods, data_sets = (
+        (ROOT / "docs" / page).read_text() for page in ("methods/README.md", "data-sets.md")
+    )
     names = {name if not name.startswith("kato2019") else "kato2019-..." for name in PRESETS}
     assert not [name for name in names if f"`{name}`" not in methods]
     assert "|".join(sorted(get_args(LRSchedule))) in methods.replace("\\", "")
@@ -171,7 +196,11 @@ def test_documented_commands_are_understood(words, monkeypatch):
 
 def test_every_promise_has_a_test() -> None:
     page = (ROOT / "docs" / "reliability.md").read_text().split("## Untrusted files")[0]
-    lines = [line for line in page.splitlines() if line.startswith("|") and not line.startswith(("|---", "| fault"))]
+    lines = [
+        line
+        for line in page.splitlines()
+        if line.startswith("|") and not line.startswith(("|---", "| fault"))
+    ]
     assert len(lines) > 20
     for line in lines:
         named = re.findall(r"`((?:\w+/)*test_\w+\.py)::(\w+)`", line.split("|")[3])
@@ -190,7 +219,9 @@ def test_the_page_has_the_tables_of_the_files():
 def test_the_results_in_the_pages_are_in_the_files() -> None:
     files = " ".join(path.read_text() for path in (ROOT / "docs" / "results").glob("*.json"))
     printed = [row.printed.values() for table in TABLES.values() for row in table.rows.values()]
-    known = set(re.findall(r"\d\.\d+", files)) | {f"{figure:.3f}" for row in printed for figure in row}
+    known = set(re.findall(r"\d\.\d+", files)) | {
+        f"{figure:.3f}" for row in printed for figure in row
+    }
     pages = [path.read_text() for path in make_results.PAGES]
     written = [re.sub(r"<!-- results: .*\n(\|.*\n)*", "", page) for page in pages]
     for text in (*written, (ROOT / "README.md").read_text().partition("## 3. ")[2]):
@@ -206,7 +237,9 @@ def _load(script: str) -> ModuleType:
     return module
 
 
-make_pictures, draw_curves, make_results = map(_load, ("make_pictures", "draw_curves", "make_results"))
+make_pictures, draw_curves, make_results = map(
+    _load, ("make_pictures", "draw_curves", "make_results")
+)
 
 
 def test_every_picture_has_a_command_and_a_record() -> None:
@@ -215,8 +248,16 @@ def test_every_picture_has_a_command_and_a_record() -> None:
 
 
 def test_every_picture_is_shown() -> None:
-    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs" / "api").glob("*.rst")]
-    shown = {name for page in pages for name in re.findall(r"images/([\w-]+\.\w+)[)\n]", page.read_text())}
+    pages = [
+        ROOT / "README.md",
+        *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "docs" / "api").glob("*.rst"),
+    ]
+    shown = {
+        name
+        for page in pages
+        for name in re.findall(r"images/([\w-]+\.\w+)[)\n]", page.read_text())
+    }
     assert shown == set(make_pictures.PICTURES)
 
 
@@ -237,19 +278,34 @@ def test_a_changed_source_is_noticed(monkeypatch, tmp_path) -> None:
     assert make_pictures.out_of_date() == ["a.png"]
 
 
-def test_curves_are_drawn_by_images_and_as_the_mean_of_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = {"airplane/vanilla-seed0": "128", "airplane/vanilla-seed1": "128", "airplane/plus-seed0": "32"}
-    tables = {"runs": [["run", "networks", "iterations", "batch"]], "curves": [["run", "split", "step", "IoU", "MMD"]]}
+def test_curves_are_drawn_by_images_and_as_the_mean_of_seeds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = {
+        "airplane/vanilla-seed0": "128",
+        "airplane/vanilla-seed1": "128",
+        "airplane/plus-seed0": "32",
+    }
+    tables = {
+        "runs": [["run", "networks", "iterations", "batch"]],
+        "curves": [["run", "split", "step", "IoU", "MMD"]],
+    }
     for number, (run, batch) in enumerate(runs.items()):
         tables["runs"].append([run, "step 1000", "1000", batch])
-        tables["curves"] += [[run, "test", step, f"0.{number + 1}", "-"] for step in ("500", "1000")]
+        tables["curves"] += [
+            [run, "test", step, f"0.{number + 1}", "-"] for step in ("500", "1000")
+        ]
     (tmp_path / "short.json").write_text(json.dumps(tables))
     longer = tables["curves"][-1][:2] + ["1500", "0.5", "0.1"]
-    (tmp_path / "long.json").write_text(json.dumps(tables | {"curves": [*tables["curves"], longer]}))
+    (tmp_path / "long.json").write_text(
+        json.dumps(tables | {"curves": [*tables["curves"], longer]})
+    )
     monkeypatch.setattr(draw_curves, "RESULTS", tmp_path)
     curves = draw_curves.read_curves(["short", "long", "short=generated"])
     assert list(curves) == ["airplane", "generated airplane"]
-    assert curves["airplane"]["plus"]["0"][:, 0].tolist() == [125, 250, 375], "steps of 32 images count a quarter"
+    assert curves["airplane"]["plus"]["0"][:, 0].tolist() == [125, 250, 375], (
+        "steps of 32 images count a quarter"
+    )
     lines = draw_curves.draw(curves).axes[0].get_lines()
     assert {line.get_label(): line.get_ydata().tolist() for line in lines} == {
         "Vanilla-AE": [pytest.approx(0.15)] * 2,

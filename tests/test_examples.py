@@ -61,7 +61,14 @@ def test_every_example_is_tested_and_short():
 
 
 def test_draw_views_from_the_command_line(tmp_path):
-    command = [sys.executable, str(EXAMPLES / "draw_views.py"), "--output", str(tmp_path / "new"), "--views", "2"]
+    command = [
+        sys.executable,
+        str(EXAMPLES / "draw_views.py"),
+        "--output",
+        str(tmp_path / "new"),
+        "--views",
+        "2",
+    ]
     done = subprocess.run([*command, "--image-size", "64"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     check_picture(imageio.imread(tmp_path / "new" / "views.png"), 2 * 64, 3 * 64)
@@ -77,7 +84,10 @@ def test_draw_gradients(tmp_path):
     moved = run("draw_gradients", tmp_path, "--image-size", "64")
     assert moved["nmr"] > 2 * moved["local"] > 100 and moved["none"] == 0
     panels = np.split(imageio.imread(tmp_path / "gradients.png").astype(int), 5, axis=1)
-    orange, blue = ((panels[3][..., 0] - panels[3][..., 2] > 60), (panels[3][..., 2] - panels[3][..., 0] > 60))
+    orange, blue = (
+        (panels[3][..., 0] - panels[3][..., 2] > 60),
+        (panels[3][..., 2] - panels[3][..., 0] > 60),
+    )
     assert orange.sum() > 10 and blue.sum() < orange.sum()
 
 
@@ -89,14 +99,23 @@ def test_fit_masks(tmp_path):
     assert run("fit_masks", tmp_path, "--steps", "60") > 0.9
     ring = trimesh.load(tmp_path / "fit_masks.glb", force="mesh")
     assert ring.is_watertight and ring.euler_number == 0 and ring.volume > 0
-    again = ["--folder", str(tmp_path / "masks"), "--start", str(tmp_path / "fit_masks.glb"), "--steps", "2"]
+    again = [
+        "--folder",
+        str(tmp_path / "masks"),
+        "--start",
+        str(tmp_path / "fit_masks.glb"),
+        "--steps",
+        "2",
+    ]
     assert run("fit_masks", tmp_path / "again", *again) > 0.9
     assert imageio.imread(tmp_path / "fit_masks.png").shape == (2 * 90, 12 * 120)
 
 
 def test_draw_surfaces(tmp_path):
     run("draw_surfaces", tmp_path, "--image-size", "64")
-    room, wide, soft = (imageio.imread(tmp_path / f"{name}.png") for name in ("room", "wide", "soft"))
+    room, wide, soft = (
+        imageio.imread(tmp_path / f"{name}.png") for name in ("room", "wide", "soft")
+    )
     assert room.shape == (64, 64, 3) and wide.shape == (64, 128, 3) and soft.shape == (32, 128)
     assert (room.max(-1) > 60).all() and (wide.max(-1) > 60).all()  # walls everywhere
     assert (np.abs(wide[:, 32:96].astype(int) - room).max(-1) > 8).mean() < 0.02
@@ -180,7 +199,9 @@ def test_shape_from_silhouettes():
 
 def test_texture_and_light():
     names, _ = run_notebook("texture_and_light")
-    together, alone = ((names[images] - names["truth"]).abs().mean() for images in ("found", "wrong"))
+    together, alone = (
+        (names[images] - names["truth"]).abs().mean() for images in ("found", "wrong")
+    )
     assert together < alone / 4
     assert abs(names["ambient"] - names["true_ambient"]) < 0.05
     assert torch.cosine_similarity(names["direction"], names["true_direction"], dim=0) > 0.99

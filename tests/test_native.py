@@ -12,7 +12,8 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.mark.skipif(sys.platform != "linux", reason="tools/check_native.sh is for Linux")
 @pytest.mark.parametrize(
-    "check", ["tests", "count", *(pytest.param(name, marks=pytest.mark.slow) for name in ("asan", "tsan"))]
+    "check",
+    ["tests", "count", *(pytest.param(name, marks=pytest.mark.slow) for name in ("asan", "tsan"))],
 )
 def test_native(check):
     result = subprocess.run(

@@ -19,7 +19,9 @@ DOCS = ROOT / "docs"
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs bash")
 def test_the_commands_of_the_page(tmp_path) -> None:
-    commands, cluster = re.findall(r"```sh\n(.*?)```", (DOCS / "scale.md").read_text(), re.DOTALL)[:2]
+    commands, cluster = re.findall(r"```sh\n(.*?)```", (DOCS / "scale.md").read_text(), re.DOTALL)[
+        :2
+    ]
     assert [line.split()[0] for line in commands.splitlines()] == ["learn3d", "torchrun", "learn3d"]
     folders = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     if not shutil.which("dask", path=folders):
@@ -27,13 +29,23 @@ def test_the_commands_of_the_page(tmp_path) -> None:
     shutil.copytree(ROOT / "tools", tmp_path / "tools")
     script = f"set -e\ntrap 'kill $(jobs -p)' EXIT\n{cluster}\n{commands}"
     environment = os.environ | {"PATH": folders, "OMP_NUM_THREADS": "1"}
-    call = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True, "timeout": 900}
+    call = {
+        "cwd": tmp_path,
+        "env": environment,
+        "capture_output": True,
+        "text": True,
+        "timeout": 900,
+    }
     ended = subprocess.run(["bash", "-c", script], **call)
     assert ended.returncode == 0, ended.stderr
     assert {"big/03001627/train/set.json", "runs/chair/last.safetensors", "tables/kato.md"} <= {
         str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")
     }
-    assert "in each of 2 ranks (gloo)" in ended.stderr and "[3/3] " in ended.stderr and "[2/2] " in ended.stderr
+    assert (
+        "in each of 2 ranks (gloo)" in ended.stderr
+        and "[3/3] " in ended.stderr
+        and "[2/2] " in ended.stderr
+    )
 
 
 def test_the_syntax_of_the_examples() -> None:

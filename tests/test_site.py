@@ -33,7 +33,10 @@ class Page(HTMLParser):
         self.places |= {attributes[name] for name in ("id", "name") if attributes.get(name)}
         if tag == "a" and attributes.get("href"):
             self.links.append(attributes["href"])
-        if tag in ("script", "img", "iframe", "source", "link") and attributes.get("rel") not in ("next", "prev"):
+        if tag in ("script", "img", "iframe", "source", "link") and attributes.get("rel") not in (
+            "next",
+            "prev",
+        ):
             self.loads += [attributes[name] for name in ("src", "href") if attributes.get(name)]
 
 
@@ -41,7 +44,16 @@ class Page(HTMLParser):
 def site(tmp_path_factory):
     """The folder of the built site. In a folder of its own, so that the installed package is described."""
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", DOCS, folder / "html"]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "--fail-on-warning",
+        "--keep-going",
+        "--quiet",
+        DOCS,
+        folder / "html",
+    ]
     environment = os.environ | {"GITHUB_REPOSITORY": "somebody/nmr"}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -69,7 +81,9 @@ def test_links_lead_to_places_that_exist(pages):
                 continue
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             place = unquote(parts.fragment)
-            if not target.is_file() or (place and target in pages and place not in pages[target].places):
+            if not target.is_file() or (
+                place and target in pages and place not in pages[target].places
+            ):
                 lost.append((path.name, link))
     assert lost == []
 
@@ -79,7 +93,9 @@ def test_pages_load_nothing_from_elsewhere(site, pages):
     assert len(loads) > 100
     assert [(name, load) for name, load in loads if urlsplit(load).netloc] == []
     for sheet in site.rglob("*.css"):
-        assert not re.findall(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//", sheet.read_text()), sheet.name
+        assert not re.findall(r"(?:url\(|@import)\s*['\"]?(?:https?:)?//", sheet.read_text()), (
+            sheet.name
+        )
 
 
 def test_links_show_words_and_no_markup(site):
@@ -91,7 +107,9 @@ def test_every_public_name_is_described(pages):
     described = set().union(*(page.places for page in pages.values()))
     public = {f"nmr.{name}" for name in nmr.__all__} - {"nmr.cameras", "nmr.losses", "nmr.metrics"}
     for module in (nmr.cameras, nmr.losses, nmr.metrics):
-        public |= {f"{module.__name__}.{name}" for name in module.__all__ if name not in nmr.__all__}
+        public |= {
+            f"{module.__name__}.{name}" for name in module.__all__ if name not in nmr.__all__
+        }
     assert sorted(public - described) == []
 
 
@@ -107,4 +125,7 @@ def test_every_parameter_of_a_drawing_function_is_explained_at_it(site):
 def test_notebooks_lead_to_colab(site):
     for notebook in (DOCS / "examples").glob("*.ipynb"):
         page = (site / "examples" / f"{notebook.stem}.html").read_text()
-        assert f"colab.research.google.com/github/somebody/nmr/blob/main/docs/examples/{notebook.name}" in page
+        assert (
+            f"colab.research.google.com/github/somebody/nmr/blob/main/docs/examples/{notebook.name}"
+            in page
+        )

@@ -40,8 +40,14 @@ class Scene(NamedTuple):
         height, width = self.mask.shape
         wide, high = right - left, bottom - top
         shares = rng.uniform(0.01, 0.05, 4)
-        left, right = max(1, round(left - shares[0] * wide)), min(width - 1, round(right + shares[1] * wide))
-        top, bottom = max(1, round(top - shares[2] * high)), min(height - 1, round(bottom + shares[3] * high))
+        left, right = (
+            max(1, round(left - shares[0] * wide)),
+            min(width - 1, round(right + shares[1] * wide)),
+        )
+        top, bottom = (
+            max(1, round(top - shares[2] * high)),
+            min(height - 1, round(bottom + shares[3] * high)),
+        )
         return left, top, right - left, bottom - top
 
 
@@ -50,9 +56,13 @@ def compose(rng: np.random.Generator, photographs: list[Image.Image]) -> Scene:
     width, height = SIZES[rng.integers(len(SIZES))]
     photo = rng.random() < 0.4
     scene = (
-        _part(rng, photographs[rng.integers(len(photographs))], width, height) if photo else _room(rng, width, height)
+        _part(rng, photographs[rng.integers(len(photographs))], width, height)
+        if photo
+        else _room(rng, width, height)
     )
-    paint, alpha = _object(rng, str(rng.choice(CATEGORIES)), round(min(width, height) * rng.uniform(0.55, 0.85)))
+    paint, alpha = _object(
+        rng, str(rng.choice(CATEGORIES)), round(min(width, height) * rng.uniform(0.55, 0.85))
+    )
     tall, wide = alpha.shape
     left = round((width - wide) / 2 + rng.uniform(-0.1, 0.1) * width)
     top = round((height - tall) * rng.uniform(0.45, 0.8))
@@ -64,7 +74,9 @@ def compose(rng: np.random.Generator, photographs: list[Image.Image]) -> Scene:
     scene[top : top + tall, left : left + wide] += paint
     scene = ndimage.gaussian_filter(scene, (rng.uniform(0.3, 0.7),) * 2 + (0,))
     scene += rng.normal(0, rng.uniform(1, 4), scene.shape)
-    return Scene(scene.clip(0, 255).astype(np.uint8), whole > 0.5, "photograph" if photo else "room")
+    return Scene(
+        scene.clip(0, 255).astype(np.uint8), whole > 0.5, "photograph" if photo else "room"
+    )
 
 
 def _object(rng: np.random.Generator, category: str, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +86,9 @@ def _object(rng: np.random.Generator, category: str, side: int) -> tuple[np.ndar
     colors, lights = natural_look(vertices, mesh.faces, rng)
     angles = rng.uniform(5, 30), [rng.uniform(-180, 180)]
     camera = nmr.LookAt.from_angles(DISTANCE, *angles, half_fov_deg=HALF_FOV_DEG)
-    (rgb,), (alpha,) = photograph(vertices, mesh.faces, colors, camera, image_size=512, lights=lights)
+    (rgb,), (alpha,) = photograph(
+        vertices, mesh.faces, colors, camera, image_size=512, lights=lights
+    )
     left, top, right, bottom = mask_box(alpha)
     picture = Image.fromarray(np.dstack([rgb, alpha])).crop((left, top, right, bottom))
     scale = side / max(picture.size)
@@ -108,11 +122,17 @@ def _room(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
     if pattern == 1:
         wall = wall + strength * np.sign(np.sin(x / rng.uniform(3, 12)))[..., None]
     elif pattern == 2:
-        wall = wall + strength * (ndimage.gaussian_filter(rng.normal(size=(height, width)), 1.5) * 4)[..., None]
+        wall = (
+            wall
+            + strength
+            * (ndimage.gaussian_filter(rng.normal(size=(height, width)), 1.5) * 4)[..., None]
+        )
     scene = np.broadcast_to(wall, (height, width, 3)).copy()
     if rng.random() < 0.4:
         left, top = rng.integers(0, width // 2), rng.integers(0, height // 4)
-        frame = np.s_[top : top + height // rng.integers(3, 6), left : left + width // rng.integers(3, 6)]
+        frame = np.s_[
+            top : top + height // rng.integers(3, 6), left : left + width // rng.integers(3, 6)
+        ]
         scene[frame] = _tint(rng, 30)
         inner = scene[frame][4:-4, 4:-4]
         inner[:] = _tint(rng, 60)
@@ -135,7 +155,11 @@ def _room(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
     scene[on_floor] = (floor + tone[..., None])[on_floor]
     if rng.random() < 0.7:
         scene[(y <= line) & (y > line - rng.uniform(0.01, 0.04) * height)] = board
-    light = 1 + rng.uniform(-0.25, 0.25) * (x / width - 0.5) + rng.uniform(-0.25, 0.25) * (y / height - 0.5)
+    light = (
+        1
+        + rng.uniform(-0.25, 0.25) * (x / width - 0.5)
+        + rng.uniform(-0.25, 0.25) * (y / height - 0.5)
+    )
     spot = np.hypot(x / width - rng.random(), y / height - rng.random())
     return scene * (light * (1.05 - rng.uniform(0, 0.3) * spot))[..., None]
 
@@ -149,9 +173,13 @@ def _part(rng: np.random.Generator, photo: Image.Image, width: int, height: int)
     """A random part of a photograph in these sizes."""
     least = max(width / photo.width, height / photo.height)
     scale = max(least, min(2.5, least * rng.uniform(1, 1.8)))
-    photo = photo.resize((max(width, round(photo.width * scale)), max(height, round(photo.height * scale))))
+    photo = photo.resize(
+        (max(width, round(photo.width * scale)), max(height, round(photo.height * scale)))
+    )
     left, top = rng.integers(photo.width - width + 1), rng.integers(photo.height - height + 1)
-    part = photo.crop((left, top, left + width, top + height)).filter(ImageFilter.GaussianBlur(rng.uniform(0, 2)))
+    part = photo.crop((left, top, left + width, top + height)).filter(
+        ImageFilter.GaussianBlur(rng.uniform(0, 2))
+    )
     return np.asarray(part) * rng.uniform(0.8, 1.0, 3)
 
 
@@ -160,7 +188,13 @@ def package_photographs() -> list[Image.Image]:
     from skimage import data
     from sklearn.datasets import load_sample_image
 
-    pictures = [data.brick(), data.gravel(), data.grass(), data.rocket(), data.stereo_motorcycle()[0]]
+    pictures = [
+        data.brick(),
+        data.gravel(),
+        data.grass(),
+        data.rocket(),
+        data.stereo_motorcycle()[0],
+    ]
     pictures.append(load_sample_image("china.jpg"))
     return [Image.fromarray(np.ascontiguousarray(picture)).convert("RGB") for picture in pictures]
 
@@ -188,16 +222,28 @@ def main(images: int = 40, seed: int = 2, sheet: Path | None = None) -> None:
     kinds, values, shown = [], [], []
     for number, scene in enumerate(scenes(images, seed)):
         box = scene.box(np.random.default_rng([seed, number, 1]))
-        found = [keep_object(find_outline(scene.colors, each, model.judge).mask)[0] for each in (None, box)]
+        found = [
+            keep_object(find_outline(scene.colors, each, model.judge).mask)[0]
+            for each in (None, box)
+        ]
         values.append([iou(mask, scene.mask) for mask in found])
         kinds.append(scene.kind)
         shown += [_draw(scene.colors, mask) for mask in found]
     good, kinds = np.array(values) > GOOD, np.array(kinds)
     print(f"{'':12}{'pictures':>12}{'no hand':>12}{'box':>12}")
-    for name, rows in [*((kind, kinds == kind) for kind in ("room", "photograph")), ("all", kinds != "")]:
-        print(f"{name:12}{rows.sum():12}" + "".join(f"{share:12.0%}" for share in good[rows].mean(axis=0)))
+    for name, rows in [
+        *((kind, kinds == kind) for kind in ("room", "photograph")),
+        ("all", kinds != ""),
+    ]:
+        print(
+            f"{name:12}{rows.sum():12}"
+            + "".join(f"{share:12.0%}" for share in good[rows].mean(axis=0))
+        )
     if sheet is not None:
-        save_png(sheet, tile([shown[start : start + 8] for start in range(0, len(shown), 8)], tile_size=192))
+        save_png(
+            sheet,
+            tile([shown[start : start + 8] for start in range(0, len(shown), 8)], tile_size=192),
+        )
 
 
 def _draw(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -18,7 +18,9 @@ from learn3d.studio.picture_to_mesh.fit import fit, predict
 from learn3d.studio.picture_to_mesh.reconstruction import frame, load_model, recognize, reduce_mask
 from learn3d.studio.picture_to_mesh.templates import fit_template
 
-COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,azimuth,kind,warned".split(",")
+COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,azimuth,kind,warned".split(
+    ","
+)
 
 
 def main(models: Path, category: str, run: Path | None = None, images: int = 48) -> None:
@@ -35,7 +37,9 @@ def main(models: Path, category: str, run: Path | None = None, images: int = 48)
         sources, rows = list(mesh_sources(models / name).values()), []
         for number in range(images):
             mesh, rng = check(sources[number % len(sources)]()), np.random.default_rng(number)
-            vertices = torch.from_numpy(fit_to_box(mesh.vertices) @ mesh_to_object("y", "z").T).float()
+            vertices = torch.from_numpy(
+                fit_to_box(mesh.vertices) @ mesh_to_object("y", "z").T
+            ).float()
             pose = view_poses(torch.from_numpy(rng.integers(24, size=1)))
             colors, lights = natural_look(vertices.numpy(), mesh.faces, rng)
             look = {"image_size": 256, "lights": lights}
@@ -43,13 +47,22 @@ def main(models: Path, category: str, run: Path | None = None, images: int = 48)
             mask = reduce_mask(frame(rgb, alpha)[3])
             predicted = predict(model.method, torch.from_numpy(model.prepare(rgb, alpha)), mask)
             template, kind = next(fit_template(model.templates, model.categories, predicted, mask))
-            boxed = template._replace(vertices=torch.from_numpy(fit_to_box(template.vertices.numpy())))
+            boxed = template._replace(
+                vertices=torch.from_numpy(fit_to_box(template.vertices.numpy()))
+            )
             shapes = (predicted.shape, fit(model.method, predicted, mask), boxed)
             truth = KATO.voxelize(vertices[None], torch.from_numpy(mesh.faces))
-            grids = [KATO.voxelize(shape.vertices[None].clamp(-0.499, 0.499), shape.faces) for shape in shapes]
+            grids = [
+                KATO.voxelize(shape.vertices[None].clamp(-0.499, 0.499), shape.faces)
+                for shape in shapes
+            ]
             voxels = [float(nmr.metrics.voxel_iou(grid, truth)) for grid in grids]
             error_deg = wrap_deg(template.view.azimuth_deg - pose.azimuth_deg)
-            right = float(error_deg.abs()) < 20, kind == name, recognize(model, predicted.code[0])[1] is not None
+            right = (
+                float(error_deg.abs()) < 20,
+                kind == name,
+                recognize(model, predicted.code[0])[1] is not None,
+            )
             rows.append((*(shape.iou for shape in shapes), *voxels, *right))
         print(f"{name:12}", *(f"{value:20.3f}" for value in np.mean(rows, axis=0)), flush=True)
 

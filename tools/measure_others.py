@@ -29,7 +29,9 @@ def draw(mesh: RawMesh, rng: np.random.Generator) -> Picture:
     vertices = np.float32(fit_to_box(mesh.vertices) @ mesh_to_object("y", "z").T)
     cameras = view_poses(torch.from_numpy(rng.integers(24, size=1))).cameras()
     colors, lights = natural_look(vertices, mesh.faces, rng)
-    (rgb,), (alpha,) = photograph(vertices, mesh.faces, colors, cameras, image_size=256, lights=lights)
+    (rgb,), (alpha,) = photograph(
+        vertices, mesh.faces, colors, cameras, image_size=256, lights=lights
+    )
     return rgb, alpha
 
 
@@ -54,7 +56,10 @@ def generated(category: str, count: int) -> Iterator[Picture]:
 
 
 def main(
-    others: tuple[Path, ...] = (), known: tuple[Path, ...] = (), run: Path | None = None, images: int = 60
+    others: tuple[Path, ...] = (),
+    known: tuple[Path, ...] = (),
+    run: Path | None = None,
+    images: int = 60,
 ) -> None:
     """Print the share of pictures with a warning: it should be large for other things, small for known kinds.
 

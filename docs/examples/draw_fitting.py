@@ -14,7 +14,14 @@ from learn3d.pictures.sheets import save_gif, tile
 from learn3d.pictures.surfaces import Surface, draw_surface
 from learn3d.studio.shapes import make_shape
 
-OBJECTS = {"airplane": 3, "car": 3, "chair": 6, "lamp": 3, "sofa": 3, "table": 3}  # category: seed of the generator
+OBJECTS = {
+    "airplane": 3,
+    "car": 3,
+    "chair": 6,
+    "lamp": 3,
+    "sofa": 3,
+    "table": 3,
+}  # category: seed of the generator
 
 
 def fit(masks: torch.Tensor, cameras: nmr.LookAt, steps: int) -> list[torch.Tensor]:
@@ -48,24 +55,39 @@ def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> d
     size: side of each picture in pixels.
     steps: of Adam, for each object.
     """
-    views = nmr.LookAt.from_angles(2.732, [-20.0, 30.0] * 12, [15.0 * k for k in range(24)], half_fov_deg=13.0)
+    views = nmr.LookAt.from_angles(
+        2.732, [-20.0, 30.0] * 12, [15.0 * k for k in range(24)], half_fov_deg=13.0
+    )
     turn = [30.0 - 360.0 * frame / frames for frame in range(frames)]
-    cameras = [nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0) for azimuth in turn]
-    shown = [min(steps, round(steps * (2 * frame / frames) ** 2)) for frame in range(frames)]  # slowly at first
+    cameras = [
+        nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0) for azimuth in turn
+    ]
+    shown = [
+        min(steps, round(steps * (2 * frame / frames) ** 2)) for frame in range(frames)
+    ]  # slowly at first
     sphere_faces, columns, ious = nmr.icosphere(4)[1], [], {}
     for category, seed in OBJECTS.items():
         mesh = make_shape(category, np.random.default_rng([seed, 0, 0]))
-        vertices = torch.as_tensor(np.asarray(mesh.vertices) * (1, 1, -1), dtype=torch.float32)  # left-handed
+        vertices = torch.as_tensor(
+            np.asarray(mesh.vertices) * (1, 1, -1), dtype=torch.float32
+        )  # left-handed
         faces = torch.as_tensor(np.asarray(mesh.faces))
         masks = nmr.render_silhouette(vertices, faces, views, image_size=96)
         shapes = fit(masks, views, steps)
         drawn = nmr.render_silhouette(shapes[-1], sphere_faces, views, image_size=96)
         ious[category] = 1 - nmr.losses.soft_iou_loss(drawn, masks).item()
         pairs = zip(shown, cameras, strict=True)
-        fitted = [draw_surface(Surface(shapes[k], sphere_faces), [view], image_size=size)[0] for k, view in pairs]
+        fitted = [
+            draw_surface(Surface(shapes[k], sphere_faces), [view], image_size=size)[0]
+            for k, view in pairs
+        ]
         columns.append((draw_surface(Surface(vertices, faces), cameras, image_size=size), fitted))
     sheets = [
-        tile([[column[row][frame] for column in columns] for row in (0, 1)], list(OBJECTS), tile_size=size)
+        tile(
+            [[column[row][frame] for column in columns] for row in (0, 1)],
+            list(OBJECTS),
+            tile_size=size,
+        )
         for frame in range(frames)
     ]
     output.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,9 @@ import nmr
 def two_balls() -> tuple[Tensor, Tensor, Tensor]:
     """A yellow ball in front of a blue one."""
     ball, faces = nmr.icosphere(4)
-    vertices = torch.cat([0.45 * ball - torch.tensor([0.2, 0.1, 0.6]), 0.7 * ball + torch.tensor([0.3, 0.1, 0.6])])
+    vertices = torch.cat(
+        [0.45 * ball - torch.tensor([0.2, 0.1, 0.6]), 0.7 * ball + torch.tensor([0.3, 0.1, 0.6])]
+    )
     colors = torch.tensor([[0.95, 0.75, 0.2], [0.25, 0.45, 0.8]]).repeat_interleave(len(ball), 0)
     return vertices, torch.cat([faces, faces + len(ball)]), colors
 
@@ -25,8 +27,16 @@ def pulls(grad: Tensor) -> Tensor:
     """Colours of vertices: orange if descent moves one to the right, blue if to the left, white if it stays."""
     step = -grad[:, 0] / grad[:, 0].abs().max().clamp_min(1e-12)
     step = step.sign() * step.abs() ** 0.4
-    white, orange, blue = torch.ones(3), torch.tensor([0.9, 0.35, 0.0]), torch.tensor([0.0, 0.3, 0.85])
-    return white + step.clamp_min(0)[:, None] * (orange - white) - step.clamp_max(0)[:, None] * (blue - white)
+    white, orange, blue = (
+        torch.ones(3),
+        torch.tensor([0.9, 0.35, 0.0]),
+        torch.tensor([0.0, 0.3, 0.85]),
+    )
+    return (
+        white
+        + step.clamp_min(0)[:, None] * (orange - white)
+        - step.clamp_max(0)[:, None] * (blue - white)
+    )
 
 
 def main(output: Path = Path("output"), image_size: int = 192) -> dict[str, int]:
@@ -41,7 +51,9 @@ def main(output: Path = Path("output"), image_size: int = 192) -> dict[str, int]
 
     def draw(vertices: Tensor, colors: Tensor, **options) -> Tensor:
         settings = {"background": 0.9, "image_size": image_size, **options}
-        return nmr.render_rgb(vertices, faces, camera, colors=nmr.VertexColors(colors), **settings)[0]
+        return nmr.render_rgb(vertices, faces, camera, colors=nmr.VertexColors(colors), **settings)[
+            0
+        ]
 
     target = draw(vertices + front * torch.tensor([0.15, 0.0, 0.0]), colors)
     panels, moved = [draw(vertices, colors), target], {}

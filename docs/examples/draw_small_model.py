@@ -14,14 +14,20 @@ from learn3d.data.conventions import mesh_to_object
 from learn3d.pictures.photograph import PALETTES, natural_look, photograph
 from learn3d.pictures.sheets import save_png, tile
 from learn3d.pictures.surfaces import Surface, draw_around
-from learn3d.studio.picture_to_mesh.reconstruction import export_mesh, load_model, reconstruct_picture
+from learn3d.studio.picture_to_mesh.reconstruction import (
+    export_mesh,
+    load_model,
+    reconstruct_picture,
+)
 from learn3d.studio.shapes import CATEGORIES, make_shape
 
 SIDE = 140  # of each small picture, in pixels
 TURNS = (0, 60, 120)  # degrees from the camera's side
 
 
-def main(output: Path = Path("output"), azimuth: float = 40.0, elevation: float = 20.0, seed: int = 7) -> Path:
+def main(
+    output: Path = Path("output"), azimuth: float = 40.0, elevation: float = 20.0, seed: int = 7
+) -> Path:
     """Writes OUTPUT/small-model.png. Rows: one object of each category; columns: its picture, the mesh, the truth.
 
     Beside it the pictures without their background, and the meshes in colour: chair.png, chair.glb and so on.
@@ -42,7 +48,9 @@ def main(output: Path = Path("output"), azimuth: float = 40.0, elevation: float 
         save_png(output / f"{category}.png", np.dstack([colors[0], masks[0]]))
         export_mesh(output / f"{category}.glb", made.surface)
         drawn = [
-            draw_around(surface, [start - turn for turn in TURNS], elevation_deg=elevation, image_size=SIDE)
+            draw_around(
+                surface, [start - turn for turn in TURNS], elevation_deg=elevation, image_size=SIDE
+            )
             for surface, start in ((made.surface, made.azimuth_deg), (truth, azimuth))
         ]
         rows.append([colors[0], *drawn[0], *drawn[1]])

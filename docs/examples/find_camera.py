@@ -15,7 +15,9 @@ import nmr
 from learn3d.studio.shapes import make_shape
 
 
-def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160, seed: int = 2) -> tuple[float, float]:
+def main(
+    output: Path = Path("output"), steps: int = 120, image_size: int = 160, seed: int = 2
+) -> tuple[float, float]:
     """Writes OUTPUT/find_camera.gif and .png: what each guess sees, in front of the target silhouette (orange).
 
     Returns the distance of the best guess from the true camera, before and after; the chair has length 1.
@@ -27,14 +29,24 @@ def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160,
     colors = nmr.FaceColors(torch.tensor([0.4, 0.62, 0.9]).expand(len(faces), 3))
 
     def silhouettes(eyes: Tensor) -> Tensor:
-        return nmr.render_silhouette(vertices, faces, nmr.LookAt(eyes, half_fov_deg=13.0), image_size=image_size)
+        return nmr.render_silhouette(
+            vertices, faces, nmr.LookAt(eyes, half_fov_deg=13.0), image_size=image_size
+        )
 
     def draw(eyes: Tensor) -> Tensor:
         """The images of eight guesses, in two rows: uint8 [height, width, 3]."""
         camera = nmr.LookAt(eyes, half_fov_deg=13.0)
-        lights = nmr.Lights(0.4, 0.7, torch.nn.functional.normalize(eyes, dim=1).unsqueeze(1))  # at the camera
+        lights = nmr.Lights(
+            0.4, 0.7, torch.nn.functional.normalize(eyes, dim=1).unsqueeze(1)
+        )  # at the camera
         rgb, alpha = nmr.render(
-            vertices, faces, camera, outputs=("rgb", "alpha"), colors=colors, lights=lights, image_size=image_size
+            vertices,
+            faces,
+            camera,
+            outputs=("rgb", "alpha"),
+            colors=colors,
+            lights=lights,
+            image_size=image_size,
         )
         behind = 1 - target[..., None] * torch.tensor([0.02, 0.35, 0.7])
         tiles = rgb + (1 - alpha[..., None]) * behind
@@ -59,11 +71,18 @@ def main(output: Path = Path("output"), steps: int = 120, image_size: int = 160,
     output.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(output / "find_camera.png", torch.cat([frames[0], frames[-1]]).numpy())
     imageio.imwrite(
-        output / "find_camera.gif", torch.stack(frames).numpy(), duration=[80] * (len(frames) - 1) + [1500], loop=0
+        output / "find_camera.gif",
+        torch.stack(frames).numpy(),
+        duration=[80] * (len(frames) - 1) + [1500],
+        loop=0,
     )
     best = errors.argmin()
     return tuple((x[best] - true_eye).norm().item() for x in (guesses, eyes))
 
 
 if __name__ == "__main__":
-    print("distance of the best guess from the true camera: {:.2f} before, {:.4f} after".format(*tyro.cli(main)))
+    print(
+        "distance of the best guess from the true camera: {:.2f} before, {:.4f} after".format(
+            *tyro.cli(main)
+        )
+    )

@@ -25,46 +25,67 @@ def turned(radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r, angle = radius.unsqueeze(1), 2 * math.pi * u
     vertices = torch.stack([r * angle.sin(), 1.3 * (v - 0.5), -r * angle.cos()], dim=-1).view(-1, 3)
     a = (torch.arange(ROWS - 1)[:, None] * COLUMNS + torch.arange(COLUMNS - 1)).view(-1, 1)
-    faces = torch.cat([a + torch.tensor([0, COLUMNS, COLUMNS + 1]), a + torch.tensor([0, COLUMNS + 1, 1])])
+    faces = torch.cat(
+        [a + torch.tensor([0, COLUMNS, COLUMNS + 1]), a + torch.tensor([0, COLUMNS + 1, 1])]
+    )
     return vertices, faces, torch.stack([u, v], dim=-1).view(-1, 2)
 
 
 def glaze(size: int) -> Tensor:
     """The texture to be found: bands and dots, [size, 2 size, 3]."""
-    y, x = torch.meshgrid(torch.arange(size) / size, torch.arange(2 * size) / (2 * size), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(size) / size, torch.arange(2 * size) / (2 * size), indexing="ij"
+    )
     dots = ((12 * x % 1 - 0.5) ** 2 + (8 * y % 1 - 0.5) ** 2 < 0.09).unsqueeze(-1)
     bands = (torch.sin(6 * math.pi * y + torch.sin(4 * math.pi * x)) > 0).unsqueeze(-1)
     blue, cream, red = torch.tensor([[0.15, 0.3, 0.5], [0.85, 0.8, 0.65], [0.75, 0.25, 0.2]])
     return torch.where(dots, red, torch.where(bands, blue, cream))
 
 
-def main(output: Path = Path("output"), steps: int = 150, views: int = 12, size: int = 96) -> tuple[float, float]:
+def main(
+    output: Path = Path("output"), steps: int = 150, views: int = 12, size: int = 96
+) -> tuple[float, float]:
     """Writes OUTPUT/fit_lit_vase.png: photographs from unused sides, the first guess, and what was found.
 
     Returns the mean error of the colours in these views, before and after.
     """
     v = torch.linspace(0, 1, ROWS)
 
-    def photographs(radius: Tensor, texture: Tensor, lamp: Tensor, shine: Tensor, azimuths_deg: list[float]) -> Tensor:
+    def photographs(
+        radius: Tensor, texture: Tensor, lamp: Tensor, shine: Tensor, azimuths_deg: list[float]
+    ) -> Tensor:
         vertices, faces, uv = turned(radius)
         camera = nmr.LookAt.from_angles(3.0, 25.0, azimuths_deg, half_fov_deg=15.0)
         colors = nmr.UVTexture(texture, uv, wrap="clamp", filter="mipmap")
-        lights = nmr.Lights(0.35, 0.0, smooth=True, position=lamp, point=0.9, specular=shine, shininess=12.0)
-        return nmr.render_rgb(vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=size)
+        lights = nmr.Lights(
+            0.35, 0.0, smooth=True, position=lamp, point=0.9, specular=shine, shininess=12.0
+        )
+        return nmr.render_rgb(
+            vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=size
+        )
 
     truth = 0.30 + 0.14 * (2.2 * math.pi * v - 0.6).sin() - 0.05 * v, glaze(size // 2)
     truth = *truth, torch.tensor([0.8, 1.4, -1.2]), torch.tensor(0.35)
     azimuths, unseen = [360 / views * k for k in range(views)], [15.0, 105.0, 195.0, 285.0]
     pictures, wanted = photographs(*truth, azimuths), photographs(*truth, unseen)
 
-    guess = torch.full((ROWS,), 0.3), torch.full_like(truth[1], 0.5), torch.tensor([0.0, 1.0, -2.0]), torch.tensor(0.1)
+    guess = (
+        torch.full((ROWS,), 0.3),
+        torch.full_like(truth[1], 0.5),
+        torch.tensor([0.0, 1.0, -2.0]),
+        torch.tensor(0.1),
+    )
     rates = 0.004, 0.03, 0.03, 0.01
     found = [x.clone().requires_grad_() for x in guess]
-    optimizer = torch.optim.Adam([{"params": x, "lr": lr} for x, lr in zip(found, rates, strict=True)])
+    optimizer = torch.optim.Adam(
+        [{"params": x, "lr": lr} for x, lr in zip(found, rates, strict=True)]
+    )
     for step in range(steps):
         some = [(5 * step + k * views // 4) % views for k in range(4)]
         optimizer.zero_grad()
-        (photographs(*found, [azimuths[k] for k in some]) - pictures[some]).square().mean(0).sum().backward()
+        (photographs(*found, [azimuths[k] for k in some]) - pictures[some]).square().mean(
+            0
+        ).sum().backward()
         optimizer.step()
 
     with torch.no_grad():

@@ -23,25 +23,36 @@ def draw(vertices: list[Tensor], faces: list[Tensor], color: list[float]) -> Ten
     colors = nmr.FaceColors([torch.tensor(color).expand(len(f), 3) for f in faces])
     lights = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, -0.4], [-0.7, -0.1, -0.6]])
     camera = nmr.LookAt.from_angles(2.732, 25.0, 40.0, half_fov_deg=12.0)
-    images = nmr.render_rgb(vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=192)
+    images = nmr.render_rgb(
+        vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=192
+    )
     return (torch.cat(list(images), dim=1).clamp(0, 1) * 255).round().byte()
 
 
-def main(output: Path = Path("output"), steps: int = 250, image_size: int = 64) -> tuple[float, float]:
+def main(
+    output: Path = Path("output"), steps: int = 250, image_size: int = 64
+) -> tuple[float, float]:
     """Writes OUTPUT/fit_packed.png: targets above; below the results, from spheres of 162 and 642 vertices.
 
     Returns 1 - IoU of the silhouettes, before and after.
     """
     goals = [make_shape(category, np.random.default_rng(seed)) for category, seed in SHAPES]
     # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
-    goal_vertices = [torch.tensor(g.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0]) for g in goals]
+    goal_vertices = [
+        torch.tensor(g.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0])
+        for g in goals
+    ]
     goal_faces = [torch.tensor(g.faces) for g in goals]
     # One pose per image: all views of the first mesh, then all views of the second.
     azimuths = [360 / VIEWS * k for k in range(VIEWS)] * len(goals)
-    camera = nmr.LookAt.from_angles(2.732, [0.0, 35.0] * (len(azimuths) // 2), azimuths, half_fov_deg=12.0)
+    camera = nmr.LookAt.from_angles(
+        2.732, [0.0, 35.0] * (len(azimuths) // 2), azimuths, half_fov_deg=12.0
+    )
 
     def silhouettes(vertices: list[Tensor], faces: list[Tensor]) -> Tensor:
-        vertices, faces = ([x for x in meshes for _ in range(VIEWS)] for meshes in (vertices, faces))
+        vertices, faces = (
+            [x for x in meshes for _ in range(VIEWS)] for meshes in (vertices, faces)
+        )
         return nmr.render_silhouette(vertices, faces, camera, image_size=image_size)
 
     targets = silhouettes(goal_vertices, goal_faces)

@@ -17,16 +17,22 @@ from learn3d.studio.shapes import make_shape
 LIGHTS = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, -0.4], [-0.7, -0.1, -0.6]])
 
 
-def draw(vertices: Tensor, faces: Tensor, azimuths_deg: list[float], color: list[float], size: int = 192) -> Tensor:
+def draw(
+    vertices: Tensor, faces: Tensor, azimuths_deg: list[float], color: list[float], size: int = 192
+) -> Tensor:
     """Pictures of the mesh from several sides, next to each other: uint8 [height, width, 3]."""
     camera = nmr.LookAt.from_angles(2.732, 25.0, azimuths_deg, half_fov_deg=12.0)
     colors = nmr.FaceColors(torch.tensor(color).expand(len(faces), 3))
-    images = nmr.render_rgb(vertices, faces, camera, colors=colors, lights=LIGHTS, background=1.0, image_size=size)
+    images = nmr.render_rgb(
+        vertices, faces, camera, colors=colors, lights=LIGHTS, background=1.0, image_size=size
+    )
     images = images[:, size // 6 : -size // 6]  # airplanes are flat
     return (torch.cat(list(images), dim=1).clamp(0, 1) * 255).round().byte()
 
 
-def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, seed: int = 5) -> tuple[float, float]:
+def main(
+    output: Path = Path("output"), steps: int = 200, image_size: int = 96, seed: int = 5
+) -> tuple[float, float]:
     """Writes OUTPUT/fit_silhouette.gif (the progress) and fit_silhouette.png (the target; below it the result).
 
     Returns 1 - IoU of the silhouettes, before and after.
@@ -35,7 +41,9 @@ def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, 
     # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
     goal = torch.tensor(airplane.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0])
     goal_faces = torch.tensor(airplane.faces)
-    camera = nmr.LookAt.from_angles(2.732, [-30.0, 30.0] * 8, [22.5 * k for k in range(16)], half_fov_deg=12.0)
+    camera = nmr.LookAt.from_angles(
+        2.732, [-30.0, 30.0] * 8, [22.5 * k for k in range(16)], half_fov_deg=12.0
+    )
     target = nmr.render_silhouette(goal, goal_faces, camera, image_size=image_size)
 
     sphere, faces = nmr.icosphere(3)
@@ -63,11 +71,16 @@ def main(output: Path = Path("output"), steps: int = 200, image_size: int = 96, 
         optimizer.step()
 
     sides = [-135.0, -45.0, 30.0, 100.0]
-    comparison = torch.cat([draw(goal, goal_faces, sides, gray), draw(vertices.detach(), faces, sides, blue)])
+    comparison = torch.cat(
+        [draw(goal, goal_faces, sides, gray), draw(vertices.detach(), faces, sides, blue)]
+    )
     output.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(output / "fit_silhouette.png", comparison.numpy())
     imageio.imwrite(
-        output / "fit_silhouette.gif", torch.stack(frames).numpy(), duration=[80] * (len(frames) - 1) + [1500], loop=0
+        output / "fit_silhouette.gif",
+        torch.stack(frames).numpy(),
+        duration=[80] * (len(frames) - 1) + [1500],
+        loop=0,
     )
     return losses[0].item(), losses[-1].item()
 

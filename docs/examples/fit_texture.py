@@ -21,9 +21,13 @@ def vase(rows: int = 32, columns: int = 48) -> tuple[Tensor, Tensor, Tensor]:
     v, u = torch.meshgrid(torch.linspace(0, 1, rows), torch.linspace(0, 1, columns), indexing="ij")
     radius, angle = 0.30 + 0.16 * (2.2 * math.pi * v - 0.6).sin() - 0.05 * v, 2 * math.pi * u
     # Seen from outside, u runs to the right: x is right, y up and z away from a viewer at azimuth 0.
-    vertices = torch.stack([radius * angle.sin(), 1.3 * (v - 0.5), -radius * angle.cos()], dim=-1).view(-1, 3)
+    vertices = torch.stack(
+        [radius * angle.sin(), 1.3 * (v - 0.5), -radius * angle.cos()], dim=-1
+    ).view(-1, 3)
     a = (torch.arange(rows - 1)[:, None] * columns + torch.arange(columns - 1)).view(-1, 1)
-    faces = torch.cat([a + torch.tensor([0, columns, columns + 1]), a + torch.tensor([0, columns + 1, 1])])
+    faces = torch.cat(
+        [a + torch.tensor([0, columns, columns + 1]), a + torch.tensor([0, columns + 1, 1])]
+    )
     return vertices, faces, torch.stack([u, v], dim=-1).view(-1, 2)
 
 
@@ -35,11 +39,15 @@ def painting(height: int, width: int) -> Tensor:
         draw.rectangle([0, row * height // 16, width, (row + 1) * height // 16 - 1], fill=color)
     font = ImageFont.load_default(height // 5)
     for k, word in enumerate(("NEURAL", "MESH", "RENDER")):
-        draw.text(((k + 0.5) * width / 3, height * 0.5), word, fill="#1f4e5f", font=font, anchor="mm")
+        draw.text(
+            ((k + 0.5) * width / 3, height * 0.5), word, fill="#1f4e5f", font=font, anchor="mm"
+        )
     return torch.from_numpy(np.array(image)).float() / 255
 
 
-def main(output: Path = Path("output"), steps: int = 60, views: int = 12, size: int = 128) -> tuple[float, float]:
+def main(
+    output: Path = Path("output"), steps: int = 60, views: int = 12, size: int = 128
+) -> tuple[float, float]:
     """Writes OUTPUT/fit_texture.png: unused views of the vase, of the result, and both textures.
 
     Returns the mean error of the colours in these views, before and after.
@@ -50,9 +58,14 @@ def main(output: Path = Path("output"), steps: int = 60, views: int = 12, size: 
     def photograph(texture: Tensor, elevation_deg: list[float], azimuth_deg: list[float]) -> Tensor:
         camera = nmr.LookAt.from_angles(3.0, elevation_deg, azimuth_deg, half_fov_deg=14.2)
         colors = nmr.UVTexture(texture, uv, wrap="clamp")
-        return nmr.render_rgb(vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=size)
+        return nmr.render_rgb(
+            vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=size
+        )
 
-    azimuths, elevations = [360 / views * k for k in range(views)], [(5.0, 40.0)[k % 2] for k in range(views)]
+    azimuths, elevations = (
+        [360 / views * k for k in range(views)],
+        [(5.0, 40.0)[k % 2] for k in range(views)],
+    )
     truth = painting(3 * size // 4, 2 * size)
     pictures = photograph(truth, elevations, azimuths)
     unseen = [20.0] * 4, [60.0, 150.0, 240.0, 330.0]
@@ -71,7 +84,9 @@ def main(output: Path = Path("output"), steps: int = 60, views: int = 12, size: 
 
     output.mkdir(parents=True, exist_ok=True)
     rows = [torch.cat(list(row), dim=1) for row in (wanted, found, (truth, texture.detach()))]
-    imageio.imwrite(output / "fit_texture.png", (torch.cat(rows).clamp(0, 1) * 255).round().byte().numpy())
+    imageio.imwrite(
+        output / "fit_texture.png", (torch.cat(rows).clamp(0, 1) * 255).round().byte().numpy()
+    )
     return before, (found - wanted).abs().mean().item()
 
 

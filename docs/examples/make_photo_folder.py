@@ -17,10 +17,14 @@ from learn3d.studio.shapes import make_shape
 
 WIDTH, HEIGHT = 320, 240
 FOV_DEG = 40.0  # across the width
-FROM_MESH = mesh_to_object(front="z").T  # from mesh files (right-handed, front towards +z) to the object frame
+FROM_MESH = mesh_to_object(
+    front="z"
+).T  # from mesh files (right-handed, front towards +z) to the object frame
 
 
-def take_photo(vertices: np.ndarray, faces: np.ndarray, color: np.ndarray, camera: nmr.LookAt, wall: np.ndarray):
+def take_photo(
+    vertices: np.ndarray, faces: np.ndarray, color: np.ndarray, camera: nmr.LookAt, wall: np.ndarray
+):
     """A picture uint8 [240, 320, 3] of the object in front of a shaded wall, and its mask [240, 320]."""
     rgb, alpha = photograph(vertices, faces, color, camera, image_size=WIDTH)
     rows = slice((WIDTH - HEIGHT) // 2, (WIDTH + HEIGHT) // 2)
@@ -54,8 +58,12 @@ def main(
             for photo in range(photos):
                 azimuth, elevation = rng.uniform(-180, 180), rng.uniform(*elevation_deg)
                 distance = rng.uniform(2.8, 3.3)
-                camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=FOV_DEG / 2)
-                picture, mask = take_photo(vertices, mesh.faces, color, camera, rng.uniform(80, 230, 3))
+                camera = nmr.LookAt.from_angles(
+                    [distance], [elevation], [azimuth], half_fov_deg=FOV_DEG / 2
+                )
+                picture, mask = take_photo(
+                    vertices, mesh.faces, color, camera, rng.uniform(80, 230, 3)
+                )
                 name = f"{category}{number:03}_{photo}"
                 Image.fromarray(picture).save(folder / "images" / f"{name}.jpg", quality=92)
                 Image.fromarray(mask).save(folder / "masks" / f"{name}.png")

@@ -13,9 +13,17 @@ from learn3d.terminal import closed_pipe_ends, note, say, unknown_name, without_
 
 #: For each command: its module below learn3d and its class, the extra that installs its packages, and a description.
 COMMANDS = {
-    "train": ("commands.train:Train", "train", "train a model that turns one image into a 3D shape"),
+    "train": (
+        "commands.train:Train",
+        "train",
+        "train a model that turns one image into a 3D shape",
+    ),
     "evaluate": ("commands.train:Evaluate", "train", "measure trained models on a test set"),
-    "reconstruct": ("studio.commands:Reconstruct", "train", "turn images into meshes with a trained model"),
+    "reconstruct": (
+        "studio.commands:Reconstruct",
+        "train",
+        "turn images into meshes with a trained model",
+    ),
     "export": ("studio.commands:Export", "train", "write a trained model into one small file"),
     "demo": ("studio.commands:Demo", "demo", "open a page that turns pictures into meshes"),
     "make-dataset": ("studio.commands:MakeDataset", "train", "render a data set from meshes"),
@@ -24,12 +32,36 @@ COMMANDS = {
         "train",
         "convert a data set larger than memory into shards",
     ),
-    "check-dataset": ("commands.data:CheckDataset", "train", "list everything that is wrong with a data set"),
-    "estimate-poses": ("studio.commands:EstimatePoses", "train", "find the poses of images from their masks"),
-    "experiment": ("studio.commands:Experiment", "train", "make a table of the paper: train, measure, report"),
-    "figures": ("studio.commands:Figures", "figures", "draw the paper's figures from trained models"),
-    "report": ("studio.commands:Report", "report", "write a page about trained models, with shapes to turn"),
-    "fetch-debian-models": ("studio.commands:FetchDebianModels", "train", "get meshes out of Debian packages"),
+    "check-dataset": (
+        "commands.data:CheckDataset",
+        "train",
+        "list everything that is wrong with a data set",
+    ),
+    "estimate-poses": (
+        "studio.commands:EstimatePoses",
+        "train",
+        "find the poses of images from their masks",
+    ),
+    "experiment": (
+        "studio.commands:Experiment",
+        "train",
+        "make a table of the paper: train, measure, report",
+    ),
+    "figures": (
+        "studio.commands:Figures",
+        "figures",
+        "draw the paper's figures from trained models",
+    ),
+    "report": (
+        "studio.commands:Report",
+        "report",
+        "write a page about trained models, with shapes to turn",
+    ),
+    "fetch-debian-models": (
+        "studio.commands:FetchDebianModels",
+        "train",
+        "get meshes out of Debian packages",
+    ),
 }
 HELP = """usage: learn3d COMMAND [OPTIONS]
 
@@ -47,7 +79,13 @@ def main(*given: str) -> int:
     """Run the command line, with the words `given` before it; returns the exit status."""
     name, *arguments = [*given, *sys.argv[1:]] or ["--help"]
     if name in ("-h", "--help"):
-        say(HELP.format(commands="\n".join(f"  {command:19}  {text}" for command, (*_, text) in COMMANDS.items())))
+        say(
+            HELP.format(
+                commands="\n".join(
+                    f"  {command:19}  {text}" for command, (*_, text) in COMMANDS.items()
+                )
+            )
+        )
     elif name == "--version":
         say(metadata.version("nmr-learn3d"))
     elif name == "--completion":
@@ -92,4 +130,9 @@ def print_completion(shell: str = "bash") -> None:
             kinds.append(Annotated[kind, tyro.conf.subcommand(name, **given)])
     words = ["--tyro-print-completion", shell]
     with contextlib.suppress(SystemExit):
-        tyro.cli(Union[tuple(kinds)], prog="learn3d", args=words, config=(tyro.conf.OmitArgPrefixes,))  # noqa: UP007
+        tyro.cli(
+            Union[tuple(kinds)],  # noqa: UP007 (`|` takes no tuple)
+            prog="learn3d",
+            args=words,
+            config=(tyro.conf.OmitArgPrefixes,),
+        )

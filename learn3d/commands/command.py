@@ -14,7 +14,9 @@ from typing_extensions import Self, dataclass_transform  # in typing from Python
 
 Split: TypeAlias = Literal["train", "val", "test"]
 Which: TypeAlias = Annotated[Literal["last", "best"], tyro.conf.arg(name="checkpoint")]
-Runs = tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")]]
+Runs = tyro.conf.Positional[
+    Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")]
+]
 DataFolder = tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
 
 #: Options of nested dataclasses have no prefixes.
@@ -44,11 +46,17 @@ class Command:
         about = cls.about() if {"-h", "--help"} & set(arguments) else ""
         default = cls.default(arguments)
         given = {} if default is None else {"default": default}
-        return tyro.cli(cls, args=arguments, prog=f"learn3d {name}", description=about, config=FLAT, **given)
+        return tyro.cli(
+            cls, args=arguments, prog=f"learn3d {name}", description=about, config=FLAT, **given
+        )
 
     def given(self, *names: str) -> dict[str, Any]:
         """Those of the options that differ from their defaults, by name."""
-        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(type(self), name)}
+        return {
+            name: getattr(self, name)
+            for name in names
+            if getattr(self, name) != getattr(type(self), name)
+        }
 
     def refuse(self, kind: str, *names: str) -> None:
         """Raise ValueError if options are given that do not go with others (`kind`)."""
@@ -72,4 +80,6 @@ class OnDataset(Command):
 
     def pick(self, *names: str) -> dict[str, Any]:
         """The options above by name, and others."""
-        return {name: getattr(self, name) for name in ("data", "category", "split", "which", *names)}
+        return {
+            name: getattr(self, name) for name in ("data", "category", "split", "which", *names)
+        }

@@ -40,13 +40,27 @@ class CheckDataset(Command):
         splits = check_folder(self.layout, self.folder, split_names(self.category), self.split)
         for problem in (problem for split in splits for problem in split.problems):
             say(f"{problem.severity}: {problem.path}: {problem.message}")
-        rows = [(s.category, s.split, s.objects, s.count("error"), s.count("warning")) for s in splits]
+        rows = [
+            (s.category, s.split, s.objects, s.count("error"), s.count("warning")) for s in splits
+        ]
         errors, warnings = (sum(row[column] for row in rows) for column in (3, 4))
-        table = align([("category", "split", "objects", "errors", "warnings"), *(tuple(map(str, row)) for row in rows)])
+        table = align(
+            [
+                ("category", "split", "objects", "errors", "warnings"),
+                *(tuple(map(str, row)) for row in rows),
+            ]
+        )
         say(f"\n{table}\n\n{errors} errors, {warnings} warnings")
         if self.json is not None:
-            report = {"errors": errors, "warnings": warnings, "layout": self.layout, "folder": str(self.folder)}
-            write_json(self.json, report | {"splits": [dataclasses.asdict(split) for split in splits]})
+            report = {
+                "errors": errors,
+                "warnings": warnings,
+                "layout": self.layout,
+                "folder": str(self.folder),
+            }
+            write_json(
+                self.json, report | {"splits": [dataclasses.asdict(split) for split in splits]}
+            )
         return 1 if errors else 0
 
 
@@ -92,16 +106,26 @@ class ConvertDataset(Command):
                     continue
                 few = self.views_per_object if split == "train" else None
                 arguments = (self.layout, self.data, category, split, folder, self.image_size, few)
-                tasks[folder] = Task(f"{category} {split}", convert_split, arguments, folder.with_suffix(".log"))
+                tasks[folder] = Task(
+                    f"{category} {split}", convert_split, arguments, folder.with_suffix(".log")
+                )
         failed = run_tasks(list(tasks.values()), self.workers)
         if missing := [folder for folder in tasks if not (folder / shards.SET_FILE).is_file()]:
-            note(f"{len(missing)} of {len(tasks)} splits are missing; the same command converts them")
+            note(
+                f"{len(missing)} of {len(tasks)} splits are missing; the same command converts them"
+            )
             return 1 if failed else INTERRUPTED
         return 0
 
 
 def convert_split(
-    layout: Layout, data: Path, category: str, split: str, folder: Path, image_size: int, views_per_object: int | None
+    layout: Layout,
+    data: Path,
+    category: str,
+    split: str,
+    folder: Path,
+    image_size: int,
+    views_per_object: int | None,
 ) -> bool:
     """Write a split of a data set as shards into `folder`, and print a line about them."""
     options = {"image_size": image_size, "views_per_object": views_per_object}

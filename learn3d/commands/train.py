@@ -35,7 +35,10 @@ class Train(Command):
 
     @classmethod
     def about(cls) -> str:
-        lines = ["Methods (--preset NAME):", *(f"  {name:10}  {summary}" for name, (_, summary) in SHORT_NAMES.items())]
+        lines = [
+            "Methods (--preset NAME):",
+            *(f"  {name:10}  {summary}" for name, (_, summary) in SHORT_NAMES.items()),
+        ]
         lines += ["", "Presets (--preset NAME --help shows the settings of one):"]
         lines += [f"  {name:23}  {preset.label}" for name, preset in PRESETS.items()]
         return "\n".join([super().about(), "", *lines])
@@ -58,19 +61,25 @@ class Train(Command):
             raise ValueError("--resume needs --output: the folder of the run that is to go on")
         saved = load_config(given.output / "config.json")
         if given.preset and preset != saved.preset:
-            raise ValueError(f"{given.output} was started with the preset {saved.preset}, got {preset}")
+            raise ValueError(
+                f"{given.output} was started with the preset {saved.preset}, got {preset}"
+            )
         return cls(config=saved)
 
     @classmethod
     def parse(cls, name: str, arguments: Sequence[str]) -> "Train":
         command = super().parse(name, arguments)
         preset = full_name(command.config.preset)  # it may be the short name of a method
-        return dataclasses.replace(command, config=dataclasses.replace(command.config, preset=preset))
+        return dataclasses.replace(
+            command, config=dataclasses.replace(command.config, preset=preset)
+        )
 
     def run(self) -> int:
         """Train and print a summary. The exit status is 130 if a signal stopped the training."""
         if self.resume and self.overwrite:
-            raise ValueError("--resume continues a run and --overwrite replaces it; give one of them")
+            raise ValueError(
+                "--resume continues a run and --overwrite replaces it; give one of them"
+            )
         with join_ranks(self.config.device):
             summary = train(self.config, resume=self.resume, overwrite=self.overwrite)
             if rank() == 0:
@@ -108,4 +117,6 @@ class Evaluate(OnDataset):
         if self.json is not None:
             protocol = {"split": self.split, "checkpoint": self.which}
             values = [result.model_dump() for result in results]
-            write_json(self.json, {"protocol": protocol, "results": values, "means": class_means(results)})
+            write_json(
+                self.json, {"protocol": protocol, "results": values, "means": class_means(results)}
+            )

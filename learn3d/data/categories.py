@@ -27,8 +27,15 @@ def synset_of(category: str) -> str:
     Raises ValueError for an empty name or one that cannot be part of a file name.
     """
     forbidden = set('/\\:*?"<>|\0')
-    if not category or not category.isprintable() or set(category) & forbidden or category.startswith("."):
-        raise ValueError(f"category must be a plain name such as 'chair' or a synset id, got {category!r}")
+    if (
+        not category
+        or not category.isprintable()
+        or set(category) & forbidden
+        or category.startswith(".")
+    ):
+        raise ValueError(
+            f"category must be a plain name such as 'chair' or a synset id, got {category!r}"
+        )
     return SYNSETS.get(_OTHER_NAMES.get(category, category), category)
 
 
@@ -41,4 +48,6 @@ def find_splits(folder: Path | str, *patterns: str) -> dict[str, tuple[str, ...]
             for path in Path(folder).glob(f"{before}*{after}"):
                 name = path.relative_to(folder).as_posix().removeprefix(before).removesuffix(after)
                 found.setdefault(name, set()).add(split)
-    return {name: tuple(split for split in SPLITS if split in found[name]) for name in sorted(found)}
+    return {
+        name: tuple(split for split in SPLITS if split in found[name]) for name in sorted(found)
+    }

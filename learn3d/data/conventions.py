@@ -35,7 +35,9 @@ class VoxelConvention:
     name: str
     swap: tuple[int, int]  # dimensions of [B, x, y, z] to exchange
     flip: tuple[int, ...]  # dimensions to reverse after that
-    cube_side: float = 1.0  # side of the cube of the grid, centred at the origin of the object frame
+    cube_side: float = (
+        1.0  # side of the cube of the grid, centred at the origin of the object frame
+    )
     kato18_scale: float = 1.0  # scale of meshes before the kato18 voxelizer, whose rays are on the grid's corner lines
 
     def to_axes(self, grid: Tensor) -> Tensor:
@@ -46,14 +48,18 @@ class VoxelConvention:
         """The inverse of `to_axes`: convert stored voxels [B, s, s, s] to the axes (x, y, z) of the object frame."""
         return grid.flip(self.flip).transpose(*self.swap)
 
-    def voxelize(self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18") -> Tensor:
+    def voxelize(
+        self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18"
+    ) -> Tensor:
         """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the stored voxels.
 
         vertices: float [B, V, 3] or [V, 3]. faces: integer [F, 3] or [B, F, 3]. definition: "kato18" for the voxelizer
         of Kato et al. 2018 and of the paper, "kato19" for the conservative one of Kato and Harada 2019 (VPL), which
         fills every cell that a face touches. Their IoUs must not be compared with each other.
         """
-        grid = nmr.voxelize(self._to_unit(vertices, definition), faces, size=VOXEL_SIZE, definition=definition)
+        grid = nmr.voxelize(
+            self._to_unit(vertices, definition), faces, size=VOXEL_SIZE, definition=definition
+        )
         return self.to_axes(grid)
 
     def exceeds_grid(self, vertices: Tensor, definition: Definition = "kato18") -> Tensor:
@@ -62,7 +68,10 @@ class VoxelConvention:
 
     def _to_unit(self, vertices: Tensor, definition: Definition) -> Tensor:
         """Object frame to the unit cube that the grid spans."""
-        return vertices * ((self.kato18_scale if definition == "kato18" else 1.0) / self.cube_side) + 0.5
+        return (
+            vertices * ((self.kato18_scale if definition == "kato18" else 1.0) / self.cube_side)
+            + 0.5
+        )
 
 
 #: Side of the cube of the grid's corner lines: `VoxelConvention.kato18_scale` of most data sets.
@@ -78,14 +87,23 @@ class LayoutProperties:
     voxels: bool  # True if there is ground truth for the voxel IoU
     inverted: bool  # True if colours are stored as 255 - colour, see `ViewDataset.inverted`
     convention: VoxelConvention = KATO  # axes of the voxels
-    validation: bool = True  # True if there is a split "val"; otherwise networks are validated on "test"
+    validation: bool = (
+        True  # True if there is a split "val"; otherwise networks are validated on "test"
+    )
     angles: bool = True  # True if poses have azimuth and elevation, as cells of view classes need
-    stretched: bool = False  # True if images are boxes of photographs with background, stretched to squares
+    stretched: bool = (
+        False  # True if images are boxes of photographs with background, stretched to squares
+    )
     options: tuple[str, ...] = ()  # those of image_size and views_per_object that the reader takes
 
     def about(self, category: str, split: str) -> dict[str, Any]:
         """The fields of a `ViewDataset` that all data sets of the layout share, and its category and split."""
-        return {"category": category, "split": split, "convention": self.convention, "inverted": self.inverted}
+        return {
+            "category": category,
+            "split": split,
+            "convention": self.convention,
+            "inverted": self.inverted,
+        }
 
 
 #: The .mat volumes of Kar, as the paper's code reads them: axes (-z, y, x) of the object frame.
@@ -124,7 +142,11 @@ def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
     -1. The default, (x, y, z) -> (-z, y, -x), is that of Kato's renderings of ShapeNet. Raises ValueError for other or
     parallel axes.
     """
-    axes = {s + a: np.float64(-1 if s else 1) * row for s in ("", "-") for a, row in zip("xyz", np.eye(3), strict=True)}
+    axes = {
+        s + a: np.float64(-1 if s else 1) * row
+        for s in ("", "-")
+        for a, row in zip("xyz", np.eye(3), strict=True)
+    }
     if up not in axes or front not in axes or up[-1] == front[-1]:
         wanted = f"two different axes, each one of {sorted(axes)}"
         raise ValueError(f"up and front must be {wanted}; got up={up!r}, front={front!r}")

@@ -34,9 +34,15 @@ class DatasetInfo:
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K view classes
     inverted: bool  # colours are stored as 255 - colour
     num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # number of categories
-    pose_features: Annotated[int, Field(ge=0, le=64)] = 3  # length of `features` of a pose; 0 if poses are unknown
-    mirror_plane_deg: float | None = None  # result of `data.mirror_plane`; None if none was found or looked for
-    cube_side: float | None = None  # side of the cube, centred at the origin, that holds all objects; None if unknown
+    pose_features: Annotated[int, Field(ge=0, le=64)] = (
+        3  # length of `features` of a pose; 0 if poses are unknown
+    )
+    mirror_plane_deg: float | None = (
+        None  # result of `data.mirror_plane`; None if none was found or looked for
+    )
+    cube_side: float | None = (
+        None  # side of the cube, centred at the origin, that holds all objects; None if unknown
+    )
     solidity: float | None = None  # result of `ViewDataset.solidity`; None if not computed
 
 
@@ -50,9 +56,13 @@ class Batch:
     view_ids: Tensor  # int64 [B] in 0 .. K-1: view classes
     object_ids: Tensor  # int64 [B]: the object in each view, by its number in the split
     class_ids: Tensor  # int64 [B]: the category of each object; 0 if there is only one
-    voxels: Tensor | None  # bool [B, 32, 32, 32]: ground truth in the data set's axes; None if unknown
+    voxels: (
+        Tensor | None
+    )  # bool [B, 32, 32, 32]: ground truth in the data set's axes; None if unknown
     crops: Crops | None = None  # original images for the augmentation "crop"; None if unknown
-    depth: Tensor | None = None  # float32 [B, 64, 64]: along the optical axis, 0: no surface; None if unknown
+    depth: Tensor | None = (
+        None  # float32 [B, 64, 64]: along the optical axis, 0: no surface; None if unknown
+    )
 
     def __len__(self) -> int:
         return len(self.images)
@@ -79,36 +89,54 @@ class ViewDataset:
     view_names: tuple[str, ...]  # K names of the view classes
     object_ids: np.ndarray  # int64 (int32 if on disk) [M] in 0 .. N-1: the object in each view
     object_names: tuple[str, ...]  # N names from the files
-    voxels: Array | None  # bool [N, 32, 32, 32] ground truth in the data set's own axes; None if unknown
+    voxels: (
+        Array | None
+    )  # bool [N, 32, 32, 32] ground truth in the data set's own axes; None if unknown
     convention: VoxelConvention  # axes of the voxels
     inverted: bool  # True if colours are stored as 255 - colour, so that a white background is 0 (Kato's form)
-    masks: Array | None = None  # uint8 [M, 64, 64] ground truth silhouettes; None: the images' fourth channel
+    masks: Array | None = (
+        None  # uint8 [M, 64, 64] ground truth silhouettes; None: the images' fourth channel
+    )
     depth: Array | None = None  # uint8 [M, 64, 64], see `depth_levels`; None if unknown
-    class_ids: np.ndarray | None = None  # int64 [N]: category of each object; None for a single category
+    class_ids: np.ndarray | None = (
+        None  # int64 [N]: category of each object; None for a single category
+    )
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
-    points: Array | None = None  # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
+    points: Array | None = (
+        None  # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
+    )
     crops: Crops | None = None  # M original images for the augmentation "crop"; None if unknown
     stored_sizes: np.ndarray | None = None  # float32 [M]: `object_sizes`; None if not computed
-    candidates: PoseCandidates | None = None  # M sets of poses for training to draw from; None: `poses` alone
+    candidates: PoseCandidates | None = (
+        None  # M sets of poses for training to draw from; None: `poses` alone
+    )
 
     def __post_init__(self) -> None:
         m, n, side = len(self.images), self.num_objects, self.images.shape[-1]
         if self.images.shape != (m, 4, side, side) or self.images.dtype != np.uint8:
-            raise ValueError(f"images must be uint8 [M, 4, S, S], got {self.images.dtype} {list(self.images.shape)}")
+            raise ValueError(
+                f"images must be uint8 [M, 4, S, S], got {self.images.dtype} {list(self.images.shape)}"
+            )
         if self.masks is None and side != MASK_SIZE:
             raise ValueError(f"images of {side} pixels need masks of {MASK_SIZE}, got None")
         wanted = dict.fromkeys(("masks", "depth"), (m, MASK_SIZE, MASK_SIZE))
-        wanted |= dict.fromkeys(("poses", "view_ids", "object_ids", "crops", "stored_sizes", "candidates"), (m,))
+        wanted |= dict.fromkeys(
+            ("poses", "view_ids", "object_ids", "crops", "stored_sizes", "candidates"), (m,)
+        )
         wanted |= {"voxels": (n, *[VOXEL_SIZE] * 3), "points": (n,), "class_ids": (n,)}
         for name, shape in wanted.items():
             if (part := getattr(self, name)) is not None:
                 found = getattr(part, "shape", (len(part),))
                 if found[: len(shape)] != shape:
-                    raise ValueError(f"{name} of {m} images of {n} objects must be {list(shape)}, got {list(found)}")
+                    raise ValueError(
+                        f"{name} of {m} images of {n} objects must be {list(shape)}, got {list(found)}"
+                    )
         for name, end in (("view_ids", self.num_views), ("object_ids", n)):
             values = getattr(self, name)
             if m and not (values.min() >= 0 and values.max() < end):
-                raise ValueError(f"{name} must lie in 0 .. {end - 1}, got {values.min()} .. {values.max()}")
+                raise ValueError(
+                    f"{name} must lie in 0 .. {end - 1}, got {values.min()} .. {values.max()}"
+                )
 
     def __len__(self) -> int:
         return len(self.images)
@@ -133,7 +161,9 @@ class ViewDataset:
         """S: side of the images in pixels."""
         return self.images.shape[2]
 
-    def info(self, mirror_plane_deg: float | None = None, solidity: float | None = None) -> DatasetInfo:
+    def info(
+        self, mirror_plane_deg: float | None = None, solidity: float | None = None
+    ) -> DatasetInfo:
         """The properties that methods need; None for an unknown mirror plane or solidity."""
         features = 0 if self.poses is None else self.poses.num_features
         cube_side = None if self.voxels is None else self.convention.cube_side
@@ -149,11 +179,15 @@ class ViewDataset:
         samples = indices.numpy()
         if len(samples) and not 0 <= samples.min() <= samples.max() < len(self):
             given = f"{samples.min()} .. {samples.max()}"
-            raise ValueError(f"indices must lie in 0 .. {len(self) - 1}, got {given}")  # --indices of commands
+            raise ValueError(
+                f"indices must lie in 0 .. {len(self) - 1}, got {given}"
+            )  # --indices of commands
         images = self.images[samples]
         masks = images[:, 3] if self.masks is None else self.masks[samples]
         poses = None if self.poses is None else self.poses[indices]
-        view_ids, objects = (array[samples].astype(np.int64) for array in (self.view_ids, self.object_ids))
+        view_ids, objects = (
+            array[samples].astype(np.int64) for array in (self.view_ids, self.object_ids)
+        )
         classes = np.zeros_like(objects) if self.class_ids is None else self.class_ids[objects]
         return Batch(
             images=torch.from_numpy(images),
@@ -162,17 +196,33 @@ class ViewDataset:
             view_ids=torch.from_numpy(view_ids),
             object_ids=torch.from_numpy(objects),
             class_ids=torch.from_numpy(classes),
-            voxels=torch.from_numpy(self.voxels[objects]) if voxels and self.voxels is not None else None,
+            voxels=torch.from_numpy(self.voxels[objects])
+            if voxels and self.voxels is not None
+            else None,
             crops=None if self.crops is None else self.crops[samples],
-            depth=None if self.depth is None else depth_of_levels(torch.from_numpy(self.depth[samples]), poses),
+            depth=None
+            if self.depth is None
+            else depth_of_levels(torch.from_numpy(self.depth[samples]), poses),
         )
 
     def digest(self, *, voxels: bool = True) -> int:
         """CRC-32 of images, masks, poses and classes, and of voxels if wanted. Arrays on disk count by checksums."""
         poses = () if self.poses is None else vars(self.poses).values()
-        parts = [self.images, self.masks, self.depth, *poses, self.view_ids, self.object_ids, self.class_ids]
+        parts = [
+            self.images,
+            self.masks,
+            self.depth,
+            *poses,
+            self.view_ids,
+            self.object_ids,
+            self.class_ids,
+        ]
         if self.candidates is not None:
-            parts += [self.candidates.weights, self.candidates.poses.azimuth_deg, self.candidates.view_ids]
+            parts += [
+                self.candidates.weights,
+                self.candidates.poses.azimuth_deg,
+                self.candidates.view_ids,
+            ]
         crc = 0
         for part in parts + [self.voxels] * voxels:
             if part is not None:
@@ -196,8 +246,14 @@ class ViewDataset:
         """Mean ratio of a mask's area to that of its convex hull, for at most 256 images; 0 if all masks are empty."""
         from skimage.morphology import convex_hull_image  # takes half a second to import
 
-        masks = self.read_masks(np.linspace(0, len(self) - 1, min(len(self), 256)).astype(int)) > 127
-        return float(np.mean([mask.sum() / convex_hull_image(mask).sum() for mask in masks if mask.any()] or 0.0))
+        masks = (
+            self.read_masks(np.linspace(0, len(self) - 1, min(len(self), 256)).astype(int)) > 127
+        )
+        return float(
+            np.mean(
+                [mask.sum() / convex_hull_image(mask).sum() for mask in masks if mask.any()] or 0.0
+            )
+        )
 
     def read_masks(self, samples: np.ndarray) -> np.ndarray:
         """The ground truth silhouettes of the samples `samples`, int64 [B]: uint8 [B, 64, 64]."""
@@ -212,17 +268,23 @@ class ViewDataset:
         for axis in (1, 2):
             seen = masks.any(axis=axis)
             before, after = seen.argmax(axis=1), seen[:, ::-1].argmax(axis=1)
-            sides.append(np.where(seen.any(axis=1), seen.shape[1] - before - after, 0) / seen.shape[1])
+            sides.append(
+                np.where(seen.any(axis=1), seen.shape[1] - before - after, 0) / seen.shape[1]
+            )
         return np.maximum(*sides)
 
     def with_bins(self, bins: AngleBins) -> ViewDataset:
         """The same views with cells of azimuth and elevation as view classes. Raises ValueError without such poses."""
         if not isinstance(self.poses, LookAtPoses):
             got = "no poses" if self.poses is None else "rotations"
-            raise ValueError(f"cells of azimuth and elevation need look-at cameras; this data set has {got}")
+            raise ValueError(
+                f"cells of azimuth and elevation need look-at cameras; this data set has {got}"
+            )
         candidates = self.candidates
         if candidates is not None:
-            candidates = dataclasses.replace(candidates, view_ids=bins.ids(candidates.poses).numpy())
+            candidates = dataclasses.replace(
+                candidates, view_ids=bins.ids(candidates.poses).numpy()
+            )
         parts = {"view_names": tuple(bins.names()), "candidates": candidates}
         return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), **parts)
 
@@ -232,10 +294,14 @@ class ViewDataset:
         Raises ValueError if no object has `count` views.
         """
         order = np.random.default_rng(0).permutation(len(self))
-        order = order[np.argsort(self.object_ids[order], kind="stable")]  # sorted by object, shuffled within it
+        order = order[
+            np.argsort(self.object_ids[order], kind="stable")
+        ]  # sorted by object, shuffled within it
         _, starts, sizes = np.unique(self.object_ids[order], return_index=True, return_counts=True)
         if not 1 <= count <= sizes.max(initial=0):
-            raise ValueError(f"views_per_object must lie in 1 .. {sizes.max(initial=0)}, got {count}")
+            raise ValueError(
+                f"views_per_object must lie in 1 .. {sizes.max(initial=0)}, got {count}"
+            )
         if sizes.max() == count:
             return self
         number = np.arange(len(self)) - np.repeat(starts, sizes)
@@ -243,13 +309,27 @@ class ViewDataset:
 
     def select(self, samples: np.ndarray) -> ViewDataset:
         """The samples `samples`, int64 [B], and all objects. Arrays on disk are not read."""
-        names = ("images", "masks", "depth", "view_ids", "object_ids", "stored_sizes", "crops", "poses")
+        names = (
+            "images",
+            "masks",
+            "depth",
+            "view_ids",
+            "object_ids",
+            "stored_sizes",
+            "crops",
+            "poses",
+        )
         parts = {name: part for name in names if (part := getattr(self, name)) is not None}
-        chosen = {n: p.select(samples) if isinstance(p, DiskArray) else p[samples] for n, p in parts.items()}
+        chosen = {
+            n: p.select(samples) if isinstance(p, DiskArray) else p[samples]
+            for n, p in parts.items()
+        }
         return dataclasses.replace(self, **chosen)
 
 
-DEPTH_REACH = 0.9  # the corners of a cube of side 1 are 0.87 from its centre, at which the cameras look
+DEPTH_REACH = (
+    0.9  # the corners of a cube of side 1 are 0.87 from its centre, at which the cameras look
+)
 
 
 def depth_levels(depth: Tensor, poses: LookAtPoses) -> Tensor:
@@ -282,17 +362,35 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     first = datasets[0]
     for other in datasets[1:]:
         if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
-            raise ValueError(f"{other.category} and {first.category} differ in view classes or image size")
+            raise ValueError(
+                f"{other.category} and {first.category} differ in view classes or image size"
+            )
     joined = {}
-    for name in ("images", "masks", "depth", "poses", "view_ids", "voxels", "points", "stored_sizes", "crops"):
+    for name in (
+        "images",
+        "masks",
+        "depth",
+        "poses",
+        "view_ids",
+        "voxels",
+        "points",
+        "stored_sizes",
+        "crops",
+    ):
         parts = [getattr(d, name) for d in datasets]
         if len({type(part) for part in parts}) > 1:
-            raise ValueError(f"{name} of different kinds cannot be joined: convert all categories to shards, or none")
-        joined[name] = None if parts[0] is None else getattr(parts[0], "join", np.concatenate)(parts)
+            raise ValueError(
+                f"{name} of different kinds cannot be joined: convert all categories to shards, or none"
+            )
+        joined[name] = (
+            None if parts[0] is None else getattr(parts[0], "join", np.concatenate)(parts)
+        )
     starts = np.cumsum([0] + [d.num_objects for d in datasets])[:-1].tolist()
     return dataclasses.replace(
         first,
         **joined,
-        object_ids=np.concatenate([d.object_ids + start for d, start in zip(datasets, starts, strict=True)]),
+        object_ids=np.concatenate(
+            [d.object_ids + start for d, start in zip(datasets, starts, strict=True)]
+        ),
         object_names=tuple(name for d in datasets for name in d.object_names),
     )

@@ -42,7 +42,9 @@ class DiskArray:
         rows = np.concatenate([part.rows for part in parts])
         starts = np.cumsum([0] + [len(part.files) for part in parts])[:-1]
         rows["file"] += np.repeat(starts, [len(part) for part in parts]).astype(np.int32)
-        return dataclasses.replace(parts[0], files=tuple(file for part in parts for file in part.files), rows=rows)
+        return dataclasses.replace(
+            parts[0], files=tuple(file for part in parts for file in part.files), rows=rows
+        )
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -62,9 +64,14 @@ class DiskArray:
 
     def __getitem__(self, samples: np.ndarray) -> np.ndarray:
         file_of, row_of, crc_of = (self.rows[samples][name] for name in ROW.names)
-        result, size = np.empty((len(row_of), *self.row_shape), self.dtype), math.prod(self.row_shape)
+        result, size = (
+            np.empty((len(row_of), *self.row_shape), self.dtype),
+            math.prod(self.row_shape),
+        )
         content = result.reshape(len(row_of), size).view(np.uint8)
-        for number, samples_of_file in itertools.groupby(np.lexsort((row_of, file_of)), key=file_of.__getitem__):
+        for number, samples_of_file in itertools.groupby(
+            np.lexsort((row_of, file_of)), key=file_of.__getitem__
+        ):
             path, position = self.files[number]
             try:
                 with open_file(path, MAX_BYTES, WANTED) as file:
@@ -74,11 +81,15 @@ class DiskArray:
                             raise OSError("it ends early")
                         if zlib.crc32(content[k]) != crc_of[k]:
                             raise ValueError(CHANGED)
-                        if self.dtype == np.bool_ and content[k].max() > 1:  # such bools compute wrongly
+                        if (
+                            self.dtype == np.bool_ and content[k].max() > 1
+                        ):  # such bools compute wrongly
                             raise ValueError("its bools have values other than 0 and 1")
                         if self.dtype.kind == "f" and not np.isfinite(result[k]).all():
                             raise ValueError("it has numbers that are not finite")
             except (OSError, ValueError) as error:
                 text = error.message if isinstance(error, DamagedFile) else str(error)
-                raise DamagedFile(path, f"cannot be used any more ({text}); make or copy it again") from error
+                raise DamagedFile(
+                    path, f"cannot be used any more ({text}); make or copy it again"
+                ) from error
         return result

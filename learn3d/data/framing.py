@@ -22,7 +22,10 @@ from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
 MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
-SMALLEST, LARGEST = np.full(4, -1.0), np.ones(4)  # shifts of the smallest crop (the box) and of the largest
+SMALLEST, LARGEST = (
+    np.full(4, -1.0),
+    np.ones(4),
+)  # shifts of the smallest crop (the box) and of the largest
 
 
 def read_photo(
@@ -42,7 +45,9 @@ class Framed(NamedTuple):
 
     image: np.ndarray  # uint8 [4, size, size], in Kato's form
     mask: np.ndarray  # uint8 [64, 64]
-    object_size: float  # larger side of the mask's bounding box over the longer side of the photograph
+    object_size: (
+        float  # larger side of the mask's bounding box over the longer side of the photograph
+    )
     touches_border: bool  # True if the mask touches the border of the photograph
     left_out: str | None  # what its mask has beside the object, see `keep_object`
 
@@ -61,15 +66,24 @@ def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
     return Framed(*frame(colors, mask, size), object_size, touches_border, left_out)
 
 
-def _read(path: Path, mask_path: Path | None, optional: bool) -> tuple[np.ndarray, np.ndarray | None]:
+def _read(
+    path: Path, mask_path: Path | None, optional: bool
+) -> tuple[np.ndarray, np.ndarray | None]:
     image = _open(path)
     if image.mode.startswith(("I", "F")):  # Pillow would clamp values above 255
-        raise DamagedFile(path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8")
+        raise DamagedFile(
+            path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8"
+        )
     mask_image = image if mask_path is None else _open(mask_path)
     if mask_image.size != image.size:
         photo, other = (f"{i.width}x{i.height} pixels" for i in (image, mask_image))
-        raise DamagedFile(path, f"has {photo}, its mask {mask_path} {other}; is one of them rotated by 90 degrees?")
-    mask = np.asarray(mask_image.convert("RGBA"))[..., 3] if mask_image.has_transparency_data else None
+        raise DamagedFile(
+            path,
+            f"has {photo}, its mask {mask_path} {other}; is one of them rotated by 90 degrees?",
+        )
+    mask = (
+        np.asarray(mask_image.convert("RGBA"))[..., 3] if mask_image.has_transparency_data else None
+    )
     if mask is None or mask.min() == 255:  # nothing is transparent
         mask = None if mask_path is None else np.asarray(mask_image.convert("L"))
     if mask is None and not optional:
@@ -84,7 +98,10 @@ def frame(colors: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, 
     background is 0, and the mask. Each pixel is the mean over its area.
     """
     alpha = mask[..., None].astype(np.float32) / 255
-    return shrink(np.dstack([np.rint((255 - colors) * alpha), mask]).transpose(2, 0, 1).astype(np.float32), size)
+    return shrink(
+        np.dstack([np.rint((255 - colors) * alpha), mask]).transpose(2, 0, 1).astype(np.float32),
+        size,
+    )
 
 
 def _open(path: Path) -> Image.Image:
@@ -92,7 +109,9 @@ def _open(path: Path) -> Image.Image:
     image = open_image(path, PHOTOGRAPHS, limits.IMAGE_SIDE)
     try:
         return ImageOps.exif_transpose(image)
-    except Exception:  # Pillow raises various errors for damaged EXIF data; the image itself is sound
+    except (
+        Exception
+    ):  # Pillow raises various errors for damaged EXIF data; the image itself is sound
         return image
 
 
@@ -101,8 +120,12 @@ class Crops:
     """M images, reduced to the largest possible crops: the object's box plus 30 % a side (Kato and Harada 2019)."""
 
     pixels: Sequence[np.ndarray]  # M regions uint8 [h, w, 3]
-    regions: np.ndarray  # int64 [M, 4]: left, top, right, bottom in the image's pixels; right and bottom are excluded
-    boxes: np.ndarray  # float64 [M, 4]: left, top, width, height of the object's box in the image's pixels
+    regions: (
+        np.ndarray
+    )  # int64 [M, 4]: left, top, right, bottom in the image's pixels; right and bottom are excluded
+    boxes: (
+        np.ndarray
+    )  # float64 [M, 4]: left, top, width, height of the object's box in the image's pixels
     size: int  # side of the input images
 
     def __len__(self) -> int:
@@ -112,20 +135,31 @@ class Crops:
     def from_images(cls, images: Sequence[np.ndarray], boxes: np.ndarray, size: int) -> Crops:
         """Cut the regions from M images uint8 [H, W, 3]; boxes float [M, 4] overlap their images."""
         boxes = np.asarray(boxes, np.float64)
-        regions = [bounds(box, LARGEST, *image.shape[1::-1]) for image, box in zip(images, boxes, strict=True)]
+        regions = [
+            bounds(box, LARGEST, *image.shape[1::-1])
+            for image, box in zip(images, boxes, strict=True)
+        ]
         pairs = zip(images, regions, strict=True)
-        pixels = [image[top:bottom, left:right].copy() for image, (left, top, right, bottom) in pairs]
+        pixels = [
+            image[top:bottom, left:right].copy() for image, (left, top, right, bottom) in pairs
+        ]
         return cls(pixels, np.array(regions, np.int64), boxes, size)
 
     @classmethod
     def join(cls, parts: Sequence[Crops]) -> Crops:
         """Concatenate several sets of the same image size."""
-        regions, boxes = (np.concatenate([getattr(part, name) for part in parts]) for name in ("regions", "boxes"))
-        return cls([pixels for part in parts for pixels in part.pixels], regions, boxes, parts[0].size)
+        regions, boxes = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("regions", "boxes")
+        )
+        return cls(
+            [pixels for part in parts for pixels in part.pixels], regions, boxes, parts[0].size
+        )
 
     def __getitem__(self, samples: np.ndarray) -> Crops:
         """The samples `samples`, int64 [B]; the pixels are shared."""
-        return Crops([self.pixels[k] for k in samples], self.regions[samples], self.boxes[samples], self.size)
+        return Crops(
+            [self.pixels[k] for k in samples], self.regions[samples], self.boxes[samples], self.size
+        )
 
     def cut(self, shifts: np.ndarray | None = None) -> np.ndarray:
         """Input images uint8 [M, 3, size, size]: the box padded by 15 % a side, clipped to the image, and stretched.
@@ -135,7 +169,9 @@ class Crops:
         """
         shifts = np.zeros((len(self), 4)) if shifts is None else shifts
         images = np.empty((len(self), 3, self.size, self.size), np.uint8)
-        for k, (pixels, region, box) in enumerate(zip(self.pixels, self.regions, self.boxes, strict=True)):
+        for k, (pixels, region, box) in enumerate(
+            zip(self.pixels, self.regions, self.boxes, strict=True)
+        ):
             left, top, right, bottom = bounds(box, shifts[k], region[2], region[3])
             cut = pixels[top - region[1] : bottom - region[1], left - region[0] : right - region[0]]
             # the same as scipy.misc.imresize in the published code
@@ -144,7 +180,9 @@ class Crops:
         return images
 
 
-def bounds(box: np.ndarray, shift: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
+def bounds(
+    box: np.ndarray, shift: np.ndarray, width: int, height: int
+) -> tuple[int, int, int, int]:
     """Left, top, right, bottom of a crop in pixels of the image, rounded and clipped as in the published code."""
     left, top, w, h = box
     padding = PADDING + JITTER * shift  # [4]: left, top, right, bottom

@@ -31,17 +31,23 @@ def reader(layout: str) -> ModuleType:
     return importlib.import_module(f"learn3d.data.readers.{layout}")
 
 
-def check_options(layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None) -> None:
+def check_options(
+    layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None
+) -> None:
     """Raise ValueError for an unknown layout, or for an option of `load_dataset` that it does not support."""
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     if "image_size" not in LAYOUTS[layout].options and image_size != IMAGE_SIZE:
-        raise ValueError(f"images of the layout {layout!r} have 64x64 pixels, but {image_size} are wanted")
+        raise ValueError(
+            f"images of the layout {layout!r} have 64x64 pixels, but {image_size} are wanted"
+        )
     if view_bins is not None:
         AngleBins.parse(view_bins)
         if not LAYOUTS[layout].angles:
             needed = f"need look-at cameras, but the poses of the layout {layout!r} are rotations"
-            raise ValueError(f"view_bins {view_bins!r}: cells of azimuth and elevation {needed}; choose another preset")
+            raise ValueError(
+                f"view_bins {view_bins!r}: cells of azimuth and elevation {needed}; choose another preset"
+            )
 
 
 def require_folder(folder: Path | str) -> None:
@@ -81,10 +87,14 @@ def load_dataset(
     require_folder(folder)
     names = [name.strip() for name in category.split(",")]
     if len(set(names)) != len(names) or not all(names):
-        raise ValueError(f"category must be one name, or different names joined by commas, got {category!r}")
+        raise ValueError(
+            f"category must be one name, or different names joined by commas, got {category!r}"
+        )
     options = {"image_size": image_size, "views_per_object": views_per_object}
     try:
-        dataset = concatenate([_read_split(layout, folder, name, split, **options) for name in names])
+        dataset = concatenate(
+            [_read_split(layout, folder, name, split, **options) for name in names]
+        )
     except (DamagedFile, MissingFile) as error:
         _check_layout(folder, layout)
         check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
@@ -100,12 +110,19 @@ def load_dataset(
 
 
 def _read_split(
-    layout: str, folder: Path | str, category: str, split: str, findings: Findings = STRICT, **options: Any
+    layout: str,
+    folder: Path | str,
+    category: str,
+    split: str,
+    findings: Findings = STRICT,
+    **options: Any,
 ) -> ViewDataset | None:
     """Read a split of a category from its shards, or with the layout's reader and those of the options that it has."""
     if shards.holds(folder, category, split):
         size = options.get("image_size")
-        return shards.load(folder, category, split, layout=layout, image_size=size, findings=findings)
+        return shards.load(
+            folder, category, split, layout=layout, image_size=size, findings=findings
+        )
     known = {name: options[name] for name in LAYOUTS[layout].options if name in options}
     return reader(layout).load(folder, category, split, findings=findings, **known)
 
@@ -114,7 +131,9 @@ def _check_layout(folder: Path | str, asked: str) -> None:
     """Raise MissingFile if all data sets of a folder have other layouts."""
     found = []
     for layout in LAYOUTS:
-        with contextlib.suppress(ValueError, OSError):  # a list of objects is damaged, or of another layout
+        with contextlib.suppress(
+            ValueError, OSError
+        ):  # a list of objects is damaged, or of another layout
             found += [layout] * bool(reader(layout).contents(folder))
     if found and asked not in found:
         advice = f"add --layout {found[0]}, or choose another folder or preset"
@@ -147,12 +166,18 @@ def check_folder(
     check_options(layout)
     require_folder(folder)
     found = find_splits(folder, f"*/SPLIT/{shards.SET_FILE}")
-    with contextlib.suppress(*(ValueError, OSError) if found or categories else ()):  # the check finds this fault, too
+    with contextlib.suppress(
+        *(ValueError, OSError) if found or categories else ()
+    ):  # the check finds this fault, too
         for category, there in reader(layout).contents(folder).items():
-            found[category] = tuple(split for split in SPLITS if split in (*there, *found.get(category, ())))
+            found[category] = tuple(
+                split for split in SPLITS if split in (*there, *found.get(category, ()))
+            )
     if not found and not categories:
         _check_layout(folder, layout)
-        raise MissingFile(Path(folder), f"holds nothing of the layout {layout!r}; its files: docs/data-sets.md")
+        raise MissingFile(
+            Path(folder), f"holds nothing of the layout {layout!r}; its files: docs/data-sets.md"
+        )
     reports = []
     for category in categories or found:
         for split in splits or found.get(category) or found.get(synset_of(category)) or SPLITS:
@@ -160,7 +185,14 @@ def check_folder(
             try:
                 _read_split(layout, folder, category, split, findings)
             except (ValueError, OSError) as error:
-                path, message = getattr(error, "path", folder), getattr(error, "message", str(error))
+                path, message = (
+                    getattr(error, "path", folder),
+                    getattr(error, "message", str(error)),
+                )
                 findings.problems.append(Problem(str(path), message))
-            reports.append(SplitReport(category, split, findings.objects, tuple(dict.fromkeys(findings.problems))))
+            reports.append(
+                SplitReport(
+                    category, split, findings.objects, tuple(dict.fromkeys(findings.problems))
+                )
+            )
     return reports

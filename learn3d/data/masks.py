@@ -27,7 +27,9 @@ def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
         return mask, None
     areas = np.bincount(regions.ravel(), pixels.ravel())[1:]
     rows, columns = zip(*ndimage.find_objects(regions), strict=True)
-    lengths = np.array([max(y.stop - y.start, x.stop - x.start) for y, x in zip(rows, columns, strict=True)])
+    lengths = np.array(
+        [max(y.stop - y.start, x.stop - x.start) for y, x in zip(rows, columns, strict=True)]
+    )
     largest = int(areas.argmax())
     kept = np.arange(count) == largest
     reach = _NEAR * lengths[largest] + _REACH * lengths
@@ -35,15 +37,30 @@ def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
     for _ in range(_ROUNDS):
         if not len(rest):
             break
-        gaps = ndimage.minimum(ndimage.distance_transform_edt(~np.r_[False, kept][regions]), regions, rest + 1) - 1
+        gaps = (
+            ndimage.minimum(
+                ndimage.distance_transform_edt(~np.r_[False, kept][regions]), regions, rest + 1
+            )
+            - 1
+        )
         near = gaps <= reach[rest]
         if not near.any():
             break
         kept[rest[near]], rest = True, rest[~near]
     if kept.all():
         return mask, None
-    nearest = regions[tuple(ndimage.distance_transform_edt(regions == 0, return_distances=False, return_indices=True))]
-    of_object = np.r_[False, kept][nearest].repeat(step, 0).repeat(step, 1)[: mask.shape[0], : mask.shape[1]]
+    nearest = regions[
+        tuple(
+            ndimage.distance_transform_edt(
+                regions == 0, return_distances=False, return_indices=True
+            )
+        )
+    ]
+    of_object = (
+        np.r_[False, kept][nearest]
+        .repeat(step, 0)
+        .repeat(step, 1)[: mask.shape[0], : mask.shape[1]]
+    )
     return np.where(of_object, mask, np.uint8(0)), _describe(areas[~kept], areas[kept].sum())
 
 
@@ -53,7 +70,11 @@ def _describe(left_out: np.ndarray, area: float) -> str | None:
         return "several objects of similar size were found, and only the largest is used"
     share = left_out.sum() / area
     parts, were = ("one part", "was") if len(left_out) == 1 else (f"{len(left_out)} parts", "were")
-    return f"{parts} away from the object, {share:.0%} of its size, {were} left out" if share > _SAID else None
+    return (
+        f"{parts} away from the object, {share:.0%} of its size, {were} left out"
+        if share > _SAID
+        else None
+    )
 
 
 def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
@@ -63,7 +84,9 @@ def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
     """
     inside = mask > 127
     if not inside.any():
-        raise ValueError("its mask is empty: no pixel is at least half white, or opaque; white must be the object")
+        raise ValueError(
+            "its mask is empty: no pixel is at least half white, or opaque; white must be the object"
+        )
     if inside.all():
         raise ValueError("its mask is all white: white must be the object, black the background")
     border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])

@@ -13,9 +13,13 @@ from learn3d.data.poses import LookAtPoses
 SECTOR_DEG = 15.0  # width of the azimuth sectors whose masks are averaged; candidate planes are half of it apart
 _SECTORS = round(360 / SECTOR_DEG)
 _MIN_IMAGES, _MAX_IMAGES = 4, 2048  # images of a sector: fewer are ignored, of more a part is used
-_MIN_SECTORS = _SECTORS // 2  # pairs of mirrored sectors that a candidate needs, or all if fewer sectors have images
+_MIN_SECTORS = (
+    _SECTORS // 2
+)  # pairs of mirrored sectors that a candidate needs, or all if fewer sectors have images
 _MIN_PLANES = 6  # candidate planes that are needed, or one for each sector with images
-_MAX_RATIO = 0.1  # largest ratio of the difference at the mirror plane to the median over all candidates
+_MAX_RATIO = (
+    0.1  # largest ratio of the difference at the mirror plane to the median over all candidates
+)
 
 
 def find_mirror_plane(dataset: ViewDataset) -> float | None:
@@ -40,7 +44,10 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
         samples = np.flatnonzero(sectors == sector)
         part = np.linspace(0, len(samples) - 1, min(len(samples), _MAX_IMAGES)).round().astype(int)
         masks = dataset.read_masks(samples[part]) / np.float32(255)
-        means[sector], noise[sector] = masks.mean(axis=0), masks.var(axis=0).sum() / (len(masks) - 1)
+        means[sector], noise[sector] = (
+            masks.mean(axis=0),
+            masks.var(axis=0).sum() / (len(masks) - 1),
+        )
     differences = np.full(_SECTORS, np.inf)
     for plane in range(_SECTORS):  # its azimuth is plane * SECTOR_DEG / 2
         other = (plane - np.arange(_SECTORS)) % _SECTORS

@@ -35,29 +35,45 @@ class PoseTable:
     weights: np.ndarray  # float32 [N, C]: probabilities; each row sums to 1
     distance: np.ndarray  # float32 [N]
     half_fov_deg: np.ndarray  # float32 [N]
-    confidence: np.ndarray  # float32 [N]: probability that the best azimuth is within 30 degrees of the truth
+    confidence: (
+        np.ndarray
+    )  # float32 [N]: probability that the best azimuth is within 30 degrees of the truth
 
     def __post_init__(self) -> None:
         count, shape = len(self.fingerprint), self.azimuth_deg.shape
         if not count or len(shape) != 2 or not 1 <= shape[1] <= MAX_CANDIDATES:
-            raise ValueError(f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {MAX_CANDIDATES}, got {shape}")
+            raise ValueError(
+                f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {MAX_CANDIDATES}, got {shape}"
+            )
         for name, values in vars(self).items():
             dtype = np.dtype(np.uint64 if name == "fingerprint" else np.float32)
-            wanted = (count, shape[1]) if name in ("azimuth_deg", "elevation_deg", "weights") else (count,)
+            wanted = (
+                (count, shape[1])
+                if name in ("azimuth_deg", "elevation_deg", "weights")
+                else (count,)
+            )
             if (values.dtype, values.shape) != (dtype, wanted):
-                raise ValueError(f"{name} must be {dtype} {list(wanted)}, got {values.dtype} {values.shape}")
+                raise ValueError(
+                    f"{name} must be {dtype} {list(wanted)}, got {values.dtype} {values.shape}"
+                )
             if name in ("weights", "confidence") and not 0 <= values.min() <= values.max() <= 1.001:
                 raise ValueError(f"{name} must lie in 0 .. 1")
         if not self.poses(np.arange(count)).in_range().all():
-            raise ValueError("some of its cameras are impossible (elevation, distance or field of view)")
+            raise ValueError(
+                "some of its cameras are impossible (elevation, distance or field of view)"
+            )
         if not np.allclose(self.weights.sum(axis=1), 1, atol=1e-3):
             raise ValueError("the weights of the candidates of an image must add up to 1")
 
     def poses(self, rows: np.ndarray, best: bool = False) -> LookAtPoses:
         """The B * C candidate poses of the rows `rows`, int64 [B], or only the B best ones."""
         last = 1 if best else self.azimuth_deg.shape[1]
-        angles = (values[rows, :last].reshape(-1) for values in (self.azimuth_deg, self.elevation_deg))
-        return LookAtPoses(*angles, *(values[rows].repeat(last) for values in (self.distance, self.half_fov_deg)))
+        angles = (
+            values[rows, :last].reshape(-1) for values in (self.azimuth_deg, self.elevation_deg)
+        )
+        return LookAtPoses(
+            *angles, *(values[rows].repeat(last) for values in (self.distance, self.half_fov_deg))
+        )
 
     def turned(self, offset_deg: float) -> PoseTable:
         """The table with this angle added to all azimuths."""
@@ -94,7 +110,9 @@ class PoseTable:
         poses, training = self.poses(rows, best=True), self.poses(np.arange(len(order)), best=True)
         view_ids, view_names = view_classes(poses, training)
         every = self.poses(rows)
-        candidates = PoseCandidates(every, view_classes(every, training)[0], self.weights[rows], self.weights[rows])
+        candidates = PoseCandidates(
+            every, view_classes(every, training)[0], self.weights[rows], self.weights[rows]
+        )
         parts = {"view_ids": view_ids, "view_names": view_names, "candidates": candidates}
         return dataclasses.replace(dataset, poses=poses, **parts)
 

@@ -28,7 +28,9 @@ class _PoseSet:
 
     def __getitem__(self, indices: Tensor) -> Poses:
         """The poses of the samples `indices`, int64 [B]."""
-        return replace(self, **{name: v[indices] for name, v in vars(self).items() if isinstance(v, Tensor)})
+        return replace(
+            self, **{name: v[indices] for name, v in vars(self).items() if isinstance(v, Tensor)}
+        )
 
     @classmethod
     def join(cls, parts: Sequence[Poses]) -> Poses:
@@ -36,9 +38,18 @@ class _PoseSet:
         joined = {}
         for name in vars(parts[0]):
             values = [getattr(part, name) for part in parts]
-            if any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1:  # else one number for all
+            if (
+                any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1
+            ):  # else one number for all
                 tensors = [torch.as_tensor(v, dtype=torch.float32) for v in values]
-                values = [torch.cat([v if v.ndim else v.expand(len(p)) for v, p in zip(tensors, parts, strict=True)])]
+                values = [
+                    torch.cat(
+                        [
+                            v if v.ndim else v.expand(len(p))
+                            for v, p in zip(tensors, parts, strict=True)
+                        ]
+                    )
+                ]
             joined[name] = values[0]
         return cls(**joined)
 
@@ -61,14 +72,22 @@ class LookAtPoses(_PoseSet):
             if isinstance(value, (np.ndarray, Tensor)):
                 object.__setattr__(self, name, torch.as_tensor(value, dtype=torch.float32))
                 if value.shape != (len(self),):
-                    raise ValueError(f"{name} must be [{len(self)}] or one number, got {list(value.shape)}")
+                    raise ValueError(
+                        f"{name} must be [{len(self)}] or one number, got {list(value.shape)}"
+                    )
 
     def in_range(self) -> Tensor:
         """Which poses are finite and within the bounds of `files.limits`: bool [M]."""
         (near, far), (narrow, wide) = limits.DISTANCE, limits.FOV_DEG
         azimuth, elevation, distance, half_fov = map(torch.as_tensor, vars(self).values())
         sound = (azimuth.abs() <= limits.ANGLE_DEG) & (elevation.abs() < 90)
-        return sound & (distance >= near) & (distance <= far) & (half_fov > narrow / 2) & (half_fov < wide / 2)
+        return (
+            sound
+            & (distance >= near)
+            & (distance <= far)
+            & (half_fov > narrow / 2)
+            & (half_fov < wide / 2)
+        )
 
     def cameras(self) -> nmr.LookAt:
         """The M cameras as one batch."""
@@ -77,7 +96,9 @@ class LookAtPoses(_PoseSet):
 
     def features(self) -> Tensor:
         """The input of a discriminator: the eye's position of each view, float32 [M, 3]."""
-        return nmr.cameras.points_from_angles(self.distance, self.elevation_deg, self.azimuth_deg).to(torch.float32)
+        return nmr.cameras.points_from_angles(
+            self.distance, self.elevation_deg, self.azimuth_deg
+        ).to(torch.float32)
 
     def mirrored(self, chosen: Tensor) -> LookAtPoses:
         """The poses after the images `chosen` (bool [M]) are flipped left-right: their azimuths are negated."""
@@ -102,13 +123,17 @@ class RotationPoses(_PoseSet):
 
     def in_range(self) -> Tensor:
         """Which matrices are finite and invertible: bool [M]. Rotations may include a reflection."""
-        return torch.linalg.det(self.rotation.nan_to_num()).ne(0) & self.rotation.isfinite().all(2).all(1)
+        return torch.linalg.det(self.rotation.nan_to_num()).ne(0) & self.rotation.isfinite().all(
+            2
+        ).all(1)
 
     def cameras(self) -> nmr.cameras.Projection:
         """The M cameras as one batch."""
         offset = torch.tensor([0.0, 0.0, self.depth_offset]).expand(len(self), 3)[:, :, None]
         intrinsics = torch.eye(2, 3).expand(len(self), 2, 3)
-        return nmr.cameras.Projection(torch.cat([self.rotation, offset], dim=2), intrinsics, perspective=False)
+        return nmr.cameras.Projection(
+            torch.cat([self.rotation, offset], dim=2), intrinsics, perspective=False
+        )
 
     def features(self) -> Tensor:
         """The input of a discriminator: the nine entries of each rotation, float32 [M, 9]."""
@@ -148,5 +173,7 @@ class PoseCandidates:
         """
         drawn = np.random.default_rng([seed, step, 2]).random(len(indices))
         ends = self.weights[indices].cumsum(axis=1)[:, :-1]
-        chosen = indices * self.weights.shape[1] + torch.from_numpy((drawn[:, None] >= ends).sum(axis=1))
+        chosen = indices * self.weights.shape[1] + torch.from_numpy(
+            (drawn[:, None] >= ends).sum(axis=1)
+        )
         return self.poses[chosen], torch.from_numpy(self.view_ids[chosen])

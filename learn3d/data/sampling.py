@@ -23,7 +23,9 @@ GROUP_SIZE = 5  # views per object of sampling "groups"
 VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_SIZE, "classes": 1}
 
 
-def batches(dataset: ViewDataset, options: Any, start: int = 1, rows: Tensor | slice = ALL_ROWS) -> Iterator[Batch]:
+def batches(
+    dataset: ViewDataset, options: Any, start: int = 1, rows: Tensor | slice = ALL_ROWS
+) -> Iterator[Batch]:
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
     options: `sampling`, `batch_size`, `augment`, `seed` and `iterations`, as in `TrainConfig`.
@@ -45,10 +47,14 @@ def batches(dataset: ViewDataset, options: Any, start: int = 1, rows: Tensor | s
                 poses, view_ids = dataset.candidates.draw(indices, options.seed, step)
                 batch = dataclasses.replace(batch, poses=poses[rows], view_ids=view_ids[rows])
             whole = {"count": len(indices), "rows": rows}
-            yield augment(batch, options.augment, options.seed, step, inverted=dataset.inverted, **whole)
+            yield augment(
+                batch, options.augment, options.seed, step, inverted=dataset.inverted, **whole
+            )
 
 
-def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int) -> Tensor:
+def sample_indices(
+    dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int
+) -> Tensor:
     """Samples of step `step` (from 1): int64 [batch_size], or the largest multiple of the group size below it.
 
     "views": epochs of shuffled views. "pairs": two different views of each of batch_size / 2 random objects,
@@ -63,13 +69,19 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
     sizes = np.diff(starts)
     if sampling == "classes":
         drawn = rng.integers(dataset.num_classes, size=batch_size)
-        return torch.from_numpy(np.array([order[starts[c] + rng.integers(sizes[c])] for c in drawn]))
+        return torch.from_numpy(
+            np.array([order[starts[c] + rng.integers(sizes[c])] for c in drawn])
+        )
     able = np.flatnonzero(sizes >= 2)
     if len(able) == 0:
-        raise ValueError("no object has two views; a multi-view method needs at least two views of an object")
+        raise ValueError(
+            "no object has two views; a multi-view method needs at least two views of an object"
+        )
     objects = able[rng.integers(len(able), size=batch_size // VIEWS_OF_OBJECT[sampling])]
     if sampling == "groups":
-        views = [rng.permutation(max(size, GROUP_SIZE))[:GROUP_SIZE] % size for size in sizes[objects]]
+        views = [
+            rng.permutation(max(size, GROUP_SIZE))[:GROUP_SIZE] % size for size in sizes[objects]
+        ]
         return torch.from_numpy(order[starts[objects, None] + np.array(views)].T.reshape(-1))
     first = rng.integers(sizes[objects])
     second = (first + rng.integers(1, sizes[objects])) % sizes[objects]
@@ -79,7 +91,12 @@ def sample_indices(dataset: ViewDataset, sampling: Sampling, batch_size: int, se
 def shuffled_epochs(num_samples: int, batch_size: int, seed: int, step: int) -> Tensor:
     """Samples of step `step` (from 1) from a sequence of shuffled epochs, int64 [batch_size]."""
     epochs, places = np.divmod(np.arange((step - 1) * batch_size, step * batch_size), num_samples)
-    return torch.cat([_epoch_order(num_samples, seed, e)[places[epochs == e]] for e in np.unique(epochs).tolist()])
+    return torch.cat(
+        [
+            _epoch_order(num_samples, seed, e)[places[epochs == e]]
+            for e in np.unique(epochs).tolist()
+        ]
+    )
 
 
 @functools.lru_cache(maxsize=2)
@@ -93,7 +110,10 @@ def _grouped_views(dataset: ViewDataset, by_class: bool) -> tuple[np.ndarray, np
     """Samples int64 [M] sorted by object or category, after the positions int64 at which each starts, and M."""
     ids, count = dataset.object_ids, dataset.num_objects
     if by_class:
-        ids, count = np.zeros_like(ids) if dataset.class_ids is None else dataset.class_ids[ids], dataset.num_classes
+        ids, count = (
+            np.zeros_like(ids) if dataset.class_ids is None else dataset.class_ids[ids],
+            dataset.num_classes,
+        )
     order = np.argsort(ids, kind="stable")
     return np.searchsorted(ids[order], np.arange(count + 1)), order
 
@@ -136,7 +156,9 @@ def augment(
         if name == "crop":
             if position > 0 or batch.crops is None:
                 wanted = "the original images, which only the layout pascal3d without shards has"
-                raise ValueError(f"crop must be the first augmentation, and needs {wanted}; got {', '.join(names)}")
+                raise ValueError(
+                    f"crop must be the first augmentation, and needs {wanted}; got {', '.join(names)}"
+                )
             colors = torch.from_numpy(batch.crops.cut(rng.uniform(-1, 1, (count, 4))[rows]))
         elif name in ("channels", "colors"):
             order = torch.from_numpy(np.argsort(rng.random((count, 3)), axis=1)[rows])
@@ -155,7 +177,9 @@ def augment(
                 images = _flip(images, mirrored)
                 depth = None if batch.depth is None else _flip(batch.depth, mirrored)
                 poses = None if batch.poses is None else batch.poses.mirrored(mirrored)
-                batch = dataclasses.replace(batch, masks=_flip(batch.masks, mirrored), depth=depth, poses=poses)
+                batch = dataclasses.replace(
+                    batch, masks=_flip(batch.masks, mirrored), depth=depth, poses=poses
+                )
         batch = dataclasses.replace(batch, images=torch.cat([colors, images[:, 3:]], dim=1))
     return batch
 

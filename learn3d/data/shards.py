@@ -96,7 +96,9 @@ def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
     tensors = {name: getattr(part, name).astype(np.int32) for name in ("object_ids", "view_ids")}
     tensors["sides"] = part.object_sizes().astype(np.float32)
     tensors |= {name: v.numpy() for name, v in _pose_fields(part).items() if isinstance(v, Tensor)}
-    arrays = {name: np.ascontiguousarray(a) for name in _ARRAYS if (a := getattr(part, name)) is not None}
+    arrays = {
+        name: np.ascontiguousarray(a) for name in _ARRAYS if (a := getattr(part, name)) is not None
+    }
     for name, array in arrays.items():
         tensors[f"{name}.checksums"] = np.array([zlib.crc32(row) for row in array], np.uint32)
     metadata = {"objects": list(part.object_names), "crc": _crc(part.object_names, tensors)}
@@ -130,16 +132,24 @@ def write_set(folder: Path, layout: str, dataset: ViewDataset) -> int:
     step = max(1, SHARD_BYTES * count // max(1, dataset.images.nbytes))
     for number, start in enumerate(range(0, count, step)):
         part = dataset.select(np.flatnonzero(dataset.object_ids // step == number))
-        names = [name for name in ("voxels", "points", "object_names") if getattr(dataset, name) is not None]
+        names = [
+            name
+            for name in ("voxels", "points", "object_names")
+            if getattr(dataset, name) is not None
+        ]
         own = {name: getattr(dataset, name)[start : start + step] for name in names}
-        write_shard(folder, number, dataclasses.replace(part, object_ids=part.object_ids - start, **own))
+        write_shard(
+            folder, number, dataclasses.replace(part, object_ids=part.object_ids - start, **own)
+        )
     finish_set(folder, layout, number + 1, dataset)
     return number + 1
 
 
 def remove(folder: Path) -> None:
     """Remove the shards in the folder of a split, with their reports; other files stay."""
-    for path in itertools.chain(*(folder.glob(pattern) for pattern in (SET_FILE, _FILES, _REPORTS))):
+    for path in itertools.chain(
+        *(folder.glob(pattern) for pattern in (SET_FILE, _FILES, _REPORTS))
+    ):
         path.unlink()
 
 
@@ -162,7 +172,9 @@ def load(
     try:
         facts = SetFile(**content)
     except (ValueError, TypeError) as error:
-        raise DamagedFile(where / SET_FILE, f"is no description of shards ({error}); {_MAKE_AGAIN}") from None
+        raise DamagedFile(
+            where / SET_FILE, f"is no description of shards ({error}); {_MAKE_AGAIN}"
+        ) from None
     if facts.layout != layout or image_size not in (None, facts.image_size):
         found = f"images of {facts.image_size} pixels in the layout {facts.layout!r}"
         wanted = f"{image_size or facts.image_size} pixels in {layout!r}"
@@ -170,8 +182,12 @@ def load(
         raise DamagedFile(where, f"has {found}, expected {wanted}; {hint}")
     paths = sorted(where.glob(_FILES))
     if len(paths) != facts.shards:
-        missing = next(path for n in itertools.count() if (path := shard_path(where, n)) not in paths)
-        findings.take(DamagedFile(missing, f"the split needs {facts.shards} shards, but has {len(paths)}"))
+        missing = next(
+            path for n in itertools.count() if (path := shard_path(where, n)) not in paths
+        )
+        findings.take(
+            DamagedFile(missing, f"the split needs {facts.shards} shards, but has {len(paths)}")
+        )
     read = (findings.attempt(_read_shard, path, facts, category, split) for path in paths)
     parts = [part for part in read if part is not None]
     try:
@@ -181,7 +197,9 @@ def load(
     if findings.strict or dataset is None:
         return dataset
     findings.objects = dataset.num_objects
-    for array in (a for part in parts for name in _ARRAYS if (a := getattr(part, name)) is not None):
+    for array in (
+        a for part in parts for name in _ARRAYS if (a := getattr(part, name)) is not None
+    ):
         for rows in np.array_split(np.arange(len(array)), len(array) // _ROWS_AT_ONCE + 1):
             if findings.attempt(array.__getitem__, rows) is None:
                 break
@@ -197,9 +215,13 @@ def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDa
             names, tables, arrays = _read_tables(path, file)
             poses = None
             if kind := _POSES.get(facts.poses):
-                poses = kind(**{f.name: (tables | facts.constants)[f.name] for f in dataclasses.fields(kind)})
+                poses = kind(
+                    **{f.name: (tables | facts.constants)[f.name] for f in dataclasses.fields(kind)}
+                )
                 if not (sound := poses.in_range()).all():
-                    raise ValueError(f"the pose of view {int(sound.int().argmin())} is out of range")
+                    raise ValueError(
+                        f"the pose of view {int(sound.int().argmin())} is out of range"
+                    )
             if not ((tables["sides"] >= 0) & (tables["sides"] <= 1)).all():
                 raise ValueError("sides must lie in 0 .. 1")
             dataset = ViewDataset(
@@ -213,18 +235,38 @@ def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDa
                 **{"voxels": None} | arrays,
             )
             if dataset.image_size != facts.image_size:
-                raise ValueError(f"its images have {dataset.image_size} pixels, not {facts.image_size}")
+                raise ValueError(
+                    f"its images have {dataset.image_size} pixels, not {facts.image_size}"
+                )
             return dataset
-        except (ValueError, TypeError, LookupError, AttributeError, OSError, SafetensorError) as error:
-            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise DamagedFile(path, f"cannot be read as {WANTED} ({text}); {_MAKE_AGAIN}") from error
+        except (
+            ValueError,
+            TypeError,
+            LookupError,
+            AttributeError,
+            OSError,
+            SafetensorError,
+        ) as error:
+            text = (
+                str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            )
+            raise DamagedFile(
+                path, f"cannot be read as {WANTED} ({text}); {_MAKE_AGAIN}"
+            ) from error
 
 
-def _read_tables(path: Path, file: BinaryIO) -> tuple[list[str], dict[str, np.ndarray], dict[str, DiskArray]]:
+def _read_tables(
+    path: Path, file: BinaryIO
+) -> tuple[list[str], dict[str, np.ndarray], dict[str, DiskArray]]:
     """The names of objects, the tables, and the arrays of a shard."""
-    with safe_open(path, "np") as shard:  # it compares shapes and positions with the length of the file
+    with safe_open(
+        path, "np"
+    ) as shard:  # it compares shapes and positions with the length of the file
         metadata = parse_json(shard.metadata()["shard"])
-        read = {name: shard.get_slice(name)[:0] if name in _ARRAYS else shard.get_tensor(name) for name in shard.keys()}
+        read = {
+            name: shard.get_slice(name)[:0] if name in _ARRAYS else shard.get_tensor(name)
+            for name in shard.keys()
+        }
     for name, array in read.items():
         if array.dtype != (wanted := _DTYPES.get(name.partition(".")[2] or name, np.float32)):
             raise ValueError(f"{name} is {array.dtype}; expected {np.dtype(wanted)}")
@@ -237,7 +279,9 @@ def _read_tables(path: Path, file: BinaryIO) -> tuple[list[str], dict[str, np.nd
         rows = np.zeros(len(tables[f"{name}.checksums"]), ROW)
         rows["row"], rows["crc"] = np.arange(len(rows)), tables[f"{name}.checksums"]
         if len(rows) != header[name]["shape"][0]:
-            raise ValueError(f"{name} has {header[name]['shape'][0]} rows, but {len(rows)} checksums")
+            raise ValueError(
+                f"{name} has {header[name]['shape'][0]} rows, but {len(rows)} checksums"
+            )
         begin = 8 + size + header[name]["data_offsets"][0]
         arrays[name] = DiskArray(((path, begin),), rows, read[name].shape[1:], read[name].dtype)
     return metadata["objects"], tables, arrays

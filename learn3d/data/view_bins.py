@@ -31,7 +31,9 @@ class AngleBins:
 
     azimuth_width_deg: Annotated[float, Field(gt=0, le=360)]
     elevation_width_deg: Positive
-    elevation_low_deg: Annotated[float, Field(ge=-90, le=90)] = -20.0  # Kar's range of elevations is -20 .. 40
+    elevation_low_deg: Annotated[
+        float, Field(ge=-90, le=90)
+    ] = -20.0  # Kar's range of elevations is -20 .. 40
     elevation_high_deg: Annotated[float, Field(ge=-90, le=90)] = 40.0
 
     def __post_init__(self) -> None:
@@ -41,7 +43,9 @@ class AngleBins:
             raise ValueError(f"elevations must go from low to high, got {limits_deg}")
         cells = 360 / self.azimuth_width_deg * (span / self.elevation_width_deg)
         if cells > limits.VIEW_CLASSES:
-            raise ValueError(f"there would be {cells:.0f} bins; at most {limits.VIEW_CLASSES} are possible")
+            raise ValueError(
+                f"there would be {cells:.0f} bins; at most {limits.VIEW_CLASSES} are possible"
+            )
 
     @classmethod
     def parse(cls, text: str) -> AngleBins:
@@ -63,17 +67,26 @@ class AngleBins:
         """The class of every pose, int64 [M] in 0 .. K-1."""
         azimuths, elevations = self.shape
         azimuth = poses.azimuth_deg.double()
-        turn = torch.where(azimuth == 180, azimuth, wrap_deg(azimuth)) + 180  # the upper end belongs to the last cell
+        turn = (
+            torch.where(azimuth == 180, azimuth, wrap_deg(azimuth)) + 180
+        )  # the upper end belongs to the last cell
         a = (turn / self.azimuth_width_deg).floor().long().clamp(0, azimuths - 1)
         elevation = torch.as_tensor(poses.elevation_deg, dtype=torch.float32).double()
-        e = ((elevation - self.elevation_low_deg) / self.elevation_width_deg).floor().long().clamp(0, elevations - 1)
+        e = (
+            ((elevation - self.elevation_low_deg) / self.elevation_width_deg)
+            .floor()
+            .long()
+            .clamp(0, elevations - 1)
+        )
         return a * elevations + e
 
     def names(self) -> list[str]:
         """The K names of the classes: the middles of their cells."""
         azimuths, elevations = self.shape
         middle_a = [-180 + (k + 0.5) * self.azimuth_width_deg for k in range(azimuths)]
-        middle_e = [self.elevation_low_deg + (k + 0.5) * self.elevation_width_deg for k in range(elevations)]
+        middle_e = [
+            self.elevation_low_deg + (k + 0.5) * self.elevation_width_deg for k in range(elevations)
+        ]
         return [f"azimuth {a:g}°, elevation {e:g}°" for a in middle_a for e in middle_e]
 
 

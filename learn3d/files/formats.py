@@ -10,7 +10,16 @@ import numpy as np
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile, faults_of, open_file, read_bytes
 
-EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".3mf", ".dae")  # the last two need further packages
+EXTENSIONS = (
+    ".obj",
+    ".off",
+    ".ply",
+    ".stl",
+    ".glb",
+    ".gltf",
+    ".3mf",
+    ".dae",
+)  # the last two need further packages
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +42,10 @@ def read_mesh(path: Path) -> RawMesh:
 
 
 def _read(path: Path) -> RawMesh:
-    with open_file(path, limits.MESH_FILE_BYTES, "a mesh file") as file, faults_of(path, "a mesh file", advice=""):
+    with (
+        open_file(path, limits.MESH_FILE_BYTES, "a mesh file") as file,
+        faults_of(path, "a mesh file", advice=""),
+    ):
         size = os.fstat(file.fileno()).st_size
         sandbox.allow(30 * size, size / 1e6)
         if not size:
@@ -42,12 +54,16 @@ def _read(path: Path) -> RawMesh:
         if not len(faces):
             raise DamagedFile(path, "no faces")
         if faces.min() < 0 or faces.max() >= len(vertices):
-            raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}; there are {len(vertices)}")
+            raise ValueError(
+                f"faces refer to vertices {faces.min()} .. {faces.max()}; there are {len(vertices)}"
+            )
         is_used = np.zeros(len(vertices), bool)
         is_used[faces] = True
         used = vertices[is_used]
         if not np.isfinite(used).all():
-            raise ValueError(f"{np.count_nonzero(~np.isfinite(used).all(axis=1))} of its corners are not finite")
+            raise ValueError(
+                f"{np.count_nonzero(~np.isfinite(used).all(axis=1))} of its corners are not finite"
+            )
         if (used == used[0]).all():
             raise ValueError("all its corners are at one place: its longest side is 0")
     return RawMesh(np.asarray(vertices, np.float64), faces)
@@ -72,7 +88,9 @@ def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:
         try:
             return read(file)
         except ImportError:
-            raise ValueError(f"{kind} files need further packages; run `pip install {packages}`") from None
+            raise ValueError(
+                f"{kind} files need further packages; run `pip install {packages}`"
+            ) from None
     from learn3d.files.meshes import read_off, read_ply, read_stl
 
     return {".off": read_off, ".ply": read_ply, ".stl": read_stl}[kind](file.read())
@@ -96,7 +114,9 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
     with open_file(path, limits.VOLUME_BYTES, wanted) as file:
         array = np.asarray(scipy.io.loadmat(file, variable_names=[name]).get(name))
     if array.dtype.kind not in "biuf" or array.shape != (size,) * 3:
-        raise DamagedFile(path, f"has {array.dtype} {list(array.shape)} as {name!r}; expected {wanted}")
+        raise DamagedFile(
+            path, f"has {array.dtype} {list(array.shape)} as {name!r}; expected {wanted}"
+        )
     return array != 0
 
 
@@ -106,13 +126,23 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
     No code in the file is executed (weights_only). Raises DamagedFile if it is not a state dict.
     """
     with open_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18") as file:
-        sandbox.allow(3 * 2**28 + 4 * os.fstat(file.fileno()).st_size, 25.0)  # most of it for importing torch
+        sandbox.allow(
+            3 * 2**28 + 4 * os.fstat(file.fileno()).st_size, 25.0
+        )  # most of it for importing torch
     import torch
     from safetensors.torch import load_file
 
     is_torch = path.suffix != ".safetensors"
-    weights = torch.load(path, map_location="cpu", weights_only=True) if is_torch else load_file(path)
-    if not isinstance(weights, dict) or not all(isinstance(value, torch.Tensor) for value in weights.values()):
-        raise DamagedFile(path, f"must hold a state dict (names -> tensors), got {type(weights).__name__}")
+    weights = (
+        torch.load(path, map_location="cpu", weights_only=True) if is_torch else load_file(path)
+    )
+    if not isinstance(weights, dict) or not all(
+        isinstance(value, torch.Tensor) for value in weights.values()
+    ):
+        raise DamagedFile(
+            path, f"must hold a state dict (names -> tensors), got {type(weights).__name__}"
+        )
     halves = (torch.float16, torch.bfloat16)
-    return {str(n): (t.float() if t.dtype in halves else t).detach().numpy() for n, t in weights.items()}
+    return {
+        str(n): (t.float() if t.dtype in halves else t).detach().numpy() for n, t in weights.items()
+    }

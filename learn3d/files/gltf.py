@@ -14,7 +14,9 @@ from learn3d.files.reading import parse_json
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Required extensions with no effect on the triangles, or read here.
-_HARMLESS = re.compile(r"KHR_mesh_quantization|(KHR|EXT|MSFT)_(materials|texture|lights|animation|xmp)\w*")
+_HARMLESS = re.compile(
+    r"KHR_mesh_quantization|(KHR|EXT|MSFT)_(materials|texture|lights|animation|xmp)\w*"
+)
 _REFUSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
 
 
@@ -32,7 +34,9 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
         raise ValueError(f"it is glTF {tree['asset']['version']}; version 2 is read")
     for name in tree.get("extensionsRequired", []):
         if not _HARMLESS.fullmatch(name):
-            raise ValueError(f"it needs the extension {name}, which is not supported; save it without")
+            raise ValueError(
+                f"it needs the extension {name}, which is not supported; save it without"
+            )
     accessors = _Accessors(tree, binary, read_other)
     vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
     places = _places(tree)
@@ -56,8 +60,12 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
             if "indices" in primitive:
                 indices = accessors.read(primitive["indices"])[:, 0].astype(np.int64)
             if len(indices) and indices.max() >= len(points):
-                raise ValueError(f"a face refers to vertex {indices.max()}, but its mesh has {len(points)}")
-            used, indices = np.unique(indices, return_inverse=True)  # primitives may share one large array
+                raise ValueError(
+                    f"a face refers to vertex {indices.max()}, but its mesh has {len(points)}"
+                )
+            used, indices = np.unique(
+                indices, return_inverse=True
+            )  # primitives may share one large array
             faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
             vertices.append(points[used])
             total += len(used)
@@ -85,20 +93,27 @@ def _refuse(item: dict[str, Any]) -> None:
     """Raise ValueError if an object has an extension that holds its geometry."""
     for name in _REFUSED:
         if name in item.get("extensions", {}):
-            raise ValueError(f"it uses the extension {name}, which is not supported; save it without")
+            raise ValueError(
+                f"it uses the extension {name}, which is not supported; save it without"
+            )
 
 
 class _Accessors:
     """The arrays of a file."""
 
-    def __init__(self, tree: dict[str, Any], binary: bytes | None, read_other: Callable[[str], bytes]) -> None:
+    def __init__(
+        self, tree: dict[str, Any], binary: bytes | None, read_other: Callable[[str], bytes]
+    ) -> None:
         self.tree, self.binary, self.read_other = tree, binary, read_other
         self.buffers: dict[int, bytes] = {}
 
     def read(self, number: int) -> np.ndarray:
         """Accessor `number` as [count, components]; float64 for floats and normalised integers."""
         accessor = self.tree["accessors"][_index(number)]
-        kind, shape = _COMPONENTS[accessor["componentType"]], (accessor["count"], _WIDTHS[accessor["type"]])
+        kind, shape = (
+            _COMPONENTS[accessor["componentType"]],
+            (accessor["count"], _WIDTHS[accessor["type"]]),
+        )
         sparse = accessor.get("sparse")
         if "bufferView" in accessor:
             values = self._view(accessor["bufferView"], accessor.get("byteOffset", 0), kind, shape)
@@ -110,8 +125,12 @@ class _Accessors:
             count, values = sparse["count"], values.copy()
             rows, new = sparse["indices"], sparse["values"]
             kind_of_rows = _COMPONENTS[rows["componentType"]]
-            at = self._view(rows["bufferView"], rows.get("byteOffset", 0), kind_of_rows, (count, 1))[:, 0]
-            values[at] = self._view(new["bufferView"], new.get("byteOffset", 0), kind, (count, shape[1]))
+            at = self._view(
+                rows["bufferView"], rows.get("byteOffset", 0), kind_of_rows, (count, 1)
+            )[:, 0]
+            values[at] = self._view(
+                new["bufferView"], new.get("byteOffset", 0), kind, (count, shape[1])
+            )
         if accessor.get("normalized") and values.dtype.kind != "f":
             return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
         return values.astype(np.float64) if values.dtype.kind == "f" else values
@@ -141,7 +160,9 @@ class _Accessors:
             else:
                 data = self.read_other(unquote(uri))
             if len(data) < buffer["byteLength"]:
-                raise EOFError(f"buffer {number} has {len(data)} bytes; {buffer['byteLength']} are promised")
+                raise EOFError(
+                    f"buffer {number} has {len(data)} bytes; {buffer['byteLength']} are promised"
+                )
             self.buffers[number] = data
         return self.buffers[number]
 
@@ -181,13 +202,17 @@ def _skinned(
     """Points [N, 3] where the joints of their skin put them; the place of the mesh itself has no effect."""
     joints = np.stack([places[number] for number in skin["joints"]])
     if "inverseBindMatrices" in skin:
-        joints = joints @ accessors.read(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+        joints = joints @ accessors.read(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(
+            1, 2
+        )
     moved = np.zeros_like(points)
     for which in (name for name in attributes if name.startswith("JOINTS_")):
         weights = accessors.read(attributes[which.replace("JOINTS", "WEIGHTS")])
         for joint, weight in zip(accessors.read(attributes[which]).T, weights.T, strict=True):
             matrices = joints[joint]
-            moved += weight[:, None] * ((matrices[:, :3, :3] @ points[:, :, None])[:, :, 0] + matrices[:, :3, 3])
+            moved += weight[:, None] * (
+                (matrices[:, :3, :3] @ points[:, :, None])[:, :, 0] + matrices[:, :3, 3]
+            )
     return moved
 
 
@@ -197,7 +222,9 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     quaternion = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     x, y, z, w = quaternion / (np.linalg.norm(quaternion) or 1.0)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])  # cross @ v is the cross product of (x, y, z) with v
+    cross = np.array(
+        [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    )  # cross @ v is the cross product of (x, y, z) with v
     turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
     matrix = np.eye(4)
     matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)
@@ -214,5 +241,7 @@ def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
         faces[1::2] = faces[1::2, ::-1]
         return faces
     if mode == 6:
-        return np.stack([np.broadcast_to(indices[:1], len(indices[2:])), indices[1:-1], indices[2:]], axis=1)
+        return np.stack(
+            [np.broadcast_to(indices[:1], len(indices[2:])), indices[1:-1], indices[2:]], axis=1
+        )
     raise ValueError(f"it has a primitive of the unknown mode {mode}")

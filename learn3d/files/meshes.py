@@ -13,8 +13,23 @@ import numpy as np
 from nmr.obj import triangulate
 
 Triangles = tuple[np.ndarray, np.ndarray]
-_PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
-_PLY_TYPES |= {"double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"}
+_PLY_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+}
+_PLY_TYPES |= {
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+}
 _PLY_TYPES |= {"uint32": "u4", "float32": "f4", "float64": "f8"}
 _PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
@@ -22,10 +37,14 @@ _PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": "
 def read_stl(content: bytes) -> Triangles:
     """Read an STL file, binary (bytes behind the last triangle are ignored) or text."""
     count = int.from_bytes(content[80:84], "little")
-    is_text = content.lstrip()[:5].lower() == b"solid" and re.search(rb"(?i)\bfacet\b|endsolid", content[: 2**16])
+    is_text = content.lstrip()[:5].lower() == b"solid" and re.search(
+        rb"(?i)\bfacet\b|endsolid", content[: 2**16]
+    )
     if len(content) == 84 + 50 * count or not is_text:
         if len(content) < 84 + 50 * count or len(content) < 84:
-            raise EOFError(f"it has {len(content)} bytes; its header promises {count} triangles of 50")
+            raise EOFError(
+                f"it has {len(content)} bytes; its header promises {count} triangles of 50"
+            )
         rows = np.frombuffer(content, "u1", 50 * count, 84).reshape(count, 50)
         corners = rows[:, 12:48].copy().view("<f4").reshape(-1, 3)
     else:
@@ -36,7 +55,9 @@ def read_stl(content: bytes) -> Triangles:
             raise EOFError("its last solid does not end")
         corners = np.fromstring(b" ".join(lines), sep=" ").reshape(-1, 3)
         if len(corners) != 3 * facets or len(lines) != len(corners):
-            raise ValueError(f"it has {facets} facets and {len(corners)} corners; each facet needs three")
+            raise ValueError(
+                f"it has {facets} facets and {len(corners)} corners; each facet needs three"
+            )
     return corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3)
 
 
@@ -55,8 +76,12 @@ def read_off(content: bytes) -> Triangles:
     if len(rows) < num_vertices + num_faces and head == b"OFF":
         rows = _off_rows(b" ".join(lines).split()[4:], num_vertices, num_faces)
     if len(rows) < num_vertices + num_faces:
-        raise EOFError(f"it has {len(rows)} lines; its header promises {num_vertices} corners and {num_faces} faces")
-    vertices = np.array([line.split()[:3] for line in rows[:num_vertices]], np.float64).reshape(-1, 3)
+        raise EOFError(
+            f"it has {len(rows)} lines; its header promises {num_vertices} corners and {num_faces} faces"
+        )
+    vertices = np.array([line.split()[:3] for line in rows[:num_vertices]], np.float64).reshape(
+        -1, 3
+    )
     sizes, corners = [], []
     for line in rows[num_vertices:]:
         size, *words = line.split()
@@ -105,7 +130,10 @@ def read_ply(content: bytes) -> Triangles:
     for name, count, properties in elements:
         if name == "tristrips" and count:
             raise ValueError("it has triangle strips (element tristrips); save it with triangles")
-        columns = [(one, [np.dtype(_PLY_ORDERS[kind] + each) for each in types]) for one, types in properties]
+        columns = [
+            (one, [np.dtype(_PLY_ORDERS[kind] + each) for each in types])
+            for one, types in properties
+        ]
         found, at = _ply_element(body, at, name, count, columns)
         if name == "vertex":
             vertices = np.stack([found[axis][0] for axis in "xyz"], axis=1).astype(np.float64)
@@ -135,7 +163,9 @@ def _ply_element(
         offsets = offsets + (types[0].itemsize if len(types) > 1 else 0)
         if same:
             strides = (int(starts[1] - starts[0]), item)
-            values = np.ndarray((count, lengths[0]), types[-1], body, int(offsets[0]), strides).ravel()
+            values = np.ndarray(
+                (count, lengths[0]), types[-1], body, int(offsets[0]), strides
+            ).ravel()
         else:
             bytes_of = np.repeat(offsets - item * (np.cumsum(lengths) - lengths), lengths)
             bytes_of = bytes_of + item * np.arange(len(bytes_of))
@@ -145,7 +175,9 @@ def _ply_element(
     return found, int(starts[-1])
 
 
-def _ply_rows(body: bytes, at: int, count: int, columns: list[list[np.dtype]]) -> tuple[np.ndarray, np.ndarray]:
+def _ply_rows(
+    body: bytes, at: int, count: int, columns: list[list[np.dtype]]
+) -> tuple[np.ndarray, np.ndarray]:
     """Where each row starts and the last one ends, int64 [count + 1], and the lengths of its lists [columns, count]."""
 
     def row(at: int) -> tuple[int, list[int]]:
@@ -153,7 +185,11 @@ def _ply_rows(body: bytes, at: int, count: int, columns: list[list[np.dtype]]) -
         for types in columns:
             length = 1
             if len(types) > 1:
-                length = int(struct.unpack_from(types[0].byteorder.replace("|", "=") + types[0].char, body, at)[0])
+                length = int(
+                    struct.unpack_from(
+                        types[0].byteorder.replace("|", "=") + types[0].char, body, at
+                    )[0]
+                )
                 at += types[0].itemsize
             if length < 0:
                 raise ValueError("a list has a negative length")
@@ -193,7 +229,9 @@ def read_3mf(file: BinaryIO) -> Triangles:
 
     scene = trimesh.load(file, file_type="3mf", force="scene", process=False)
     parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
-    return trimesh.util.append_faces([part.vertices for part in parts], [part.faces for part in parts])
+    return trimesh.util.append_faces(
+        [part.vertices for part in parts], [part.faces for part in parts]
+    )
 
 
 def read_dae(file: BinaryIO) -> Triangles:

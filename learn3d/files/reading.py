@@ -23,7 +23,10 @@ class _FileError(Exception):
         self.path, self.message = path, message
 
     def __reduce__(self) -> tuple[type, tuple[Path, str]]:
-        return type(self), (self.path, self.message)  # for pickle, which passes only the text by default
+        return type(self), (
+            self.path,
+            self.message,
+        )  # for pickle, which passes only the text by default
 
 
 class DamagedFile(_FileError, ValueError):
@@ -97,8 +100,12 @@ def faults_of(path: Path | str, wanted: str, advice: str = FETCH_AGAIN) -> Itera
         elif type(error) not in (ValueError, EOFError):
             reason = f"{type(error).__name__}: {reason}".removesuffix(": ")
         advice = FETCH_AGAIN if isinstance(error, EOFError) else advice
-        end = "" if getattr(error, "errno", None) or not advice else f". {advice}"  # errno: the system names the cause
-        raise DamagedFile(Path(path), f"cannot be read ({reason}); expected {wanted}{end}") from error
+        end = (
+            "" if getattr(error, "errno", None) or not advice else f". {advice}"
+        )  # errno: the system names the cause
+        raise DamagedFile(
+            Path(path), f"cannot be read ({reason}); expected {wanted}{end}"
+        ) from error
 
 
 def open_file(path: Path | str, max_bytes: int, wanted: str) -> BinaryIO:
@@ -110,7 +117,11 @@ def open_file(path: Path | str, max_bytes: int, wanted: str) -> BinaryIO:
     with faults_of(path, wanted):
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     status = os.fstat(file.fileno())
-    fault = f"has {status.st_size} bytes; the limit is {max_bytes}" if status.st_size > max_bytes else ""
+    fault = (
+        f"has {status.st_size} bytes; the limit is {max_bytes}"
+        if status.st_size > max_bytes
+        else ""
+    )
     if not stat.S_ISREG(status.st_mode):
         fault = "cannot be read: it is not a regular file"
     if fault:

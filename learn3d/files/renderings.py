@@ -28,13 +28,17 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
         pixels, most = image.width * image.height, limits.IMAGE_PIXELS
         if max(image.size) > max_side or pixels > most:
             size = f"{image.width}x{image.height} pixels"
-            raise DamagedFile(path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller")
+            raise DamagedFile(
+                path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller"
+            )
         sandbox.allow(56 * pixels, pixels / 1e7)  # for decoding, masking and framing
         image.load()
         return image
 
 
-View = tuple[np.ndarray, np.ndarray, int]  # image uint8 [4, S, S], mask uint8 [64, 64], largest value of the mask
+View = tuple[
+    np.ndarray, np.ndarray, int
+]  # image uint8 [4, S, S], mask uint8 [64, 64], largest value of the mask
 
 
 def read_with_alpha(path: Path, size: int) -> View:
@@ -51,12 +55,17 @@ def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
     if depth_path.exists():
         depth = open_image(depth_path, RENDERINGS, limits.RENDER_SIDE)
         if depth.size != (len(color),) * 2:
-            raise DamagedFile(depth_path, f"is {_kind(depth)}, but {path.name} has {len(color)} pixels a side")
+            raise DamagedFile(
+                depth_path, f"is {_kind(depth)}, but {path.name} has {len(color)} pixels a side"
+            )
         is_16_bit = depth.mode.startswith("I")  # then the high byte counts
         grey = np.asarray(depth) >> 8 if is_16_bit else np.asarray(depth.convert("L"))
         mask = np.where(grey < 250, 255, 0).astype(np.uint8)
     elif mask is None:
-        raise MissingFile(depth_path, f"is missing, and {path.name} has no alpha channel; expected the depth image")
+        raise MissingFile(
+            depth_path,
+            f"is missing, and {path.name} has no alpha channel; expected the depth image",
+        )
     return _view(color, mask, size)
 
 
@@ -75,7 +84,9 @@ def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
 def _read_square(path: Path, size: int) -> tuple[np.ndarray, np.ndarray | None]:
     image, least = open_image(path, RENDERINGS, limits.RENDER_SIDE), max(size, limits.MASK_SIZE)
     if image.width != image.height or image.width < least or image.mode.startswith(("I", "F", "C")):
-        raise DamagedFile(path, f"is {_kind(image)}; expected a square image of at least {least}x{least}, 8 bits")
+        raise DamagedFile(
+            path, f"is {_kind(image)}; expected a square image of at least {least}x{least}, 8 bits"
+        )
     return split_alpha(image)
 
 
@@ -112,7 +123,9 @@ def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
     if planes.shape[1:] == (size, size):
         return planes.astype(np.uint8)
     side = max(planes.shape[1:])
-    rows, columns = (_area_weights(side, size)[:, (side - n) // 2 :][:, :n] for n in planes.shape[1:])
+    rows, columns = (
+        _area_weights(side, size)[:, (side - n) // 2 :][:, :n] for n in planes.shape[1:]
+    )
     return np.rint(rows @ planes @ columns.T).astype(np.uint8)
 
 

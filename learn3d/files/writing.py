@@ -23,10 +23,14 @@ def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[P
     path = Path(path)
     _require_regular(path)
     temporary = path.with_name(f".{path.name}{writer}.partial")
-    temporary.unlink(missing_ok=True)  # a killed process may have left a hard link, which must not be overwritten
+    temporary.unlink(
+        missing_ok=True
+    )  # a killed process may have left a hard link, which must not be overwritten
     try:
         temporary.touch()
-        mode = temporary.stat().st_mode  # as the umask says; safetensors would let only the owner read its files
+        mode = (
+            temporary.stat().st_mode
+        )  # as the umask says; safetensors would let only the owner read its files
         temporary.unlink()
         yield temporary
         temporary.chmod(mode)
@@ -36,7 +40,9 @@ def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[P
         if sync:
             _sync(path.parent)
     except OSError as error:
-        if error.errno is not None and error.filename is None:  # the error for a full disk has no file name
+        if (
+            error.errno is not None and error.filename is None
+        ):  # the error for a full disk has no file name
             error.filename = str(path)
         raise
     finally:
@@ -71,7 +77,9 @@ def check_target(path: Path, option: str, *, folder: bool = False) -> None:
         with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
-        raise OSError(f"cannot write {path}: {error.strerror or error}; give another {option}") from error
+        raise OSError(
+            f"cannot write {path}: {error.strerror or error}; give another {option}"
+        ) from error
 
 
 def give_second_name(path: Path, name: Path) -> None:

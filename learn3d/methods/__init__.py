@@ -37,11 +37,17 @@ def create_method(
     Raises ValueError if the device is missing, or if the method needs poses and the data set has none.
     """
     if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'")
+        raise ValueError(
+            "device 'cuda' was asked for, but this PyTorch sees no CUDA device; use device 'cpu'"
+        )
     if type(settings) not in _METHODS:
-        raise ValueError(f"no method learns with {type(settings).__name__}; add the pair to learn3d.methods._METHODS")
+        raise ValueError(
+            f"no method learns with {type(settings).__name__}; add the pair to learn3d.methods._METHODS"
+        )
     if "__dataclass_fields__" not in vars(type(settings)):
-        raise ValueError(f"{type(settings).__name__} lacks the decorator @checked, so its fields are no options")
+        raise ValueError(
+            f"{type(settings).__name__} lacks the decorator @checked, so its fields are no options"
+        )
     kind = _METHODS[type(settings)]
     if device == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # TF32 convolutions would not be fp32

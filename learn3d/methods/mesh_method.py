@@ -22,7 +22,9 @@ from learn3d.networks.generators import GENERATORS, GeneratorName, MeshGenerator
 from learn3d.networks.resnet import load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
 
-AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)  # classes of the view classifier: the azimuth cells of `fitting.fit`
+AZIMUTHS = AngleBins(
+    15.0, 180.0, -90.0, 90.0
+)  # classes of the view classifier: the azimuth cells of `fitting.fit`
 MIN_COMPACT_SOLIDITY = 0.8  # objects count as compact if the data's solidity is at least this
 CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts a face on the border (0.5) as outside
 
@@ -81,7 +83,9 @@ class MeshSettings(MethodSettings):
     def for_data(self, info: DatasetInfo) -> MeshSettings:
         super().for_data(info)
         if self.lambda_view > 0 and info.pose_features != LookAtPoses.num_features:
-            raise ValueError("--lambda-view needs azimuths, and the poses of these data are rotations; leave it out")
+            raise ValueError(
+                "--lambda-view needs azimuths, and the poses of these data are rotations; leave it out"
+            )
         plane = info.mirror_plane_deg if self.symmetry == "auto" else self.symmetry
         sphere = "sphere-smooth" if is_compact(info) else "sphere"
         generator = sphere if self.generator == "auto" else self.generator
@@ -99,7 +103,9 @@ class MeshMethod(Method):
     A subclass may add a network that classifies the azimuth of an image (`create_view_classifier`, `view_loss`).
     """
 
-    averages_mirror_images: ClassVar[bool] = False  # whether a code is the mean over an image and its mirror image
+    averages_mirror_images: ClassVar[bool] = (
+        False  # whether a code is the mean over an image and its mirror image
+    )
     settings: MeshSettings
     encoder: nn.Module
     generator: MeshGenerator
@@ -107,7 +113,10 @@ class MeshMethod(Method):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.faces, self.edges = self.generator.faces.cpu(), self.generator.edges.cpu()  # for the renderer
+        self.faces, self.edges = (
+            self.generator.faces.cpu(),
+            self.generator.edges.cpu(),
+        )  # for the renderer
 
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = ENCODERS[self.settings.encoder](self.info.inverted)
@@ -123,7 +132,9 @@ class MeshMethod(Method):
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
         """Adam for each network that has weights."""
-        trained = {name: network for name, network in self.networks.items() if list(network.parameters())}
+        trained = {
+            name: network for name, network in self.networks.items() if list(network.parameters())
+        }
         rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
         return {name: adam(network, rate, betas) for name, network in trained.items()}
 
@@ -154,12 +165,18 @@ class MeshMethod(Method):
 
     @torch.no_grad()
     def view_probabilities(self, images: Tensor) -> Tensor | None:
-        return self._apply(self.view_classifier, images).softmax(1).cpu() if self.settings.lambda_view > 0 else None
+        return (
+            self._apply(self.view_classifier, images).softmax(1).cpu()
+            if self.settings.lambda_view > 0
+            else None
+        )
 
     def view_loss(self, images: Tensor, poses: LookAtPoses) -> Tensor:
         """The loss of the network "view_classifier" on stored images of these poses."""
         logits = self._apply(self.view_classifier, images)
-        return pose_classification_loss(logits, AZIMUTHS.ids(poses).to(self.device, non_blocking=True))
+        return pose_classification_loss(
+            logits, AZIMUTHS.ids(poses).to(self.device, non_blocking=True)
+        )
 
     @property
     def memory_format(self) -> torch.memory_format:
@@ -190,7 +207,12 @@ class MeshMethod(Method):
         """The losses on vertices [B, V, 3] in step `step`; one whose weight is 0 is left out."""
         if self.settings.lambda_smooth == 0:
             return {}
-        return {"smoothness": (self.settings.lambda_smooth, nmr.losses.smoothness_loss(vertices, self.edges))}
+        return {
+            "smoothness": (
+                self.settings.lambda_smooth,
+                nmr.losses.smoothness_loss(vertices, self.edges),
+            )
+        }
 
 
 CODE_STEPS, VERTEX_STEPS = 40, 40  # steps of `refine`
@@ -207,20 +229,26 @@ def refine(method: Method, images: Tensor, masks: Tensor, poses: Poses) -> Meshe
     vertices. Symmetric shapes stay symmetric. Raises ValueError if the method predicts voxels.
     """
     if not isinstance(method, MeshMethod):
-        raise ValueError("only meshes can be fitted to masks, and this run predicts voxels; leave out --refine")
+        raise ValueError(
+            "only meshes can be fitted to masks, and this run predicts voxels; leave out --refine"
+        )
 
     def decode(codes: Tensor) -> Tensor:
         with method.autocast():
             return method.generator(codes.to(method.device, non_blocking=True)).float().cpu()
 
     @torch.enable_grad()
-    def descend(start: Tensor, shape: Callable[[Tensor], Tensor], learning_rate: float, steps: int) -> Tensor:
+    def descend(
+        start: Tensor, shape: Callable[[Tensor], Tensor], learning_rate: float, steps: int
+    ) -> Tensor:
         """The variables after some steps; `shape` computes vertices from them."""
         values = start.clone().requires_grad_()
         optimizer = torch.optim.Adam([values], lr=learning_rate)
         for _ in range(steps):
             vertices = shape(values)
-            silhouettes = nmr.render_silhouette(vertices, method.faces, poses.cameras(), image_size=masks.shape[-1])
+            silhouettes = nmr.render_silhouette(
+                vertices, method.faces, poses.cameras(), image_size=masks.shape[-1]
+            )
             fit = nmr.losses.soft_iou_loss(silhouettes, masks)
             loss = fit + SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
             (values.grad,) = torch.autograd.grad(loss, values)
@@ -228,6 +256,8 @@ def refine(method: Method, images: Tensor, masks: Tensor, poses: Poses) -> Meshe
         return values.detach()
 
     codes, symmetrized = method.encode(images).cpu(), method.generator.symmetrized
-    codes = descend(codes, decode, CODE_LEARNING_RATE * float(codes.square().mean().sqrt()), CODE_STEPS)
+    codes = descend(
+        codes, decode, CODE_LEARNING_RATE * float(codes.square().mean().sqrt()), CODE_STEPS
+    )
     vertices = descend(decode(codes), symmetrized, VERTEX_LEARNING_RATE, VERTEX_STEPS)
     return Meshes(symmetrized(vertices), method.faces)

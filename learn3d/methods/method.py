@@ -82,7 +82,10 @@ class Grids:
 
     def occupied(self, size: int) -> Tensor:
         """Bool [B, size, size, size], whether the mean of a larger cell is above the threshold; size divides s."""
-        return F.avg_pool3d(self.occupancy[:, None], self.occupancy.shape[-1] // size)[:, 0] > self.threshold
+        return (
+            F.avg_pool3d(self.occupancy[:, None], self.occupancy.shape[-1] // size)[:, 0]
+            > self.threshold
+        )
 
 
 class Method(abc.ABC):
@@ -131,7 +134,9 @@ class Method(abc.ABC):
 
         Parameters that no loss of the step depends on do not change.
         """
-        raise NotImplementedError(f"{type(self).__name__} must define losses, or phases for several in a step")
+        raise NotImplementedError(
+            f"{type(self).__name__} must define losses, or phases for several in a step"
+        )
 
     def phases(self, batch: Batch, step: int) -> Iterator[tuple[Losses, tuple[str, ...]]]:
         """The phases of training step `step`: the losses of each, and the names of the optimizers that minimise them.
@@ -176,4 +181,6 @@ class Method(abc.ABC):
 
     def autocast(self) -> torch.autocast:
         """Context in which the networks run at the method's precision; losses and rendering belong outside it."""
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16")
+        return torch.autocast(
+            self.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16"
+        )

@@ -23,7 +23,9 @@ class TrainingSchedule:
 
     def __post_init__(self) -> None:
         if self.iterations <= self.warmup_steps:
-            raise ValueError(f"warmup_steps must be below the {self.iterations} iterations, got {self.warmup_steps}")
+            raise ValueError(
+                f"warmup_steps must be below the {self.iterations} iterations, got {self.warmup_steps}"
+            )
         self.lr_factor(self.warmup_steps + 1)  # raises ValueError for an unknown schedule
 
     def lr_factor(self, step: int) -> float:
@@ -34,7 +36,9 @@ class TrainingSchedule:
         """
         if step <= self.warmup_steps:
             return step / self.warmup_steps
-        done = (step - 1 - self.warmup_steps) / (self.iterations - self.warmup_steps)  # 0 .. below 1
+        done = (step - 1 - self.warmup_steps) / (
+            self.iterations - self.warmup_steps
+        )  # 0 .. below 1
         if self.lr_schedule == "linear":
             return 1 - done
         if self.lr_schedule == "cosine":
@@ -43,7 +47,9 @@ class TrainingSchedule:
             return 0.1 if 20 * step > 19 * self.iterations else 1.0
         if self.lr_schedule == "constant":
             return 1.0
-        raise ValueError(f"the schedule {self.lr_schedule!r} has no branch in TrainingSchedule.lr_factor")
+        raise ValueError(
+            f"the schedule {self.lr_schedule!r} has no branch in TrainingSchedule.lr_factor"
+        )
 
 
 class EMA:
@@ -82,7 +88,9 @@ class EMA:
             own.data, self.tensors[name] = self.tensors[name], own.data
 
 
-def adam(network: nn.Module, learning_rate: float, betas: tuple[float, float] = (0.9, 0.999)) -> torch.optim.Adam:
+def adam(
+    network: nn.Module, learning_rate: float, betas: tuple[float, float] = (0.9, 0.999)
+) -> torch.optim.Adam:
     """Adam for one network: fused (13 ms a step instead of 91 on two cores), and without denormal moments."""
     parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
     optimizer = torch.optim.Adam(parameters, lr=learning_rate, betas=betas, fused=True)
@@ -99,7 +107,10 @@ def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
     """
     for parameter, state in optimizer.state.items():
         if parameter.device.type == "cpu" and state["step"] % 20 == 0:
-            for name, least in (("exp_avg", 1e-20), ("exp_avg_sq", 1e-36)):  # beside eps = 1e-8, and its square
+            for name, least in (
+                ("exp_avg", 1e-20),
+                ("exp_avg_sq", 1e-36),
+            ):  # beside eps = 1e-8, and its square
                 torch.hardshrink(state[name], least, out=state[name])
 
 

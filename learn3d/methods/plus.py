@@ -96,7 +96,9 @@ class Plus(PoseInvariant):
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
         if self.settings.uses_discriminator and networks["generator"].mirror is not None:
-            networks["discriminator"] = pose_discriminator(2 * self.info.num_views)  # flipped views are other views
+            networks["discriminator"] = pose_discriminator(
+                2 * self.info.num_views
+            )  # flipped views are other views
         if self.settings.lambda_novel_view > 0:
             networks["mask_bank"] = MaskBank(self.settings.bank_size)
         return networks | self.create_view_classifier()
@@ -130,7 +132,12 @@ class Plus(PoseInvariant):
         silhouettes = self.render(vertices, whole.poses[torch.full((len(vertices),), seen_by)])
         silhouettes = all_gather(_reduced(silhouettes))
         masks = self.mask_bank.of_view(int(whole.view_ids[seen_by])).to(silhouettes.device)
-        return {"novel_view": (self.settings.lambda_novel_view, silhouette_energy_distance(silhouettes, masks))}
+        return {
+            "novel_view": (
+                self.settings.lambda_novel_view,
+                silhouette_energy_distance(silhouettes, masks),
+            )
+        }
 
 
 def _reduced(silhouettes: Tensor) -> Tensor:

@@ -50,7 +50,11 @@ class PoseInvariantSettings(MeshSettings):
 
     @property
     def varies_over_run(self) -> str | None:
-        return "lambda_smooth_end" if self.lambda_smooth_end is not None and self.lambda_smooth > 0 else None
+        return (
+            "lambda_smooth_end"
+            if self.lambda_smooth_end is not None and self.lambda_smooth > 0
+            else None
+        )
 
     @property
     def uses_discriminator(self) -> bool:
@@ -58,7 +62,11 @@ class PoseInvariantSettings(MeshSettings):
         return self.lambda_classification > 0 or self.lambda_adversarial > 0
 
     def for_data(self, info: DatasetInfo) -> PoseInvariantSettings:
-        area = self.lambda_area if self.lambda_area != "auto" else COMPACT_AREA_WEIGHT * is_compact(info)
+        area = (
+            self.lambda_area
+            if self.lambda_area != "auto"
+            else COMPACT_AREA_WEIGHT * is_compact(info)
+        )
         return dataclasses.replace(super().for_data(info), lambda_area=area)
 
 
@@ -104,7 +112,10 @@ class PoseInvariant(MeshMethod):
         settings = self.settings
         losses: Losses = {}
         if settings.lambda_prior > 0:
-            losses["prior"] = (settings.lambda_prior, gaussian_prior_loss(codes, settings.prior_form))
+            losses["prior"] = (
+                settings.lambda_prior,
+                gaussian_prior_loss(codes, settings.prior_form),
+            )
         discriminator_turn = step % 2 == 1
         if discriminator_turn and settings.lambda_classification > 0:
             logits = self.discriminator(codes.detach())

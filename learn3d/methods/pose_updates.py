@@ -42,11 +42,15 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
             shapes = method.decode(method.encode(batch.images))
             poses = candidates.poses[(rows[:, None] * count + torch.arange(count)).flatten()]
             vertices = shapes.vertices.repeat_interleave(count, 0)
-            silhouettes = nmr.render_silhouette(vertices, shapes.faces, poses.cameras(), image_size=SIZE)
+            silhouettes = nmr.render_silhouette(
+                vertices, shapes.faces, poses.cameras(), image_size=SIZE
+            )
             masks = F.avg_pool2d(batch.masks[:, None], MASK_SIZE // SIZE).expand(-1, count, -1, -1)
             silhouettes = silhouettes.view(masks.shape)
             common = (silhouettes * masks).sum((2, 3))
-            logits.append(common / ((silhouettes + masks).sum((2, 3)) - common).clamp_min(1e-6) / TEMPERATURE)
+            logits.append(
+                common / ((silhouettes + masks).sum((2, 3)) - common).clamp_min(1e-6) / TEMPERATURE
+            )
     prior = torch.from_numpy(candidates.prior)
     logits = torch.cat(logits) + prior.clamp_min(_LEAST_PRIOR).log()
     weights = _with_marginal(logits, candidates.poses.azimuth_deg.view(prior.shape), prior).numpy()
@@ -62,6 +66,8 @@ def _with_marginal(logits: Tensor, azimuth_deg: Tensor, prior: Tensor) -> Tensor
     wanted = torch.bincount(cell, prior.flatten(), minlength=cells).clamp_min(1e-6)
     weights, shift = logits.softmax(1), torch.zeros(cells, dtype=torch.float64)
     for _ in range(_ROUNDS):
-        shift += (wanted / torch.bincount(cell, weights.flatten(), minlength=cells).clamp_min(1e-6)).log()
+        shift += (
+            wanted / torch.bincount(cell, weights.flatten(), minlength=cells).clamp_min(1e-6)
+        ).log()
         weights = (logits + shift[cell].float().view(logits.shape)).softmax(1)
     return weights

@@ -108,7 +108,9 @@ class PrGAN(Method):
     def views(self) -> ViewCircle:
         """The K views of the projected silhouettes."""
         settings = self.settings
-        return ViewCircle(self.info.num_views, settings.elevation_deg, settings.distance, settings.half_fov_deg)
+        return ViewCircle(
+            self.info.num_views, settings.elevation_deg, settings.distance, settings.half_fov_deg
+        )
 
     def check_batch(self, batch: Batch) -> None:
         check_views(batch.poses, batch.view_ids, self.views)
@@ -151,7 +153,9 @@ class PrGAN(Method):
         accuracy = self.accuracy(real, z)
         self.networks.train()
         fake = self.generate(z)
-        losses: Losses = {"accuracy": (0.0, accuracy)}  # it is logged with the first phase, and has no gradient
+        losses: Losses = {
+            "accuracy": (0.0, accuracy)
+        }  # it is logged with the first phase, and has no gradient
         if accuracy <= self.settings.accuracy_margin:
             with self.autocast():
                 of_real = self.discriminator(real).float()
@@ -169,7 +173,10 @@ class PrGAN(Method):
             first = self.discriminator.first
             of_real = frozen(first, real[:, None]).float()
             of_fake = frozen(first, self.generate(z)[:, None]).float()
-        yield {"generator_statistics": (1.0, statistics_loss(of_real, of_fake))}, ("generator_statistics",)
+        yield (
+            {"generator_statistics": (1.0, statistics_loss(of_real, of_fake))},
+            ("generator_statistics",),
+        )
 
     def encoder_loss(self, z: Tensor) -> Tensor:
         """Summed squared error of the z that the encoder predicts from samples of the generator, which is in evaluation
@@ -181,7 +188,9 @@ class PrGAN(Method):
         with self.autocast():
             estimate = self.encoder(images)
         difference = estimate.float() - z.to(self.device, non_blocking=True)
-        return size() * difference.square().sum()  # the sum over all ranks, whose losses are averaged
+        return (
+            size() * difference.square().sum()
+        )  # the sum over all ranks, whose losses are averaged
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> Tensor:
@@ -221,7 +230,9 @@ def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
     wrong = (off.abs() > torch.tensor([0.5, 0.5, 0.005 * views.distance, 0.1])).any(1)
     if bool(wrong.any()):
         first = int(wrong.nonzero()[0])
-        numbers = "azimuth {:g}, elevation {:g}, distance {:g}, half field of view {:g}".format(*found[first].tolist())
+        numbers = "azimuth {:g}, elevation {:g}, distance {:g}, half field of view {:g}".format(
+            *found[first].tolist()
+        )
         raise ValueError(
             f"{wanted}; a camera of view {int(view_ids[first])} has {numbers}. Take data in Kato's layout, or give "
             "the data set's own elevation_deg, distance and half_fov_deg"

@@ -20,7 +20,11 @@ from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.method import Losses
 from learn3d.methods.optimization import frozen
-from learn3d.networks.discriminators import OneHotViewDiscriminator, PatchDiscriminator, SpectralPatchDiscriminator
+from learn3d.networks.discriminators import (
+    OneHotViewDiscriminator,
+    PatchDiscriminator,
+    SpectralPatchDiscriminator,
+)
 from learn3d.networks.encoders import ENCODERS, PreactResNet18
 from learn3d.networks.generators import GENERATORS
 from learn3d.networks.layers import reverse_gradient
@@ -78,14 +82,18 @@ class VPLSettings(MeshSettings):
 
     @property
     def reads_view_ids(self) -> bool:
-        return self.lambda_discriminator > 0 and (self.discriminator == "dcgan" or self.other_views == "random")
+        return self.lambda_discriminator > 0 and (
+            self.discriminator == "dcgan" or self.other_views == "random"
+        )
 
     def __post_init__(self) -> None:
         size = self.image_size
         if self.encoder == "conv" and size != ENCODERS["conv"].image_size:
             raise ValueError(f"encoder 'conv' takes images of 64 pixels, got image_size {size}")
         if size % 32:
-            raise ValueError(f"image_size must be a multiple of 32 for encoder {self.encoder!r}, got {size}")
+            raise ValueError(
+                f"image_size must be a multiple of 32 for encoder {self.encoder!r}, got {size}"
+            )
         if self.silhouette_size not in (MASK_SIZE, size):
             raise ValueError(
                 f"silhouette_size must be {MASK_SIZE}, the size of the data's masks, or image_size ({size}), got "
@@ -93,11 +101,15 @@ class VPLSettings(MeshSettings):
             )
         super().__post_init__()
         if self.class_conditional and self.discriminator != "spectral-patch":
-            raise ValueError(f"class_conditional needs discriminator 'spectral-patch', got {self.discriminator!r}")
+            raise ValueError(
+                f"class_conditional needs discriminator 'spectral-patch', got {self.discriminator!r}"
+            )
 
     def check_run(self, *, iterations: int, batch_size: int) -> None:
         if self.lambda_discriminator > 0 and batch_size < 2:
-            raise ValueError("view prior learning needs another view for each image: batches of at least 2, got 1")
+            raise ValueError(
+                "view prior learning needs another view for each image: batches of at least 2, got 1"
+            )
 
     def for_data(self, info: DatasetInfo) -> "VPLSettings":
         settings = super().for_data(info)
@@ -121,7 +133,9 @@ class VPL(MeshMethod):
             encoder = PreactResNet18(settings.image_size)
         elif settings.encoder == "resnet18":
             frozen_norms = settings.pretrained is not None
-            encoder = ResNet18Encoder(info.inverted, flat_size=settings.image_size, frozen_norms=frozen_norms)
+            encoder = ResNet18Encoder(
+                info.inverted, flat_size=settings.image_size, frozen_norms=frozen_norms
+            )
         else:
             encoder = ENCODERS[settings.encoder](info.inverted)
         scales = {}
@@ -138,7 +152,9 @@ class VPL(MeshMethod):
             num_classes = info.num_classes if settings.class_conditional else None
             discriminator = SpectralPatchDiscriminator(info.pose_features, channels, num_classes)
         else:
-            discriminator = OneHotViewDiscriminator(info.num_views, channels, settings.silhouette_size)
+            discriminator = OneHotViewDiscriminator(
+                info.num_views, channels, settings.silhouette_size
+            )
         return networks | {"discriminator": discriminator}
 
     def losses(self, batch: Batch, step: int) -> Losses:
@@ -153,18 +169,26 @@ class VPL(MeshMethod):
         is_baseline = settings.lambda_discriminator == 0
         others = own[:0] if is_baseline else other_views(whole, settings.other_views)[own]
         vertices = self.predict(batch.images)[1].cpu()
-        both = torch.cat([vertices, vertices[: len(others)]])  # both views of each shape in one call
-        silhouettes, elsewhere = self.render(both, whole.poses[torch.cat([own, others])]).tensor_split([len(batch)])
+        both = torch.cat(
+            [vertices, vertices[: len(others)]]
+        )  # both views of each shape in one call
+        silhouettes, elsewhere = self.render(
+            both, whole.poses[torch.cat([own, others])]
+        ).tensor_split([len(batch)])
         projection = self._projection_loss(silhouettes, batch)
         losses: Losses = {"projection": (1.0, projection), **self.surface_losses(vertices, step)}
         if is_baseline:
             return losses
         if settings.adversary == "reversal":
-            real, fake = (reverse_gradient(s, settings.lambda_discriminator) for s in (silhouettes, elsewhere))
+            real, fake = (
+                reverse_gradient(s, settings.lambda_discriminator) for s in (silhouettes, elsewhere)
+            )
         elif step % 2 == 1:
             real, fake = silhouettes.detach(), elsewhere.detach()
         else:
-            logits = self._discriminate(functools.partial(frozen, self.discriminator), elsewhere, whole, others, own)
+            logits = self._discriminate(
+                functools.partial(frozen, self.discriminator), elsewhere, whole, others, own
+            )
             losses["adversarial"] = (settings.lambda_discriminator, F.softplus(-logits).mean())
             return losses
         of_real = self._discriminate(self.discriminator, real, whole, own, own)
@@ -175,7 +199,10 @@ class VPL(MeshMethod):
     def surface_losses(self, vertices: Tensor, step: int) -> Losses:
         losses = super().surface_losses(vertices, step)
         if self.settings.lambda_inflation > 0:
-            losses["inflation"] = (self.settings.lambda_inflation, nmr.losses.inflation_loss(vertices, self.faces))
+            losses["inflation"] = (
+                self.settings.lambda_inflation,
+                nmr.losses.inflation_loss(vertices, self.faces),
+            )
         return losses
 
     def render(self, vertices: Tensor, poses: Poses) -> Tensor:
@@ -195,16 +222,25 @@ class VPL(MeshMethod):
         if self.settings.silhouette_size != MASK_SIZE:
             masks = (batch.images[:, 3] >= MASK_THRESHOLD * 255).to(silhouettes)
         pyramid = self.settings.silhouette_loss == "pyramid"
-        return (silhouette_pyramid_loss if pyramid else nmr.losses.soft_iou_loss)(silhouettes, masks)
+        return (silhouette_pyramid_loss if pyramid else nmr.losses.soft_iou_loss)(
+            silhouettes, masks
+        )
 
     def _discriminate(
-        self, network: Callable[..., Tensor], silhouettes: Tensor, batch: Batch, seen_at: Tensor, own: Tensor
+        self,
+        network: Callable[..., Tensor],
+        silhouettes: Tensor,
+        batch: Batch,
+        seen_at: Tensor,
+        own: Tensor,
     ) -> Tensor:
         """Logits for silhouettes [b,S,S] of the shapes `own` of a whole batch, seen at its views `seen_at`."""
         silhouettes = silhouettes.to(self.device, non_blocking=True)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
-                return network(silhouettes, batch.view_ids[seen_at].to(self.device, non_blocking=True)).float()
+                return network(
+                    silhouettes, batch.view_ids[seen_at].to(self.device, non_blocking=True)
+                ).float()
         # autocast is off: with it, spectral normalisation mixes dtypes
         conditions = [batch.poses[seen_at].features().to(self.device, non_blocking=True)]
         if self.settings.class_conditional:

@@ -32,11 +32,16 @@ class OneHotViewDiscriminator(nn.Module):
     def __init__(self, num_views: int, channels: int = 128, silhouette_size: int = 64) -> None:
         super().__init__()
         self.num_views = num_views
-        layers: list[nn.Module] = [nn.Conv2d(1 + num_views, channels, 4, stride=2, padding=1), nn.LeakyReLU(SLOPE)]
+        layers: list[nn.Module] = [
+            nn.Conv2d(1 + num_views, channels, 4, stride=2, padding=1),
+            nn.LeakyReLU(SLOPE),
+        ]
         for before in (channels, 2 * channels, 4 * channels):
             convolution = nn.Conv2d(before, 2 * before, 4, stride=2, padding=1)
             layers += [convolution, nn.BatchNorm2d(2 * before), nn.LeakyReLU(SLOPE)]
-        self.layers = nn.Sequential(*layers, nn.Flatten(), nn.Linear(8 * channels * (silhouette_size // 16) ** 2, 1))
+        self.layers = nn.Sequential(
+            *layers, nn.Flatten(), nn.Linear(8 * channels * (silhouette_size // 16) ** 2, 1)
+        )
 
     def forward(self, silhouettes: Tensor, view_ids: Tensor) -> Tensor:
         planes = F.one_hot(view_ids, self.num_views).to(silhouettes)
@@ -52,14 +57,21 @@ class SpectralPatchDiscriminator(nn.Module):
     projection (Miyato and Koyama 2018): the product of a learned vector of the class with the last features.
     """
 
-    def __init__(self, view_features: int, channels: int = 32, num_classes: int | None = None) -> None:
+    def __init__(
+        self, view_features: int, channels: int = 32, num_classes: int | None = None
+    ) -> None:
         super().__init__()
-        self.first = nn.Sequential(_spectral_conv(1, channels), *_norm_without_gain(nn.BatchNorm2d(channels)))
+        self.first = nn.Sequential(
+            _spectral_conv(1, channels), *_norm_without_gain(nn.BatchNorm2d(channels))
+        )
         self.view = nn.Sequential(
-            spectral_norm(nn.Linear(view_features, channels, bias=False)), *_norm_without_gain(nn.BatchNorm1d(channels))
+            spectral_norm(nn.Linear(view_features, channels, bias=False)),
+            *_norm_without_gain(nn.BatchNorm1d(channels)),
         )
         layers: list[nn.Module] = []
-        for before, after in itertools.pairwise((2 * channels, 2 * channels, 4 * channels, 8 * channels, 8 * channels)):
+        for before, after in itertools.pairwise(
+            (2 * channels, 2 * channels, 4 * channels, 8 * channels, 8 * channels)
+        ):
             layers += [_spectral_conv(before, after), *_norm_without_gain(nn.BatchNorm2d(after))]
         self.layers = nn.Sequential(*layers)
         self.last = _spectral_conv(8 * channels, 1, bias=True)
@@ -67,7 +79,9 @@ class SpectralPatchDiscriminator(nn.Module):
         if num_classes is not None:
             self.classes = spectral_norm(nn.Linear(num_classes, 8 * channels, bias=False))
 
-    def forward(self, silhouettes: Tensor, views: Tensor, class_ids: Tensor | None = None) -> Tensor:
+    def forward(
+        self, silhouettes: Tensor, views: Tensor, class_ids: Tensor | None = None
+    ) -> Tensor:
         """`views` float [B,C]; `class_ids` int64 [B], only with `num_classes`."""
         features = self.layers(_append(self.first(silhouettes.unsqueeze(1)), self.view(views)))
         logits = self.last(features).squeeze(1)
@@ -88,7 +102,9 @@ class PatchDiscriminator(nn.Module):
 
     def __init__(self, view_features: int, channels: int = 64) -> None:
         super().__init__()
-        self.first = nn.Sequential(nn.Conv2d(1, channels, 4, stride=2, padding=2), nn.LeakyReLU(SLOPE))
+        self.first = nn.Sequential(
+            nn.Conv2d(1, channels, 4, stride=2, padding=2), nn.LeakyReLU(SLOPE)
+        )
         self.view = nn.Sequential(nn.Linear(view_features, channels), nn.LeakyReLU(SLOPE))
         layers: list[nn.Module] = []
         for before, after, stride in ((2, 2, 2), (2, 4, 2), (4, 8, 1)):
@@ -99,7 +115,9 @@ class PatchDiscriminator(nn.Module):
 
     def forward(self, silhouettes: Tensor, views: Tensor) -> Tensor:
         """`views` float [B,C]."""
-        return self.layers(_append(self.first(silhouettes.unsqueeze(1)), self.view(views))).squeeze(1)
+        return self.layers(_append(self.first(silhouettes.unsqueeze(1)), self.view(views))).squeeze(
+            1
+        )
 
 
 def _append(features: Tensor, view: Tensor) -> Tensor:

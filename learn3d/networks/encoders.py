@@ -28,7 +28,9 @@ class ConvEncoder(nn.Module):
     def __init__(self, inverted: bool = True) -> None:
         super().__init__()
         self.convolutions = _convolutions(*self.channels)
-        self.layers = linear_layers(self.channels[-1] * (self.image_size // 8) ** 2, *self.hidden_sizes, CODE_SIZE)
+        self.layers = linear_layers(
+            self.channels[-1] * (self.image_size // 8) ** 2, *self.hidden_sizes, CODE_SIZE
+        )
 
     def forward(self, images: Tensor) -> Tensor:
         # The last ReLU follows the change of memory layout; before it, its gradient would take 9 ms of a 270 ms step.
@@ -53,8 +55,12 @@ class LightConvEncoder(ConvEncoder):
     def __init__(self, inverted: bool = True) -> None:
         nn.Module.__init__(self)
         self.inverted, narrow = inverted, 32
-        self.convolutions = _convolutions(32, 64, 128).extend([nn.Conv2d(128, narrow, 1), nn.ReLU()])
-        self.layers = linear_layers(narrow * (self.image_size // 8) ** 2, *self.hidden_sizes, CODE_SIZE)
+        self.convolutions = _convolutions(32, 64, 128).extend(
+            [nn.Conv2d(128, narrow, 1), nn.ReLU()]
+        )
+        self.layers = linear_layers(
+            narrow * (self.image_size // 8) ** 2, *self.hidden_sizes, CODE_SIZE
+        )
         initialize_he(self.convolutions)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -90,7 +96,9 @@ class ViewClassifier(nn.Module):
     def __init__(self, num_views: int, inverted: bool) -> None:
         super().__init__()
         self.inverted = inverted
-        self.convolutions = _convolutions(16, 32, 64).extend([nn.Conv2d(64, 64, 3, stride=2, padding=1), nn.ReLU()])
+        self.convolutions = _convolutions(16, 32, 64).extend(
+            [nn.Conv2d(64, 64, 3, stride=2, padding=1), nn.ReLU()]
+        )
         self.layers = linear_layers(64 * 4 * 4, 128, num_views)
         initialize_he(self.convolutions)
 
@@ -109,7 +117,10 @@ def centre(images: Tensor, object_size: float = CENTRED_SIZE) -> Tensor:
     extents, middles = [], []
     for axis in (1, 2):
         touched = inside.any(axis)
-        first, last = touched.int().argmax(1), size - touched.flip(1).int().argmax(1)  # `last` is excluded
+        first, last = (
+            touched.int().argmax(1),
+            size - touched.flip(1).int().argmax(1),
+        )  # `last` is excluded
         extents.append(last - first)
         middles.append((first + last) / size - 1)
     scale = torch.maximum(*extents) / (size * object_size)
@@ -174,7 +185,10 @@ class PreactResNet18(nn.Module):
     def __init__(self, image_size: int = 224, channels: int = 64) -> None:
         super().__init__()
         layers = [nn.Conv2d(3, channels, 7, stride=2, padding=3, bias=False), *norm_relu(channels)]
-        layers += [nn.MaxPool2d(3, stride=2, ceil_mode=True), _Block(channels, channels, first=True)]
+        layers += [
+            nn.MaxPool2d(3, stride=2, ceil_mode=True),
+            _Block(channels, channels, first=True),
+        ]
         layers.append(_Block(channels, channels))
         for width in (2 * channels, 4 * channels, 8 * channels):
             layers += [_Block(width // 2, width), _Block(width, width)]
@@ -201,7 +215,9 @@ class _Block(nn.Module):
             *norm_relu(after),
             nn.Conv2d(after, after, 3, padding=1, bias=False),
         )
-        self.shortcut = nn.Identity() if stride == 1 else nn.Conv2d(before, after, 1, stride=2, bias=False)
+        self.shortcut = (
+            nn.Identity() if stride == 1 else nn.Conv2d(before, after, 1, stride=2, bias=False)
+        )
 
     def forward(self, features: Tensor) -> Tensor:
         return self.shortcut(features) + self.residual(features)

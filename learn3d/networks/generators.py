@@ -29,7 +29,9 @@ class MeshGenerator(nn.Module):
     faces: Tensor  # int64 [F,3]
     edges: Tensor  # int64 [E,4]: the table of `nmr.edge_table`
     mirror: Tensor | None  # int64 [V]: index of each vertex's mirror image; None without symmetry
-    rotation: Tensor | None  # float32 [3,3]: turns the plane z = 0 to the plane `symmetry`; None if they are the same
+    rotation: (
+        Tensor | None
+    )  # float32 [3,3]: turns the plane z = 0 to the plane `symmetry`; None if they are the same
 
     def __init__(self, points: Tensor, faces: Tensor, symmetry: Symmetry | None) -> None:
         super().__init__()
@@ -39,9 +41,14 @@ class MeshGenerator(nn.Module):
             tables["mirror"] = torch.cdist(mirrored.double(), points.double()).argmin(dim=1)
         if symmetry not in (None, "z"):
             angle = math.radians(0.0 if symmetry == "x" else symmetry)
-            sine, cosine = round(math.sin(angle), 12), round(math.cos(angle), 12)  # exact for quarter turns
+            sine, cosine = (
+                round(math.sin(angle), 12),
+                round(math.cos(angle), 12),
+            )  # exact for quarter turns
             # The x axis is turned towards the eye, in direction (sin a, -cos a) of (x, z).
-            tables["rotation"] = torch.tensor([[sine, 0.0, -cosine], [0.0, 1.0, 0.0], [cosine, 0.0, sine]])
+            tables["rotation"] = torch.tensor(
+                [[sine, 0.0, -cosine], [0.0, 1.0, 0.0], [cosine, 0.0, sine]]
+            )
         for name, table in tables.items():
             self.register_buffer(name, table, persistent=False)
 
@@ -49,13 +56,17 @@ class MeshGenerator(nn.Module):
         """Turn vertices that are symmetric about z = 0 to the plane `symmetry`."""
         if self.rotation is None:
             return vertices
-        return (vertices[..., None] * self.rotation).sum(-2)  # autocast would round a matrix product to bf16
+        return (vertices[..., None] * self.rotation).sum(
+            -2
+        )  # autocast would round a matrix product to bf16
 
     def symmetrized(self, vertices: Tensor) -> Tensor:
         """The mean of placed vertices [B,V,3] and their mirror images; `vertices` without symmetry."""
         if self.mirror is None:
             return vertices
-        mirrored = vertices[:, self.mirror.to(vertices.device), :, None] * self.reflection.to(vertices)
+        mirrored = vertices[:, self.mirror.to(vertices.device), :, None] * self.reflection.to(
+            vertices
+        )
         return (vertices + mirrored.sum(-2)) / 2
 
     @property
@@ -85,7 +96,9 @@ class SphereGenerator(MeshGenerator):
     """
 
     sphere: Tensor  # float32 [642,3]
-    source: Tensor  # int64 [642,3]: index of each coordinate's output; the index after the last means 0
+    source: (
+        Tensor  # int64 [642,3]: index of each coordinate's output; the index after the last means 0
+    )
     sign: Tensor  # float32 [642,3]: -1 if the coordinate is the opposite of the output
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:
@@ -94,7 +107,10 @@ class SphereGenerator(MeshGenerator):
         self.register_buffer("sphere", sphere.float(), persistent=False)
         self.outputs = sphere.numel()
         if symmetry is not None:
-            middle, right = (torch.nonzero(side)[:, 0] for side in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0))
+            middle, right = (
+                torch.nonzero(side)[:, 0]
+                for side in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0)
+            )
             self.outputs = 2 * len(middle) + 3 * len(right)
             source, sign = torch.full(self.sphere.shape, self.outputs), torch.ones_like(self.sphere)
             source[middle, :2] = torch.arange(2 * len(middle)).reshape(-1, 2)
@@ -134,7 +150,9 @@ class SmoothSphereGenerator(SphereGenerator):
         neighbours[first, second] = neighbours[second, first] = 1
         laplacian = torch.diag(neighbours.sum(1)) - neighbours
         free_share, stiffness = 0.2, 3.0
-        mixing = free_share * identity + (1 - free_share) * torch.linalg.inv(identity + stiffness * laplacian)
+        mixing = free_share * identity + (1 - free_share) * torch.linalg.inv(
+            identity + stiffness * laplacian
+        )
         self.register_buffer("mixing", mixing.float(), persistent=False)
 
     def displacements(self, codes: Tensor) -> Tensor:
@@ -227,7 +245,11 @@ class ConvCubeGenerator(CubeGenerator):
     shares: Tensor  # float32 [V,3,1]: their weights 1, 1/2 or 1/3; 0 for the padding
 
     def __init__(
-        self, symmetry: Symmetry | None = None, scale: float = 0.01, object_scale: float = 0.5, channels: int = 512
+        self,
+        symmetry: Symmetry | None = None,
+        scale: float = 0.01,
+        object_scale: float = 0.5,
+        channels: int = 512,
     ) -> None:
         super().__init__(scale, object_scale, symmetry)
         self.sides = nn.ModuleList(_side_decoder(channels) for _ in self.patches)
@@ -247,10 +269,17 @@ class ConvCubeGenerator(CubeGenerator):
 
 
 def _side_decoder(channels: int) -> nn.Sequential:
-    layers: list[nn.Module] = [nn.Linear(CODE_SIZE, 4 * channels, bias=False), nn.Unflatten(1, (channels, 2, 2))]
+    layers: list[nn.Module] = [
+        nn.Linear(CODE_SIZE, 4 * channels, bias=False),
+        nn.Unflatten(1, (channels, 2, 2)),
+    ]
     layers += norm_relu(channels)
     for width in (channels // 2, channels // 4, channels // 8):
-        layers.append(nn.ConvTranspose2d(2 * width, width, 3, stride=2, padding=1, output_padding=1, bias=False))
+        layers.append(
+            nn.ConvTranspose2d(
+                2 * width, width, 3, stride=2, padding=1, output_padding=1, bias=False
+            )
+        )
         layers += norm_relu(width)
     decoder = nn.Sequential(*layers, nn.Conv2d(width, 3, 3, padding=1))
     initialize_he(decoder)
@@ -261,7 +290,11 @@ class LinearCubeGenerator(CubeGenerator):
     """Linear layers 512-4096-4096-1352*3 with ReLU (Pascal3D+)."""
 
     def __init__(
-        self, symmetry: Symmetry | None = None, scale: float = 0.1, object_scale: float = 1.0, channels: int = 4096
+        self,
+        symmetry: Symmetry | None = None,
+        scale: float = 0.1,
+        object_scale: float = 1.0,
+        channels: int = 4096,
     ) -> None:
         super().__init__(scale, object_scale, symmetry)
         self.layers = linear_layers(CODE_SIZE, channels, channels, self.base.numel())

@@ -27,7 +27,9 @@ class _Block(nn.Module):
         self.bn2 = nn.BatchNorm2d(outputs)
         self.downsample = None
         if inputs != outputs:
-            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+            self.downsample = nn.Sequential(
+                nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs)
+            )
 
     def forward(self, x: Tensor) -> Tensor:
         shortcut = x if self.downsample is None else self.downsample(x)
@@ -48,7 +50,9 @@ class ResNet18Encoder(nn.Module):
 
     image_size = 224
 
-    def __init__(self, inverted: bool = False, *, flat_size: int | None = None, frozen_norms: bool = False) -> None:
+    def __init__(
+        self, inverted: bool = False, *, flat_size: int | None = None, frozen_norms: bool = False
+    ) -> None:
         super().__init__()
         self.inverted = inverted
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
@@ -64,7 +68,9 @@ class ResNet18Encoder(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         self.code = None if flat_size is None else nn.Linear(512 * (flat_size // 32) ** 2, 512)
         norms = [module for module in self.modules() if isinstance(module, nn.BatchNorm2d)]
-        self.frozen_norms = [norm.requires_grad_(False).eval() for norm in norms] if frozen_norms else []
+        self.frozen_norms = (
+            [norm.requires_grad_(False).eval() for norm in norms] if frozen_norms else []
+        )
 
     def train(self, mode: bool = True) -> ResNet18Encoder:
         super().train(mode)
@@ -87,15 +93,26 @@ def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
 
     Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has weights of another network.
     """
-    from learn3d.files import formats, sandbox  # here, as a training without pretrained weights reads no such file
+    from learn3d.files import (
+        formats,
+        sandbox,
+    )  # here, as a training without pretrained weights reads no such file
 
     read = sandbox.read(formats.read_state_dict, path, wanted="weights of torchvision's resnet18")
-    weights = {name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")}
-    weights |= {name: value for name, value in encoder.state_dict().items() if name.startswith("code.")}
+    weights = {
+        name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")
+    }
+    weights |= {
+        name: value for name, value in encoder.state_dict().items() if name.startswith("code.")
+    }
     try:
         encoder.load_state_dict(weights)
-        if odd := [name for name, value in encoder.state_dict().items() if not value.isfinite().all()]:
+        if odd := [
+            name for name, value in encoder.state_dict().items() if not value.isfinite().all()
+        ]:
             raise RuntimeError(f"{odd[0]} is not finite")
     except RuntimeError as error:
         message = textwrap.shorten(str(error), 300)
-        raise ValueError(f"{path} must be a state dict of torchvision's resnet18: {message}") from None
+        raise ValueError(
+            f"{path} must be a state dict of torchvision's resnet18: {message}"
+        ) from None

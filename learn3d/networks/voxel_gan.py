@@ -34,7 +34,9 @@ class DoublingConvolution(nn.ConvTranspose3d):
         super().__init__(before, after, 4, stride=2, padding=1)
 
     def forward(self, features: Tensor) -> Tensor:
-        if self.out_channels == 1 and features.device.type == "cpu":  # torch takes four times as long
+        if (
+            self.out_channels == 1 and features.device.type == "cpu"
+        ):  # torch takes four times as long
             return _Double.apply(features, self.weight, self.bias)
         return super().forward(features)
 
@@ -62,7 +64,16 @@ class _Double(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:
         stride, padding, dilation, output_padding = [2] * 3, [1] * 3, [1] * 3, [0] * 3
         return torch.ops.aten.convolution_backward(
-            grad, *ctx.saved_tensors, [1], stride, padding, dilation, True, output_padding, 1, ctx.needs_input_grad
+            grad,
+            *ctx.saved_tensors,
+            [1],
+            stride,
+            padding,
+            dilation,
+            True,
+            output_padding,
+            1,
+            ctx.needs_input_grad,
         )
 
 
@@ -86,7 +97,10 @@ class VoxelGenerator(nn.Module):
 
     def forward(self, codes: Tensor) -> Tensor:
         features = self.first(codes).reshape(len(codes), -1, 4, 4, 4)
-        return torch.sigmoid(self.layers(features.to(memory_format=torch.channels_last_3d)))[:, 0] / TAU
+        return (
+            torch.sigmoid(self.layers(features.to(memory_format=torch.channels_last_3d)))[:, 0]
+            / TAU
+        )
 
 
 class SilhouetteDiscriminator(nn.Module):
@@ -98,7 +112,11 @@ class SilhouetteDiscriminator(nn.Module):
     def __init__(self, channels: Sequence[int] = DISCRIMINATOR_CHANNELS) -> None:
         super().__init__()
         self.first, *others = (
-            nn.Sequential(nn.Conv2d(before, after, 5, stride=2, padding=2), nn.BatchNorm2d(after), nn.LeakyReLU(0.2))
+            nn.Sequential(
+                nn.Conv2d(before, after, 5, stride=2, padding=2),
+                nn.BatchNorm2d(after),
+                nn.LeakyReLU(0.2),
+            )
             for before, after in itertools.pairwise((1, *channels))
         )
         self.others = nn.Sequential(*others)
@@ -119,7 +137,10 @@ class InverseEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(IMAGE_SIZE**2, 512), nn.LeakyReLU(0.2), nn.Linear(512, 512), nn.Linear(512, SHAPE_CODE + 1)
+            nn.Linear(IMAGE_SIZE**2, 512),
+            nn.LeakyReLU(0.2),
+            nn.Linear(512, 512),
+            nn.Linear(512, SHAPE_CODE + 1),
         )
         self.apply(_initialise)
 
@@ -166,9 +187,15 @@ class ViewCircle:
 
         Samples are as far apart as pixels; D of them cover the diagonal of the unit cube.
         """
-        eye = nmr.cameras.points_from_angles(self.distance, self.elevation_deg, azimuth_deg).double().reshape(3)
+        eye = (
+            nmr.cameras.points_from_angles(self.distance, self.elevation_deg, azimuth_deg)
+            .double()
+            .reshape(3)
+        )
         z_axis = -F.normalize(eye, dim=0)
-        x_axis = F.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), z_axis), dim=0)
+        x_axis = F.normalize(
+            torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), z_axis), dim=0
+        )
         y_axis = torch.linalg.cross(z_axis, x_axis)
         step = 2 * self.half_width / size
         across = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * step
@@ -192,7 +219,10 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     volumes, parts, order = density.unbind(), [], []
     for base in (view_ids % quarter).unique().tolist():
         members = (view_ids % quarter == base).nonzero()[:, 0]
-        turned = [volumes[i].rot90(int(view_ids[i]) // quarter, (0, 2)).reshape(-1) for i in members.tolist()]
+        turned = [
+            volumes[i].rot90(int(view_ids[i]) // quarter, (0, 2)).reshape(-1)
+            for i in members.tolist()
+        ]
         forward, backward = ray_table(views, base, size, density.device)
         parts.append(_Integrate.apply(torch.stack(turned, dim=1), *forward, *backward).T)
         order.append(members)
@@ -200,11 +230,15 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     return 1 - torch.exp(-tau * thickness).reshape(-1, size, size)
 
 
-Table = tuple[Tensor, Tensor, Tensor]  # a sparse matrix by rows: columns int32, row starts int32, values float32
+Table = tuple[
+    Tensor, Tensor, Tensor
+]  # a sparse matrix by rows: columns int32, row starts int32, values float32
 
 
 @functools.lru_cache(maxsize=64)
-def ray_table(views: ViewCircle, view_id: int, size: int, device: torch.device) -> tuple[Table, Table]:
+def ray_table(
+    views: ViewCircle, view_id: int, size: int, device: torch.device
+) -> tuple[Table, Table]:
     """The linear map of one view as a sparse matrix [S^2 pixels, S^3 voxels], and its transpose."""
     points = views.sample_points(float(views.azimuth_deg(torch.tensor(view_id))), size)
     position = (points.movedim(3, 0) + 0.5) * size - 0.5  # in voxels; centres are whole numbers

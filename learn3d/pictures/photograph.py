@@ -10,18 +10,26 @@ from trimesh.graph import connected_component_labels
 
 import nmr
 
-KEY_LIGHT = (0.45, 0.8, -0.4)  # towards the light, object frame (x right, y up, -z towards the camera of view 0)
+KEY_LIGHT = (
+    0.45,
+    0.8,
+    -0.4,
+)  # towards the light, object frame (x right, y up, -z towards the camera of view 0)
 BACK_LIGHT = 0.35  # strength of the light from the opposite side, relative to the key light
 
 
-def studio_lights(light: Sequence[float] = KEY_LIGHT, ambient: float = 0.5, smooth: bool = False) -> nmr.Lights:
+def studio_lights(
+    light: Sequence[float] = KEY_LIGHT, ambient: float = 0.5, smooth: bool = False
+) -> nmr.Lights:
     """A key light from the direction `light` (of any length but 0), a weaker one from behind, and ambient light.
 
     ambient: its share in 0 .. 1; a surface that faces the key light has the brightness 1. smooth: interpolate normals.
     """
     key, direction = 1.0 - ambient, torch.as_tensor(light, dtype=torch.float64)
     direction = direction / direction.norm()
-    return nmr.Lights(ambient, [key, BACK_LIGHT * key], torch.stack([direction, -direction]), smooth=smooth)
+    return nmr.Lights(
+        ambient, [key, BACK_LIGHT * key], torch.stack([direction, -direction]), smooth=smooth
+    )
 
 
 @torch.no_grad()
@@ -44,7 +52,9 @@ def photograph(
     """
     faces = torch.as_tensor(faces).cpu()
     if not isinstance(colors, nmr.UVTexture):
-        colors = nmr.FaceColors(torch.as_tensor(np.float32(colors)).clamp(0.0, 1.0).expand(len(faces), 3))
+        colors = nmr.FaceColors(
+            torch.as_tensor(np.float32(colors)).clamp(0.0, 1.0).expand(len(faces), 3)
+        )
     finer = supersample // 2  # the renderer halves once more
     images = nmr.render(
         torch.as_tensor(vertices, dtype=torch.float32).cpu(),
@@ -85,7 +95,9 @@ def natural_look(
     Connected parts with the same number of faces get the same colour out of three. The light comes from any side.
     palette: the three colours; None for random ones.
     """
-    part = connected_component_labels(np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices))[faces[:, 0]]
+    part = connected_component_labels(np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices))[
+        faces[:, 0]
+    ]
     kinds = np.unique(np.bincount(part)[part], return_inverse=True)[1]
     palette = np.array(palette or [_material(rng) for _ in range(3)])
     colors = palette[rng.choice(3, size=kinds.max() + 1, p=(0.6, 0.25, 0.15))][kinds]
@@ -97,7 +109,9 @@ def _material(rng: np.random.Generator) -> tuple[float, float, float]:
     """A random colour of wood, of paint or cloth, or a grey."""
     kind = rng.choice(3, p=(0.25, 0.4, 0.35))
     if kind == 0:
-        return colorsys.hsv_to_rgb(rng.uniform(0.05, 0.11), rng.uniform(0.3, 0.75), rng.uniform(0.2, 0.85))
+        return colorsys.hsv_to_rgb(
+            rng.uniform(0.05, 0.11), rng.uniform(0.3, 0.75), rng.uniform(0.2, 0.85)
+        )
     if kind == 1:
         return colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.2, 0.9), rng.uniform(0.2, 0.95))
     return colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.0, 0.08), rng.uniform(0.05, 0.98))

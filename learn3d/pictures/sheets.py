@@ -32,21 +32,30 @@ def tile(
     """
     font = ImageFont.load_default(12)
     top = HEADER + MARGIN if titles else MARGIN
-    left = max((math.ceil(font.getlength(title)) + 2 * MARGIN for title in row_titles), default=0) + MARGIN
+    left = (
+        max((math.ceil(font.getlength(title)) + 2 * MARGIN for title in row_titles), default=0)
+        + MARGIN
+    )
     step, half = tile_size + MARGIN, tile_size // 2
     size = (left + max(map(len, rows)) * step, top + len(rows) * step)
     sheet = Image.new("RGB", size, (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
     for column, title in enumerate(titles):
-        draw.text((left + column * step + half, HEADER - 4), title, fill=_TEXT, anchor="ms", font=font)
+        draw.text(
+            (left + column * step + half, HEADER - 4), title, fill=_TEXT, anchor="ms", font=font
+        )
     for row, title in enumerate(row_titles):
-        draw.text((left - 2 * MARGIN, top + row * step + half), title, fill=_TEXT, anchor="rm", font=font)
+        draw.text(
+            (left - 2 * MARGIN, top + row * step + half), title, fill=_TEXT, anchor="rm", font=font
+        )
     for height in (top + row * step - MARGIN // 2 for row in rules):
         draw.line([(0, height), (sheet.width, height)], fill=_RULE)
     for r, row in enumerate(rows):
         for c, picture in enumerate(row):
             if picture is not None:  # `resize` copies a picture that has the size already
-                image = Image.fromarray(picture).resize((tile_size, tile_size), Image.Resampling.BICUBIC)
+                image = Image.fromarray(picture).resize(
+                    (tile_size, tile_size), Image.Resampling.BICUBIC
+                )
                 sheet.paste(image, (left + c * step, top + r * step))
     return np.asarray(sheet)
 
@@ -77,7 +86,9 @@ def save_png(path: Path, rgb: np.ndarray) -> None:
 def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0) -> None:
     """Write an animation that repeats for ever, frames uint8 [N,H,W,3]."""
     buffer = io.BytesIO()
-    first, *rest = [Image.fromarray(f).convert("P", palette=Image.Palette.ADAPTIVE, colors=64) for f in frames]
+    first, *rest = [
+        Image.fromarray(f).convert("P", palette=Image.Palette.ADAPTIVE, colors=64) for f in frames
+    ]
     times = {"duration": round(1000 / frames_per_second), "loop": 0}
     first.save(buffer, format="GIF", save_all=True, append_images=rest, optimize=True, **times)
     writing.write_bytes(path, buffer.getvalue())
@@ -97,10 +108,14 @@ def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.
     rgb uint8 [n, S, S, 3] over white, alpha uint8 [n, S, S], voxels bool [32, 32, 32] with axes (x, y, z), z = away.
     """
     thickness = voxels.sum(axis=2).T[::-1]
-    ink = np.where(thickness > 0, 60 + 195 * thickness / max(1, thickness.max()), 15)  # the grid's own square is grey
+    ink = np.where(
+        thickness > 0, 60 + 195 * thickness / max(1, thickness.max()), 15
+    )  # the grid's own square is grey
     pictures = [*map(Image.fromarray, rgb[_shown_views(len(rgb))]), Image.fromarray(255 - alpha[0])]
     pictures.append(Image.fromarray(255 - ink.astype(np.uint8)))
-    return [np.asarray(p.resize((CELL, CELL), Image.Resampling.BOX).convert("RGB")) for p in pictures]
+    return [
+        np.asarray(p.resize((CELL, CELL), Image.Resampling.BOX).convert("RGB")) for p in pictures
+    ]
 
 
 def draw_sheet(splits: Mapping[str, Sequence[list[np.ndarray]]], views: int) -> np.ndarray:
@@ -109,9 +124,19 @@ def draw_sheet(splits: Mapping[str, Sequence[list[np.ndarray]]], views: int) -> 
     splits: for each split up to `ROWS` rows by `make_row`.
     """
     rows = [row for of_split in splits.values() for row in of_split]
-    names = ["" if number else split for split, of_split in splits.items() for number in range(len(of_split))]
+    names = [
+        "" if number else split
+        for split, of_split in splits.items()
+        for number in range(len(of_split))
+    ]
     titles = [*(f"view {view}" for view in _shown_views(views)), "mask of 0", "voxels"]
-    return tile(rows, titles, tile_size=CELL, row_titles=names, rules=[r for r, name in enumerate(names) if name])
+    return tile(
+        rows,
+        titles,
+        tile_size=CELL,
+        row_titles=names,
+        rules=[r for r, name in enumerate(names) if name],
+    )
 
 
 def _shown_views(views: int) -> range:

@@ -15,7 +15,11 @@ from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.pictures.photograph import photograph, studio_lights
 
 CLAY = (0.62, 0.68, 0.78)
-_LIGHT = (-0.5, -0.45, -0.75)  # towards the light: left of, above and behind the camera, in its axes (y is down)
+_LIGHT = (
+    -0.5,
+    -0.45,
+    -0.75,
+)  # towards the light: left of, above and behind the camera, in its axes (y is down)
 _FAR = 5.0  # distance of orthographic cameras, outside of any object: faces behind a camera would be lit from behind
 
 Cameras = Sequence[nmr.LookAt | nmr.Orthographic]  # each of one view
@@ -48,7 +52,9 @@ def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surfa
     if not padded.max() > level:
         return Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64))
     vertices, faces, _, _ = marching_cubes(padded, level, gradient_direction="ascent")
-    centred = (vertices - 0.5) / size - 0.5  # cell i of the padded grid has its centre at (i - 1 + 1/2) / size
+    centred = (
+        vertices - 0.5
+    ) / size - 0.5  # cell i of the padded grid has its centre at (i - 1 + 1/2) / size
     points = torch.from_numpy((centred * box).astype(np.float32))
     return Surface(points, torch.from_numpy(faces.astype(np.int64)))
 
@@ -65,7 +71,10 @@ def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> Cam
         )
         half_fov = math.degrees(math.atan(math.tan(math.radians(half_fov)) / zoom))
         azimuths = float(poses.azimuth_deg[0]) + np.asarray(turns_deg, np.float64)
-        return [nmr.LookAt.from_angles(distance, elevation, [a], half_fov_deg=half_fov) for a in azimuths]
+        return [
+            nmr.LookAt.from_angles(distance, elevation, [a], half_fov_deg=half_fov)
+            for a in azimuths
+        ]
     cameras = []
     for angle in np.radians(turns_deg):
         cos, sin = math.cos(angle), math.sin(angle)
@@ -97,10 +106,17 @@ def common_zoom(shapes: Iterable[tuple[Surface, Cameras]], masks: Tensor) -> flo
     masks: float [B, S, S] of the input images. A mask that touches the border allows no magnification.
     """
     inside = torch.nonzero(masks > 0.5)[:, 1:]
-    farthest = [0.05, *((2 * inside + 1) / masks.shape[-1] - 1).abs().flatten().tolist()]  # 1 is the border
+    farthest = [
+        0.05,
+        *((2 * inside + 1) / masks.shape[-1] - 1).abs().flatten().tolist(),
+    ]  # 1 is the border
     for surface, cameras in shapes:
         corners = surface.vertices[surface.faces.unique()][None]
-        farthest += [float(camera.transform(corners)[..., :2].abs().max()) for camera in cameras if corners.numel()]
+        farthest += [
+            float(camera.transform(corners)[..., :2].abs().max())
+            for camera in cameras
+            if corners.numel()
+        ]
     return max(1.0, 0.95 / max(farthest))
 
 
@@ -120,8 +136,13 @@ def draw_surface(surface: Surface, cameras: Cameras, *, image_size: int) -> np.n
     pictures = []
     for camera in cameras:  # one at a time, to save memory
         direction = torch.tensor(_LIGHT, dtype=torch.float64) @ camera.projection().matrix[0, :, :3]
-        options = {"lights": studio_lights(direction, 0.85 if colored else 0.4, smooth=colored), "supersample": 4}
-        rgb, _ = photograph(surface.vertices, surface.faces, colors, camera, image_size=image_size, **options)
+        options = {
+            "lights": studio_lights(direction, 0.85 if colored else 0.4, smooth=colored),
+            "supersample": 4,
+        }
+        rgb, _ = photograph(
+            surface.vertices, surface.faces, colors, camera, image_size=image_size, **options
+        )
         pictures.append(rgb)
     return np.concatenate(pictures)
 
@@ -138,4 +159,6 @@ def draw_around(
 
 def turntable(surface: Surface, *, frames: int = 36, image_size: int = 256) -> np.ndarray:
     """One full turn around a shape: uint8 [frames,S,S,3]."""
-    return draw_around(surface, [-360.0 * frame / frames for frame in range(frames)], image_size=image_size)
+    return draw_around(
+        surface, [-360.0 * frame / frames for frame in range(frames)], image_size=image_size
+    )

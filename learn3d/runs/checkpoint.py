@@ -47,9 +47,20 @@ def _git_commit() -> str | None:
     built_from, sources = Path(__file__).parents[1] / "commit.txt", Path(__file__).parents[2]
     if built_from.exists():  # CMakeLists.txt wrote it
         return built_from.read_text().strip() or None
-    if not (sources / ".git").exists():  # a copy of the sources, perhaps inside of another repository
+    if not (
+        sources / ".git"
+    ).exists():  # a copy of the sources, perhaps inside of another repository
         return None
-    command = ["git", "-C", str(sources), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    command = [
+        "git",
+        "-C",
+        str(sources),
+        "describe",
+        "--always",
+        "--dirty",
+        "--abbrev=40",
+        "--exclude=*",
+    ]
     try:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
@@ -65,11 +76,15 @@ class Progress:
     """The progress of a run."""
 
     step: AnyStep = 0  # last step taken
-    best_iou: Annotated[float, Field(ge=-1, le=1)] = -1.0  # best validation IoU so far; -1 before the first validation
+    best_iou: Annotated[
+        float, Field(ge=-1, le=1)
+    ] = -1.0  # best validation IoU so far; -1 before the first validation
     best_step: AnyStep = 0  # step of best_iou
     seconds: NonNegative = 0.0  # training time, over all resumptions
     object_share: Share = 0.0  # `ViewDataset.mean_object_size` of the training images
-    threads: Count | None = None  # CPU threads that the run has chosen; None: fixed, or not chosen yet
+    threads: Count | None = (
+        None  # CPU threads that the run has chosen; None: fixed, or not chosen yet
+    )
     losses: dict[str, float] = dataclasses.field(default_factory=dict)  # losses of the last step
 
 
@@ -115,7 +130,9 @@ def _checksum(text: str, tensors: dict[str, Tensor]) -> str:
     return f"{crc:08x}"
 
 
-def load(path: Path, which: str = "last", *, with_tensors: bool = True) -> tuple[dict[str, Tensor], Metadata]:
+def load(
+    path: Path, which: str = "last", *, with_tensors: bool = True
+) -> tuple[dict[str, Tensor], Metadata]:
     """Read the tensors, on the CPU, and the metadata of a checkpoint, and verify their checksum.
 
     path: a file, or a run folder with the checkpoint `which`. with_tensors: if False, neither tensors nor checksum are
@@ -124,7 +141,9 @@ def load(path: Path, which: str = "last", *, with_tensors: bool = True) -> tuple
     """
     path = find(path, which)
     if not path.is_file():
-        held = "last.safetensors and, from the first validation that measured an IoU, best.safetensors"
+        held = (
+            "last.safetensors and, from the first validation that measured an IoU, best.safetensors"
+        )
         raise ValueError(f"there is no checkpoint {path}; a run folder holds {held}")
     try:
         with safe_open(path, framework="pt") as file:
@@ -136,7 +155,9 @@ def load(path: Path, which: str = "last", *, with_tensors: bool = True) -> tuple
         raise DamagedFile(path, "is a safetensors file, but not a checkpoint of learn3d")
     text = header["learn3d"]
     if with_tensors and _checksum(text, tensors) != header.get("crc32"):
-        raise DamagedFile(path, f"has changed since it was written (another CRC-32); {_USE_ANOTHER}")
+        raise DamagedFile(
+            path, f"has changed since it was written (another CRC-32); {_USE_ANOTHER}"
+        )
     try:
         return tensors, Metadata(**parse_json(text))
     except (TypeError, ValueError) as error:  # TypeError: not a JSON object
@@ -185,23 +206,34 @@ def load_data(
     """
     layout = layout or config.layout
     if layout in LAYOUTS and LAYOUTS[layout].inverted != LAYOUTS[config.layout].inverted:
-        raise ValueError(f"the networks were trained on colours as the layout {config.layout} has them, not {layout}")
+        raise ValueError(
+            f"the networks were trained on colours as the layout {config.layout} has them, not {layout}"
+        )
     form = {"image_size": config.settings.image_size}
     if layout == config.layout:
         form["view_bins"] = config.view_bins
     own = data is None and (category is None or category in split_names(config.category))
     if own and layout == config.layout:
-        form |= {"poses": config.poses, "views_per_object": config.views_per_object if split == "train" else None}
+        form |= {
+            "poses": config.poses,
+            "views_per_object": config.views_per_object if split == "train" else None,
+        }
     return load_dataset(layout, data or config.data, category or config.category, split, **form)
 
 
 def network_tensors(method: Method) -> dict[str, Tensor]:
     """Parameters and buffers of all networks, named network.<encoder|generator|...>.<parameter>."""
     networks = method.networks.items()
-    return {f"network.{name}.{key}": value for name, net in networks for key, value in net.state_dict().items()}
+    return {
+        f"network.{name}.{key}": value
+        for name, net in networks
+        for key, value in net.state_dict().items()
+    }
 
 
-def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network") -> None:
+def restore_networks(
+    method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network"
+) -> None:
     """Copy the weights of a checkpoint ("network") or their averages ("ema") into the networks of a method.
 
     Raises ValueError if they do not fit.
@@ -215,32 +247,48 @@ def restore_networks(method: Method, tensors: dict[str, Tensor], source: Path, k
 
 def starting_with(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """The tensors whose names start with `prefix`, by the rest of their names."""
-    return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+    return {
+        key.removeprefix(prefix): tensor
+        for key, tensor in tensors.items()
+        if key.startswith(prefix)
+    }
 
 
 def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """The state of an optimizer, named optimizer.<name>.<parameter's index>.<key>, without learning rates."""
     state = optimizer.state_dict()["state"]
-    return {f"optimizer.{name}.{index}.{key}": value for index, found in state.items() for key, value in found.items()}
+    return {
+        f"optimizer.{name}.{index}.{key}": value
+        for index, found in state.items()
+        for key, value in found.items()
+    }
 
 
-def restore_optimizer(name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path) -> None:
+def restore_optimizer(
+    name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path
+) -> None:
     """Restore the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the parameters.
 
     Fused kernels index parameter, gradient and state by position in memory, so each tensor must have its parameter's
     shape, and is copied to its parameter's memory layout.
     """
-    parameters = [(p, group.get("fused")) for group in optimizer.param_groups for p in group["params"]]
+    parameters = [
+        (p, group.get("fused")) for group in optimizer.param_groups for p in group["params"]
+    ]
     state: dict[int, dict[str, Tensor]] = {}
     for place, value in starting_with(f"optimizer.{name}.", tensors).items():
         index, _, key = place.partition(".")
         if not index.isdecimal() or int(index) >= len(parameters):
-            raise ValueError(f"{source} does not fit the optimizer {name}: {place} belongs to no parameter")
+            raise ValueError(
+                f"{source} does not fit the optimizer {name}: {place} belongs to no parameter"
+            )
         parameter, fused = parameters[int(index)]
         wanted = torch.Size() if key == "step" else parameter.shape
         if fused and value.shape != wanted:
             came = f"{place} is {list(value.shape)}, wanted {list(wanted)}"
             raise ValueError(f"{source} does not fit the optimizer {name}: {came}")
         like = parameter if value.shape == parameter.shape else value
-        state.setdefault(int(index), {})[key] = torch.empty_like(like, dtype=value.dtype, device="cpu").copy_(value)
+        state.setdefault(int(index), {})[key] = torch.empty_like(
+            like, dtype=value.dtype, device="cpu"
+        ).copy_(value)
     optimizer.load_state_dict(optimizer.state_dict() | {"state": state})

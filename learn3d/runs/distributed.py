@@ -21,7 +21,9 @@ from learn3d.data.dataset import Batch
 from learn3d.terminal import stop_on_signal
 
 TIMEOUT = timedelta(seconds=50)  # time that a rank waits in a step for the others
-PATIENCE = timedelta(minutes=30)  # time that it waits for others that read data or save a checkpoint
+PATIENCE = timedelta(
+    minutes=30
+)  # time that it waits for others that read data or save a checkpoint
 
 
 def size() -> int:
@@ -52,13 +54,19 @@ def join_ranks(device: str) -> Iterator[None]:
     if device == "cuda":
         found, wanted = torch.cuda.device_count(), int(os.environ["LOCAL_WORLD_SIZE"])
         if found < wanted:
-            raise ValueError(f"{wanted} ranks need {wanted} GPUs on this machine, got {found}; start fewer ranks")
+            raise ValueError(
+                f"{wanted} ranks need {wanted} GPUs on this machine, got {found}; start fewer ranks"
+            )
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     with _lost_ranks():
-        dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo", timeout=TIMEOUT)
+        dist.init_process_group(
+            "cpu:gloo,cuda:nccl" if device == "cuda" else "gloo", timeout=TIMEOUT
+        )
         global _patient
         _patient = dist.new_group(backend="gloo", timeout=PATIENCE)
-    with stop_on_signal():  # torchrun sends SIGTERM if another rank has ended; this one says so by itself
+    with (
+        stop_on_signal()
+    ):  # torchrun sends SIGTERM if another rank has ended; this one says so by itself
         yield
     dist.destroy_process_group()
 
@@ -100,7 +108,9 @@ def all_gather_objects(value: Any, *, patient: bool = False) -> list[Any]:
 def check_same(**values: Any) -> None:
     """Raise a ValueError that names those of the values that differ between the ranks."""
     everywhere = all_gather_objects(values, patient=True)
-    if different := [name for name in values if any(found[name] != values[name] for found in everywhere)]:
+    if different := [
+        name for name in values if any(found[name] != values[name] for found in everywhere)
+    ]:
         advice = "give all ranks the same options, data and output folder, on a disk that all machines share"
         raise ValueError(f"the ranks of this run differ in {', '.join(different)}; {advice}")
 
@@ -117,7 +127,9 @@ def whole_batch(batch: Batch) -> tuple[Batch, Tensor]:
     own = torch.arange(len(batch)) + rank() * len(batch)
     if size() == 1:
         return batch, own
-    poses, view_ids, class_ids = zip(*all_gather_objects((batch.poses, batch.view_ids, batch.class_ids)), strict=True)
+    poses, view_ids, class_ids = zip(
+        *all_gather_objects((batch.poses, batch.view_ids, batch.class_ids)), strict=True
+    )
     parts = {"view_ids": torch.cat(view_ids), "class_ids": torch.cat(class_ids)}
     return dataclasses.replace(batch, poses=poses[0].join(poses), **parts), own
 
@@ -152,7 +164,9 @@ def all_gather(rows: Tensor) -> Tensor:
     if size() == 1:
         return rows
     empty = torch.zeros_like(rows)
-    return _AllReduce.apply(torch.cat([rows if number == rank() else empty for number in range(size())]))
+    return _AllReduce.apply(
+        torch.cat([rows if number == rank() else empty for number in range(size())])
+    )
 
 
 def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
@@ -191,7 +205,9 @@ class _BatchNorm(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, moments: tuple[Tensor, ...], eps: float) -> Tensor:
+    def forward(
+        ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, moments: tuple[Tensor, ...], eps: float
+    ) -> Tensor:
         ctx.save_for_backward(x, weight, *moments)
         ctx.eps = eps
         return nn.functional.batch_norm(x, *moments, weight, bias, eps=eps)
@@ -218,8 +234,13 @@ def _batch_norm(norm: nn.Module, x: Tensor) -> Tensor:
     if not norm.training:
         return type(norm).forward(norm, x)
     with torch.no_grad():
-        running = norm.running_mean.clone(), norm.running_var.clone()  # given so that the results are float32, too
-        mean, variance = (values.double() for values in torch.batch_norm_update_stats(x, *running, 0.0))
+        running = (
+            norm.running_mean.clone(),
+            norm.running_var.clone(),
+        )  # given so that the results are float32, too
+        mean, variance = (
+            values.double() for values in torch.batch_norm_update_stats(x, *running, 0.0)
+        )
         mean, square = _all_reduce(torch.stack([mean, variance + mean.square()])) / size()
         variance = square - mean.square()
         count = size() * x.numel() / x.shape[1]

@@ -26,7 +26,14 @@ CONFIG, METRICS, WANDB_ID = "config.json", "metrics.jsonl", "wandb.txt"
 LAST, PREVIOUS, BEST = "last.safetensors", "previous.safetensors", "best.safetensors"
 PICTURES, TENSORBOARD, LOCK = "pictures", "tensorboard", ".lock"
 #: The files of a run in the order of their removal; config.json is last, as it marks a run.
-WRITTEN = (LAST, PREVIOUS, BEST, METRICS, f"{PICTURES}/{'[0-9]' * 6}*.png", f"{TENSORBOARD}/events.out.tfevents.*")
+WRITTEN = (
+    LAST,
+    PREVIOUS,
+    BEST,
+    METRICS,
+    f"{PICTURES}/{'[0-9]' * 6}*.png",
+    f"{TENSORBOARD}/events.out.tfevents.*",
+)
 WRITTEN += (WANDB_ID, CONFIG)
 
 
@@ -74,11 +81,15 @@ def check_can_start(folder: Path, overwrite: bool) -> None:
     if is_run(folder):
         if not overwrite:
             resume = "continue it (--resume), " if checkpoints(folder) else ""
-            raise ValueError(f"{folder} has a run; {resume}replace it (--overwrite) or choose another folder")
+            raise ValueError(
+                f"{folder} has a run; {resume}replace it (--overwrite) or choose another folder"
+            )
         return
     if clashing := [path for pattern in WRITTEN for path in folder.glob(pattern)]:
         name = clashing[0].relative_to(folder)
-        raise ValueError(f"{folder} has {name}, but no run that it could belong to; choose another folder")
+        raise ValueError(
+            f"{folder} has {name}, but no run that it could belong to; choose another folder"
+        )
     if not overwrite and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise ValueError(
             f"{folder} is not empty; choose another folder, or add the run to the files there (--overwrite)"
@@ -114,7 +125,9 @@ def checkpoints(folder: Path) -> list[Path]:
 def resume_command(folder: Path) -> str:
     """The command that resumes the run in `folder`, quoted for a POSIX shell."""
     started = sys.argv[0]
-    program = ["python", started] if os.path.basename(started) == "train.py" else ["learn3d", "train"]
+    program = (
+        ["python", started] if os.path.basename(started) == "train.py" else ["learn3d", "train"]
+    )
     return shlex.join([*program, "--output", str(folder), "--resume"])
 
 
@@ -127,7 +140,13 @@ def advice_on_errors(folder: Path) -> Iterator[None]:
         found = checkpoints(folder)
         last = f"the last good checkpoint is {found[0]}" if found else "there is no checkpoint yet"
         if isinstance(error, FloatingPointError):
-            raise FloatingPointError(f"{error}; {last}; try a lower learning_rate or precision fp32") from None
-        room = f"{shutil.disk_usage(folder).free / 1e6:.0f} MB free there" if folder.is_dir() else "it is gone"
+            raise FloatingPointError(
+                f"{error}; {last}; try a lower learning_rate or precision fp32"
+            ) from None
+        room = (
+            f"{shutil.disk_usage(folder).free / 1e6:.0f} MB free there"
+            if folder.is_dir()
+            else "it is gone"
+        )
         advice = f"repair that and continue with: {resume_command(folder)}"
         raise OSError(f"{error} ({folder}: {room}); {last}; {advice}") from error

@@ -45,10 +45,16 @@ class RunLog(contextlib.ExitStack):
         self._metrics = self.enter_context(open(config.output / METRICS, "ab"))
         self._bar = None
         if is_watched():
-            self._bar = self.enter_context(tqdm(total=self.total, initial=start, unit="step", dynamic_ncols=True))
+            self._bar = self.enter_context(
+                tqdm(total=self.total, initial=start, unit="step", dynamic_ncols=True)
+            )
         try:
             self._writer = _open_writer(config, start)
-        except (ImportError, TypeError, AttributeError) as error:  # missing, or in conflict with other packages
+        except (
+            ImportError,
+            TypeError,
+            AttributeError,
+        ) as error:  # missing, or in conflict with other packages
             self._writer = types.SimpleNamespace(**_SILENT)
             self.say(f"warning: {config.log} does not work ({error}); metrics go to {METRICS} only")
         self.callback(self._writer.close)
@@ -68,11 +74,15 @@ class RunLog(contextlib.ExitStack):
             self._last_line = now
             seconds_per_step = (now - self._started) / (step - self.start)
             left = datetime.timedelta(seconds=round(seconds_per_step * (self.total - step)))
-            note(f"step {step}/{self.total}  {self._means()}  {1000 * seconds_per_step:.0f} ms/step, {left} left")
+            note(
+                f"step {step}/{self.total}  {self._means()}  {1000 * seconds_per_step:.0f} ms/step, {left} left"
+            )
 
     def _means(self) -> str:
         names = sorted(self._recent, key=lambda name: name != "total")
-        return "  ".join(f"{name} {sum(self._recent[name]) / len(self._recent[name]):.3g}" for name in names)
+        return "  ".join(
+            f"{name} {sum(self._recent[name]) / len(self._recent[name]):.3g}" for name in names
+        )
 
     def metrics(self, step: int, split: str, values: Mapping[str, Any]) -> None:
         """Append one line to metrics.jsonl, and pass the numbers to the writer as <split>/<name>."""
@@ -108,7 +118,9 @@ def open_log(config: TrainConfig, *, start: int) -> contextlib.AbstractContextMa
 def check_log(config: TrainConfig) -> None:
     """Raise a ValueError if the option log needs a package that is not installed."""
     if config.log == "wandb" and importlib.util.find_spec("wandb") is None:
-        raise ValueError("log 'wandb' needs the package wandb: pip install wandb, or choose tensorboard")
+        raise ValueError(
+            "log 'wandb' needs the package wandb: pip install wandb, or choose tensorboard"
+        )
 
 
 def _open_writer(config: TrainConfig, start: int) -> Any:
@@ -146,7 +158,11 @@ def read_records(content: bytes) -> Iterator[tuple[bytes, dict[str, Any]]]:
     for line in content.splitlines():
         with contextlib.suppress(ValueError):
             record = parse_json(line)
-            if isinstance(record, dict) and type(record.get("step")) is int and type(record.get("split")) is str:
+            if (
+                isinstance(record, dict)
+                and type(record.get("step")) is int
+                and type(record.get("split")) is str
+            ):
                 yield line, record
 
 

@@ -9,7 +9,14 @@ from pydantic import BaseModel, Field
 
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import Layout, require_folder
-from learn3d.evaluation import CODES_PER_VIEW, F_SCORE_DISTANCE, NO_MMD, SURFACE_POINTS, Evaluation, evaluate
+from learn3d.evaluation import (
+    CODES_PER_VIEW,
+    F_SCORE_DISTANCE,
+    NO_MMD,
+    SURFACE_POINTS,
+    Evaluation,
+    evaluate,
+)
 from learn3d.files import limits
 from learn3d.files.reading import read_bytes
 from learn3d.presets import command_line
@@ -25,8 +32,14 @@ MEASURES = {
         "voxel IoU",
         "IoU of predicted and true 32^3 grids, voxelizer of Kato et al. 2018 (kato18), as in the paper",
     ),
-    "voxel_iou_kato19": ("IoU (kato19)", "voxelizer of Kato and Harada 2019; not comparable with the voxel IoU"),
-    "precision": ("precision", "part of the predicted voxels that is true: low if shapes are too full"),
+    "voxel_iou_kato19": (
+        "IoU (kato19)",
+        "voxelizer of Kato and Harada 2019; not comparable with the voxel IoU",
+    ),
+    "precision": (
+        "precision",
+        "part of the predicted voxels that is true: low if shapes are too full",
+    ),
     "recall": ("recall", "part of the true voxels that is predicted: low if parts are missing"),
     "chamfer_l1": (
         "Chamfer-L1",
@@ -42,7 +55,10 @@ MEASURES = {
         f"between the shape codes of two views, up to {CODES_PER_VIEW} each, mean over all pairs of views, by the "
         "published code (five kernels, no root): the smaller, the less a code depends on the view",
     ),
-    "mmd_paper": ("printed MMD", "the same by the formula that the paper prints: one kernel, square root"),
+    "mmd_paper": (
+        "printed MMD",
+        "the same by the formula that the paper prints: one kernel, square root",
+    ),
 }
 HEADERS = [header for header, _ in MEASURES.values()]
 
@@ -94,7 +110,9 @@ class Result(BaseModel, strict=True):
     mmd: Number
     mmd_paper: Number
     objects: list[ObjectMeans]  # [] for data without voxels
-    curve: list[CurvePoint] = []  # the validations of the training, from an experiment; [] from `evaluate_runs`
+    curve: list[
+        CurvePoint
+    ] = []  # the validations of the training, from an experiment; [] from `evaluate_runs`
 
     @property
     def commit(self) -> str:
@@ -134,12 +152,23 @@ def evaluate_runs(
             evaluation = evaluate(method, dataset, detailed=True)
             means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
             if means["hollow"]:
-                note(f"warning: {means['hollow']:.1%} of the meshes reach beyond the voxel grid and count as hollow")
+                note(
+                    f"warning: {means['hollow']:.1%} of the meshes reach beyond the voxel grid and count as hollow"
+                )
             if means["mmd"] is None:
                 note(f"warning: {NO_MMD}")
-            about = {"checkpoint": str(file), "method": label, "preset": config.preset, "category": name}
+            about = {
+                "checkpoint": str(file),
+                "method": label,
+                "preset": config.preset,
+                "category": name,
+            }
             about |= {"data": str((data or config.data).resolve()), "command": command_line(config)}
-            about |= {"iterations": config.iterations, "seed": config.seed, "versions": metadata.versions}
+            about |= {
+                "iterations": config.iterations,
+                "seed": config.seed,
+                "versions": metadata.versions,
+            }
             about |= {"step": metadata.progress.step, "seconds": metadata.progress.seconds}
             about["images"] = len(evaluation.view_ids)
             objects = _means_by_object(evaluation, dataset) if dataset.voxels is not None else []
@@ -155,7 +184,9 @@ def read_curve(folder: Path) -> list[CurvePoint]:
 
 
 def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[ObjectMeans]:
-    values = torch.stack([evaluation.values[name] for name in ("voxel_iou", "voxel_iou_kato19")], dim=1)
+    values = torch.stack(
+        [evaluation.values[name] for name in ("voxel_iou", "voxel_iou_kato19")], dim=1
+    )
     objects = []
     for number in evaluation.object_ids.unique():
         own = values[(evaluation.object_ids == number) & ~values[:, 0].isnan()].numpy()
@@ -172,7 +203,9 @@ def format_table(results: Sequence[Result]) -> str:
         rows.append((*about, *format_measures(vars(r))))
     for m in class_means(results):
         classes = f"{m['classes']} classes" if m["classes"] > 1 else "1 class"
-        rows.append(("mean", f"{m['method']} ({m['preset']})", "", "", classes, *format_measures(m)))
+        rows.append(
+            ("mean", f"{m['method']} ({m['preset']})", "", "", classes, *format_measures(m))
+        )
     return align(rows)
 
 
@@ -188,7 +221,10 @@ def class_means(results: Iterable[Result]) -> list[dict[str, Any]]:
         by_method.setdefault((r.method, r.preset), {}).setdefault(r.category, []).append(r)
     return [
         {"method": method, "preset": preset, "classes": len(classes)}
-        | {name: _mean(_mean(getattr(r, name) for r in same) for same in classes.values()) for name in MEASURES}
+        | {
+            name: _mean(_mean(getattr(r, name) for r in same) for same in classes.values())
+            for name in MEASURES
+        }
         for (method, preset), classes in by_method.items()
     ]
 

@@ -38,7 +38,11 @@ class Summary:
         end = f"{'finished' if self.finished else 'stopped'} at step {done.step} after {self.seconds / 60:.1f} min"
         if done.seconds > self.seconds + 1:
             end += f" ({minutes:.1f} min of training in all)"
-        best = f"best validation IoU {done.best_iou:.4f} at step {done.best_step}; " if done.best_step else ""
+        best = (
+            f"best validation IoU {done.best_iou:.4f} at step {done.best_step}; "
+            if done.best_step
+            else ""
+        )
         return f"{end}; {best}everything is in {self.folder}"
 
 
@@ -55,10 +59,14 @@ class Run:
     method: Method
     info: DatasetInfo
     data: str  # `describe_images` of the training images
-    candidates: PoseCandidates | None = None  # estimated poses of the training images, whose weights change
+    candidates: PoseCandidates | None = (
+        None  # estimated poses of the training images, whose weights change
+    )
     versions: dict[str, str | None] = field(default_factory=versions)
 
-    def begin(self, train_set: ViewDataset, *, resume: bool, overwrite: bool) -> tuple[Progress, tuple[str, ...]]:
+    def begin(
+        self, train_set: ViewDataset, *, resume: bool, overwrite: bool
+    ) -> tuple[Progress, tuple[str, ...]]:
         """Prepare method and folder for a new run, or restore the last checkpoint.
 
         Returns the progress of the run, and warnings. The folder of a finished run does not change.
@@ -71,7 +79,9 @@ class Run:
             progress = Progress(object_share=train_set.mean_object_size())
             self.method.start_from_pretrained()
         if progress.step > config.iterations:
-            raise ValueError(f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for")
+            raise ValueError(
+                f"{folder} has taken {progress.step} steps, more than the {config.iterations} asked for"
+            )
         if distributed.rank() > 0:
             return progress, notes
         if resume:
@@ -82,7 +92,9 @@ class Run:
             writing.write_json(folder / CONFIG, config_to_dict(config), sync=True)
         return progress, notes
 
-    def describe(self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner) -> str:
+    def describe(
+        self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner
+    ) -> str:
         """Method, data and device of a run that begins or continues; mirror plane and generator if masks decide."""
         config, info = self.config, self.info
         verb = f"resuming at step {progress.step}" if progress.step else "training"
@@ -110,7 +122,9 @@ class Run:
                 "give the run's own data set, or start a new run"
             )
         if self.info != metadata.info:
-            raise ValueError(f"{path} was trained on data of {metadata.info}, these are {self.info}")
+            raise ValueError(
+                f"{path} was trained on data of {metadata.info}, these are {self.info}"
+            )
         checkpoint.restore_networks(self.method, tensors, path)
         if self.method.ema is not None:
             with self.method.ema_weights():
@@ -120,12 +134,16 @@ class Run:
         if self.candidates is not None:
             self.candidates.weights[:] = tensors["poses.weights"]
         if "random.cpu" not in tensors:
-            raise ValueError(f"{path} holds no state of the random numbers; is it the last checkpoint of a run?")
+            raise ValueError(
+                f"{path} holds no state of the random numbers; is it the last checkpoint of a run?"
+            )
         torch.set_rng_state(tensors["random.cpu"])
         if config.device == "cuda" and "random.cuda" in tensors:
             torch.cuda.set_rng_state(tensors["random.cuda"])
         if (before.val_split, before.max_val_images) != (config.val_split, config.max_val_images):
-            return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)  # measured on other images
+            return dataclasses.replace(
+                metadata.progress, best_iou=-1.0, best_step=0
+            )  # measured on other images
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog) -> None:
@@ -157,13 +175,19 @@ class Run:
         if distributed.rank() > 0:
             return
         with self.method.ema_weights():
-            self._write(self.config.output / BEST, checkpoint.network_tensors(self.method), progress)
+            self._write(
+                self.config.output / BEST, checkpoint.network_tensors(self.method), progress
+            )
 
     def _write(self, path: Path, tensors: dict[str, Tensor], progress: Progress) -> None:
-        checkpoint.save(path, tensors, Metadata(self.config, self.info, progress, self.data, self.versions))
+        checkpoint.save(
+            path, tensors, Metadata(self.config, self.info, progress, self.data, self.versions)
+        )
 
 
-def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] | None, tuple[str, ...]]:
+def load_last(
+    config: TrainConfig,
+) -> tuple[tuple[dict[str, Tensor], Metadata] | None, tuple[str, ...]]:
     """The newest undamaged checkpoint of a run, or None if it has none yet; and warnings.
 
     If last.safetensors is damaged or missing, previous.safetensors replaces it. Raises ValueError if the folder has no
@@ -173,7 +197,9 @@ def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] |
     paths = run_folder.checkpoints(folder)
     if not paths:
         if not run_folder.is_run(folder):
-            raise ValueError(f"there is no checkpoint and no {CONFIG} in {folder}; start the run without --resume")
+            raise ValueError(
+                f"there is no checkpoint and no {CONFIG} in {folder}; start the run without --resume"
+            )
         check_resume(config, load_config(folder / CONFIG))
     for path in paths:
         try:
@@ -183,8 +209,12 @@ def load_last(config: TrainConfig) -> tuple[tuple[dict[str, Tensor], Metadata] |
             continue
         if path.name == PREVIOUS and distributed.rank() == 0:
             writing.give_second_name(path, folder / LAST)
-            notes.append("going on from the checkpoint before it; the steps since then are repeated")
+            notes.append(
+                "going on from the checkpoint before it; the steps since then are repeated"
+            )
         return saved, tuple(notes)
     if notes:
-        raise DamagedFile(folder, "; ".join(notes) + "; no checkpoint is whole: start a new run (--overwrite)")
+        raise DamagedFile(
+            folder, "; ".join(notes) + "; no checkpoint is whole: start a new run (--overwrite)"
+        )
     return None, ()

@@ -26,10 +26,14 @@ class ThreadTuner:
 
     def __init__(self, threads: int | None) -> None:
         self.all = threads or torch.get_num_threads()
-        self.fixed = threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1 or size() > 1
+        self.fixed = (
+            threads is not None or "OMP_NUM_THREADS" in os.environ or self.all == 1 or size() > 1
+        )
         self._seconds: deque[float] = deque(maxlen=WINDOW)  # durations of the last steps
         self._best = float("inf")  # smallest median of WINDOW steps
-        self._medians: dict[int, float] = {}  # medians of the current trial, by the number of threads
+        self._medians: dict[
+            int, float
+        ] = {}  # medians of the current trial, by the number of threads
         self._trying = not self.fixed
         self._use(self.all)
 

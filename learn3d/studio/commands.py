@@ -98,7 +98,9 @@ class EstimatePoses(Command):
         views = estimate_views(datasets, self.cameras, self.options)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
-        say(f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}")
+        say(
+            f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}"
+        )
         if self.compare:
             comparison = compare(views)
             say(comparison.text())
@@ -132,7 +134,11 @@ class Experiment(Request, Command):
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> "Experiment | None":
-        return cls(table=next(iter(TABLES)), data=Path(), output=Path()) if "--list" in arguments else None
+        return (
+            cls(table=next(iter(TABLES)), data=Path(), output=Path())
+            if "--list" in arguments
+            else None
+        )
 
     def run(self) -> int:
         if self.list:
@@ -161,7 +167,9 @@ class Reconstruct(OnDataset):
     """The image files, two to eight, show the same object from several sides, and become one mesh."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model. If not given: the small model of the package."""
-    images: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]] = ()
+    images: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]
+    ] = ()
     """Images of any size. If not given: images of --data. In those without transparency, --masks or --box the object is
     searched: it is what differs from a plain background, or else is cut out of the middle (needs the extra photos)."""
     masks: tuple[Path, ...] = ()
@@ -194,10 +202,15 @@ class Reconstruct(OnDataset):
             options = self.pick("indices") | {"refined": bool(self.refine)}
             paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
         else:
-            options = {name: getattr(self, name) for name in ("images", "which", "category", "masks", "crop")}
+            options = {
+                name: getattr(self, name)
+                for name in ("images", "which", "category", "masks", "crop")
+            }
             if self.same_object:
                 self.refuse("--same-object", "box", "guesses", "refine")
-                paths = reconstruct_object_files(self.model, self.output, mesh_format=self.format, **options)
+                paths = reconstruct_object_files(
+                    self.model, self.output, mesh_format=self.format, **options
+                )
                 return say("\n".join(map(str, paths)))
             options |= {"box": self.box, "guesses": self.guesses}
             options["refined"] = self.refine is not False
@@ -224,7 +237,11 @@ class Export(Command):
 
     def run(self) -> None:
         check_target(self.output, "--output")
-        others = None if self.others is None else cut_out_pictures(load_model(self.source, self.which), self.others)
+        others = (
+            None
+            if self.others is None
+            else cut_out_pictures(load_model(self.source, self.which), self.others)
+        )
         size = export(self.source, self.output, which=self.which, others=others)
         say(f"{self.output} ({size / 1e6:.1f} MB)")
 
@@ -242,7 +259,9 @@ class Figures(OnDataset):
       learn3d figures tsne --runs runs/vanilla runs/proposed --output pictures/tsne.png
     """
 
-    figure: tyro.conf.Positional[Annotated[Literal["grid", "tsne", "interpolation"], tyro.conf.arg(metavar="FIGURE")]]
+    figure: tyro.conf.Positional[
+        Annotated[Literal["grid", "tsne", "interpolation"], tyro.conf.arg(metavar="FIGURE")]
+    ]
     """One of the figures above."""
     runs: tuple[Path, ...]
     """Run folders (or checkpoint files), in the order of the figure."""
@@ -262,10 +281,16 @@ class Figures(OnDataset):
         from learn3d.studio.tables.trained_models import open_runs
 
         check_target(self.output.parent, "--output", folder=True)
-        refused = {"grid": (), "interpolation": ("truth",), "tsne": ("images", "indices", "truth")}[self.figure]
+        refused = {"grid": (), "interpolation": ("truth",), "tsne": ("images", "indices", "truth")}[
+            self.figure
+        ]
         self.refuse(f"the figure {self.figure}", *refused)
         runs = open_runs(self.runs, **self.pick("labels"))
-        save = {"grid": grids.save_grid, "interpolation": grids.save_interpolation, "tsne": tsne.save_tsne}[self.figure]
+        save = {
+            "grid": grids.save_grid,
+            "interpolation": grids.save_interpolation,
+            "tsne": tsne.save_tsne,
+        }[self.figure]
         paths = save(runs, self.output, **self.given("images", "indices", "truth"))
         say("\n".join(map(str, paths)))
 

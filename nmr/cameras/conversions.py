@@ -27,7 +27,10 @@ from .projection import (
 )
 
 # Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer; PyTorch3D: left, up, away.
-_HOST = {"dtype": torch.float64, "device": "cpu"}  # cameras are computed there, whatever the default device is
+_HOST = {
+    "dtype": torch.float64,
+    "device": "cpu",
+}  # cameras are computed there, whatever the default device is
 _OPENGL_AXES = torch.tensor([[1.0], [-1.0], [-1.0]], **_HOST)
 _PYTORCH3D_AXES = torch.tensor([[-1.0], [-1.0], [1.0]], **_HOST)
 
@@ -47,17 +50,25 @@ def _image_size(image_size: tuple[float, float] | None, in_ndc: bool) -> tuple[f
 def _plain(camera: ProjectingCamera, height: float, width: float) -> Projection:
     """The camera for an image of this shape."""
     if not isinstance(camera, ProjectingCamera):
-        raise TypeError(f"camera must be one of nmr's (nmr.cameras.ProjectingCamera), got {describe(camera)}")
+        raise TypeError(
+            f"camera must be one of nmr's (nmr.cameras.ProjectingCamera), got {describe(camera)}"
+        )
     plain = camera.for_image(height, width).projection().plain()
-    expanded = (None if x is None else x.expand(plain.batch, *x.shape[1:]) for x in plain.parameters())
+    expanded = (
+        None if x is None else x.expand(plain.batch, *x.shape[1:]) for x in plain.parameters()
+    )
     matrix, intrinsics, distortion, *_ = expanded
     return Projection(matrix, intrinsics, distortion, plain.perspective)
 
 
-def _without_distortion(camera: ProjectingCamera, target: str, height: float, width: float) -> Projection:
+def _without_distortion(
+    camera: ProjectingCamera, target: str, height: float, width: float
+) -> Projection:
     projection = _plain(camera, height, width)
     if projection.distortion is not None and projection.perspective and projection.distortion.any():
-        raise ValueError(f"{target} has no lens distortion; undistort the images and drop dist_coeffs")
+        raise ValueError(
+            f"{target} has no lens distortion; undistort the images and drop dist_coeffs"
+        )
     return projection
 
 
@@ -123,12 +134,20 @@ def from_opencv(
         d = as_numbers(dist_coeffs, "dist_coeffs", "4, 5 or 8 numbers")
         d = d.squeeze(-1) if d.ndim > 1 and d.shape[-1] == 1 else d
         if d.ndim not in (1, 2) or d.shape[-1] not in ((4,) if fisheye else (4, 5, 8)):
-            wanted = "k1, k2, k3, k4 of a fisheye" if fisheye else "k1, k2, p1, p2, also with k3, also with k4, k5, k6"
+            wanted = (
+                "k1, k2, k3, k4 of a fisheye"
+                if fisheye
+                else "k1, k2, p1, p2, also with k3, also with k4, k5, k6"
+            )
             raise ValueError(
                 f"dist_coeffs must be {wanted}, got shape {list(d.shape)}; OpenCV's models with 12 and 14 numbers are "
                 "not supported"
             )
-        dist_coeffs = d if fisheye or d.shape[-1] != 4 else torch.cat([d, torch.zeros_like(d[..., :1])], dim=-1)
+        dist_coeffs = (
+            d
+            if fisheye or d.shape[-1] != 4
+            else torch.cat([d, torch.zeros_like(d[..., :1])], dim=-1)
+        )
     elif fisheye:
         dist_coeffs = torch.zeros(4, **_HOST)
     return Pinhole(K + shift, R, t, dist_coeffs, orig_size=(height, width))
@@ -159,7 +178,9 @@ def to_opencv(
     corner = torch.tensor([0.0, 0.0, 1.0], **_HOST)
     shift = (0.5 - pixel_center) * corner
     third = corner.expand_as(x)
-    K = torch.stack([width / 2 * (corner + x) - shift, height / 2 * (corner - y) - shift, third], dim=1)
+    K = torch.stack(
+        [width / 2 * (corner + x) - shift, height / 2 * (corner - y) - shift, third], dim=1
+    )
     matrix = projection.matrix
     return K, matrix[:, :, :3], matrix[:, :, 3], projection.distortion
 
@@ -203,8 +224,12 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
     if not (view[:, 3] == last[1]).all():
         raise ValueError("the last row of view must be (0, 0, 0, 1); are the matrices transposed?")
     if not perspective and not (clip[:, 3] == last[1]).all():
-        raise ValueError("the last row of projection must be (0, 0, -1, 0) or (0, 0, 0, 1); is it transposed?")
-    offset, shear = (clip[:, :2, 3], clip[:, :2, 2]) if perspective else (clip[:, :2, 2], clip[:, :2, 3])
+        raise ValueError(
+            "the last row of projection must be (0, 0, -1, 0) or (0, 0, 0, 1); is it transposed?"
+        )
+    offset, shear = (
+        (clip[:, :2, 3], clip[:, :2, 2]) if perspective else (clip[:, :2, 2], clip[:, :2, 3])
+    )
     if offset.any():
         column = 3 if perspective else 2
         raise ValueError(f"projection[0:2, {column}] must be 0: nmr's cameras have no such term")
@@ -214,7 +239,11 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
 
 
 def to_opengl(
-    camera: ProjectingCamera, *, near: float, far: float, image_size: tuple[float, float] | None = None
+    camera: ProjectingCamera,
+    *,
+    near: float,
+    far: float,
+    image_size: tuple[float, float] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """``view`` and ``projection``, ``[B, 4, 4]``, as :func:`from_opengl` takes them; near and far map to -1 and 1 in z.
 
@@ -230,7 +259,9 @@ def to_opengl(
     (torch.Size([1, 4, 4]), torch.Size([1, 4, 4]))
     """
     if not 0 <= near < far < float("inf"):
-        raise ValueError(f"near and far must be finite with 0 <= near < far, got near={near}, far={far}")
+        raise ValueError(
+            f"near and far must be finite with 0 <= near < far, got near={near}, far={far}"
+        )
     camera = _without_distortion(camera, "OpenGL", *_image_size(image_size, True))
     matrix, intrinsics = camera.matrix, camera.intrinsics
     last = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]], **_HOST)
@@ -253,7 +284,9 @@ def _pairs(value: Numbers, name: str) -> Tensor:
     """``[B, 2]`` from a number, ``[B]`` or ``[B, 2]``."""
     value = as_numbers(value, name, "a number, [B] or [B, 2]")
     if value.ndim > 2 or (value.ndim == 2 and value.shape[1] != 2):
-        raise ValueError(f"{name} must be a number or have shape [B] or [B, 2], got {list(value.shape)}")
+        raise ValueError(
+            f"{name} must be a number or have shape [B] or [B, 2], got {list(value.shape)}"
+        )
     value = value.to("cpu", torch.float64)
     return value if value.ndim == 2 else value.reshape(-1, 1).expand(-1, 2)
 
@@ -315,7 +348,9 @@ def from_pytorch3d(
         focal, centre = focal * (2 / shorter), -(centre - size / 2) * (2 / shorter)
     focal, centre = focal * (shorter / size), centre * (shorter / size)
     # x = -x_ndc, and X of the camera axes also changes its sign: only the principal point needs a minus.
-    intrinsics = torch.stack([_row(focal[:, 0], 0, -centre[:, 0]), _row(0, -focal[:, 1], centre[:, 1])], dim=1)
+    intrinsics = torch.stack(
+        [_row(focal[:, 0], 0, -centre[:, 0]), _row(0, -focal[:, 1], centre[:, 1])], dim=1
+    )
     kind = _SquareProjection if image_size is None else Projection
     return kind(_PYTORCH3D_AXES * matrix, intrinsics, perspective=not orthographic)
 
@@ -346,7 +381,9 @@ def from_pytorch3d_fov(
     """
     fov = as_parameter(fov, "fov").to("cpu", torch.float64).reshape(-1)
     focal = 1 / torch.tan((torch.deg2rad(fov) if degrees else fov) / 2)
-    return from_pytorch3d(R, T, torch.stack([focal / aspect_ratio, focal], dim=-1), image_size=image_size)
+    return from_pytorch3d(
+        R, T, torch.stack([focal / aspect_ratio, focal], dim=-1), image_size=image_size
+    )
 
 
 def to_pytorch3d(
@@ -374,14 +411,22 @@ def to_pytorch3d(
     shorter, size = min(height, width), torch.tensor([width, height], **_HOST)
     intrinsics, matrix = camera.intrinsics, _PYTORCH3D_AXES * camera.matrix
     if intrinsics[:, 0, 1].any() or intrinsics[:, 1, 0].any():
-        raise ValueError("PyTorch3D's focal_length and principal_point cannot express the skew of this camera")
+        raise ValueError(
+            "PyTorch3D's focal_length and principal_point cannot express the skew of this camera"
+        )
     focal = torch.stack([intrinsics[:, 0, 0], -intrinsics[:, 1, 1]], dim=-1) * (size / shorter)
     centre = torch.stack([-intrinsics[:, 0, 2], intrinsics[:, 1, 2]], dim=-1) * (size / shorter)
     if not in_ndc:
         focal, centre = focal * (shorter / 2), size / 2 - centre * (shorter / 2)
     arguments = dict(
-        R=matrix[:, :, :3].transpose(1, 2), T=matrix[:, :, 3], focal_length=focal, principal_point=centre, in_ndc=in_ndc
+        R=matrix[:, :, :3].transpose(1, 2),
+        T=matrix[:, :, 3],
+        focal_length=focal,
+        principal_point=centre,
+        in_ndc=in_ndc,
     )
     return (
-        arguments if image_size is None else arguments | {"image_size": torch.tensor([[height, width]], device="cpu")}
+        arguments
+        if image_size is None
+        else arguments | {"image_size": torch.tensor([[height, width]], device="cpu")}
     )

@@ -23,7 +23,9 @@ from .projection import (
 
 Scalars = float | Sequence[float] | Tensor
 
-_UNIT = 1 - 1e-6  # a vector whose squared length is smaller was shorter than 1e-5, and not stretched (look_at.cpp)
+_UNIT = (
+    1 - 1e-6
+)  # a vector whose squared length is smaller was shorter than 1e-5, and not stretched (look_at.cpp)
 _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 
@@ -89,9 +91,19 @@ class _Placed(SquarePixels):
         for name, value in parameters.items():
             object.__setattr__(self, name, value)
         scale = parameters[view]
-        as_tensor = scale if isinstance(scale, Tensor) else torch.tensor(scale, dtype=torch.float64, device="cpu")
+        as_tensor = (
+            scale
+            if isinstance(scale, Tensor)
+            else torch.tensor(scale, dtype=torch.float64, device="cpu")
+        )
         object.__setattr__(self, "_view", as_tensor)
-        common_batch(**{n: x for n, x in parameters.items() if isinstance(x, Tensor) and x.ndim == 1 + (n in names)})
+        common_batch(
+            **{
+                n: x
+                for n, x in parameters.items()
+                if isinstance(x, Tensor) and x.ndim == 1 + (n in names)
+            }
+        )
         self._warn_if_it_sees_nothing(*names)
 
     def _warn_if_it_sees_nothing(self, *names: str) -> None:
@@ -102,8 +114,12 @@ class _Placed(SquarePixels):
         parameters = [x.detach() for x in self._parameters()]
         if torch.compiler.is_compiling() or not all(x.is_cpu for x in parameters):
             return
-        rows = ops.look_at(*(x.double() for x in parameters), self._along, False, self.perspective, True)
-        sideways = rows[:, :3].square().sum(1)  # 1, but less if up x forward is too short to be stretched
+        rows = ops.look_at(
+            *(x.double() for x in parameters), self._along, False, self.perspective, True
+        )
+        sideways = (
+            rows[:, :3].square().sum(1)
+        )  # 1, but less if up x forward is too short to be stretched
         if holds_for_all(sideways > _UNIT):
             return
         warn_if_not_finite(self, *names)

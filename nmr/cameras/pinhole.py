@@ -74,19 +74,36 @@ class Pinhole(ProjectingCamera):
         t = t.squeeze(1) if t.ndim == 3 and t.shape[1] == 1 else t
         object.__setattr__(self, "t", as_parameter(t, "t", 3))
         if self.dist_coeffs is not None:
-            numbers = as_numbers(self.dist_coeffs, "dist_coeffs", "numbers of shape [5], [8] or [4], or [B, 5] ...")
+            numbers = as_numbers(
+                self.dist_coeffs, "dist_coeffs", "numbers of shape [5], [8] or [4], or [B, 5] ..."
+            )
             count = numbers.shape[-1] if numbers.ndim and numbers.shape[-1] in (4, 8) else 5
             object.__setattr__(self, "dist_coeffs", as_parameter(numbers, "dist_coeffs", count))
         object.__setattr__(self, "orig_size", height_and_width(self.orig_size, "orig_size"))
         warn_if_not_finite(self, "K", "R", "t", "dist_coeffs")
-        named = {"K": (self.K, 3), "R": (self.R, 3), "t": (self.t, 2), "dist_coeffs": (self.dist_coeffs, 2)}
-        common_batch(**{name: x for name, (x, ndim) in named.items() if x is not None and x.ndim == ndim})
+        named = {
+            "K": (self.K, 3),
+            "R": (self.R, 3),
+            "t": (self.t, 2),
+            "dist_coeffs": (self.dist_coeffs, 2),
+        }
+        common_batch(
+            **{name: x for name, (x, ndim) in named.items() if x is not None and x.ndim == ndim}
+        )
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        K, R, t = batched(self.K, torch.float64, 3, 3), batched(self.R, dtype, 3, 3), batched(self.t, dtype, 3, 1)
+        K, R, t = (
+            batched(self.K, torch.float64, 3, 3),
+            batched(self.R, dtype, 3, 3),
+            batched(self.t, dtype, 3, 1),
+        )
         batch = common_batch(R=R, t=t)
         matrix = torch.cat([R.expand(batch, 3, 3), t.expand(batch, 3, 1)], dim=-1)
         height, width = self.orig_size
         intrinsics = K[:, :2] * K.new_tensor([[2 / width], [-2 / height]]) + _CENTRE
-        distortion = None if self.dist_coeffs is None else batched(self.dist_coeffs, dtype, self.dist_coeffs.shape[-1])
+        distortion = (
+            None
+            if self.dist_coeffs is None
+            else batched(self.dist_coeffs, dtype, self.dist_coeffs.shape[-1])
+        )
         return Projection(matrix, intrinsics.to(dtype), distortion)

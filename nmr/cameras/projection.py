@@ -97,7 +97,10 @@ class ProjectingCamera:
         """
         vertices, meshes = _check_batch(vertices, starts)
         rows, distortion, perspective = self._rows(vertices.dtype)
-        rows, distortion = rows.to(vertices), None if distortion is None else distortion.to(vertices)
+        rows, distortion = (
+            rows.to(vertices),
+            None if distortion is None else distortion.to(vertices),
+        )
         batch = len(rows) if distortion is None or len(distortion) == 1 else len(distortion)
         if batch != meshes and batch != 1 and (meshes != 1 or starts is not None):
             raise ValueError(
@@ -154,16 +157,32 @@ class Projection(ProjectingCamera):
     extent: Tensor | None = None
 
     def __post_init__(self) -> None:
-        shapes = (("matrix", (3, 4)), ("intrinsics", (2, 3)), ("distortion", (5,)), ("origin", (3,)), ("extent", ()))
+        shapes = (
+            ("matrix", (3, 4)),
+            ("intrinsics", (2, 3)),
+            ("distortion", (5,)),
+            ("origin", (3,)),
+            ("extent", ()),
+        )
         for name, shape in shapes:
             value = getattr(self, name)
-            if name == "distortion" and isinstance(value, Tensor) and value.shape[1:] in ((4,), (8,)):
+            if (
+                name == "distortion"
+                and isinstance(value, Tensor)
+                and value.shape[1:] in ((4,), (8,))
+            ):
                 shape = value.shape[1:]
             if value is None and name not in ("matrix", "intrinsics"):
                 continue
-            if not isinstance(value, Tensor) or value.ndim != len(shape) + 1 or value.shape[1:] != shape:
+            if (
+                not isinstance(value, Tensor)
+                or value.ndim != len(shape) + 1
+                or value.shape[1:] != shape
+            ):
                 wanted = ", ".join(["B", *map(str, shape)])
-                raise ValueError(f"{name} must be a tensor of shape [{wanted}], got {describe(value)}")
+                raise ValueError(
+                    f"{name} must be a tensor of shape [{wanted}], got {describe(value)}"
+                )
             if not value.is_floating_point():
                 object.__setattr__(self, name, value.double())
         _ = self.batch
@@ -172,7 +191,13 @@ class Projection(ProjectingCamera):
     def batch(self) -> int:
         """Number of cameras; 1 serves every image."""
         matrix, intrinsics, distortion, origin, extent = self.parameters()
-        return common_batch(matrix=matrix, intrinsics=intrinsics, distortion=distortion, origin=origin, extent=extent)
+        return common_batch(
+            matrix=matrix,
+            intrinsics=intrinsics,
+            distortion=distortion,
+            origin=origin,
+            extent=extent,
+        )
 
     def parameters(self) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
         """matrix, intrinsics, distortion, origin, extent."""
@@ -188,8 +213,13 @@ class Projection(ProjectingCamera):
         )
         origin = matrix.new_zeros(1, 3) if origin is None else origin
         extent = matrix.new_ones(1) if extent is None else extent
-        parts, batch = (matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)), self.batch
-        rows = torch.cat([part if len(part) == batch else part.expand(batch, -1) for part in parts], dim=1)
+        parts, batch = (
+            (matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)),
+            self.batch,
+        )
+        rows = torch.cat(
+            [part if len(part) == batch else part.expand(batch, -1) for part in parts], dim=1
+        )
         return rows, distortion, self.perspective
 
     def plain(self) -> Projection:
@@ -285,7 +315,12 @@ def _check_batch(vertices: object, starts: object) -> tuple[Tensor, int]:
     if starts is None:
         vertices = check_vertices(vertices)
         return vertices, vertices.shape[0]
-    if not isinstance(starts, Tensor) or starts.dtype != torch.int64 or starts.ndim != 2 or starts.shape[1] != 2:
+    if (
+        not isinstance(starts, Tensor)
+        or starts.dtype != torch.int64
+        or starts.ndim != 2
+        or starts.shape[1] != 2
+    ):
         raise ValueError(f"starts must be an int64 tensor [B + 1, 2], got {describe(starts)}")
     if not isinstance(vertices, Tensor) or vertices.ndim != 2:
         raise ValueError(f"with starts, vertices must be packed [N, 3], got {describe(vertices)}")
@@ -296,8 +331,12 @@ def common_batch(**parameters: Tensor | None) -> int:
     """The batch size that all parameters ``[B or 1, ...]`` share; a ValueError names those that differ."""
     sizes = {x.shape[0] for x in parameters.values() if x is not None} - {1}
     if len(sizes) > 1:
-        shapes = ", ".join(f"{name} {list(x.shape)}" for name, x in parameters.items() if x is not None)
-        raise ValueError(f"the parameters of a camera must have one batch size (or 1), got {shapes}")
+        shapes = ", ".join(
+            f"{name} {list(x.shape)}" for name, x in parameters.items() if x is not None
+        )
+        raise ValueError(
+            f"the parameters of a camera must have one batch size (or 1), got {shapes}"
+        )
     return sizes.pop() if sizes else 1
 
 
@@ -307,7 +346,8 @@ def warn_if_not_finite(camera: ProjectingCamera, *names: str) -> None:
         value = getattr(camera, name)
         if isinstance(value, Tensor) and not holds_for_all(value.detach().isfinite()):
             warnings.warn(
-                f"{name} of a {type(camera).__name__} is not finite: its image is empty", stacklevel=callers_level()
+                f"{name} of a {type(camera).__name__} is not finite: its image is empty",
+                stacklevel=callers_level(),
             )
 
 
@@ -315,7 +355,10 @@ def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:
     """``value`` as a float tensor ``[*shape]`` or ``[B, *shape]``; numbers that are not tensors become float64."""
     one, many = (", ".join([*first, *map(str, shape)]) for first in ([], ["B"]))
     tensor = as_numbers(value, name, f"numbers of shape [{one}] or [{many}]")
-    if tensor.ndim not in (len(shape), len(shape) + 1) or tensor.shape[tensor.ndim - len(shape) :] != shape:
+    if (
+        tensor.ndim not in (len(shape), len(shape) + 1)
+        or tensor.shape[tensor.ndim - len(shape) :] != shape
+    ):
         raise ValueError(f"{name} must have shape [{one}] or [{many}], got {list(tensor.shape)}")
     return tensor
 
@@ -334,5 +377,7 @@ def height_and_width(value: object, name: str) -> tuple[float, float]:
     except (TypeError, ValueError):
         size = ()
     if len(size) != 2 or not all(0 < x < float("inf") for x in size):
-        raise ValueError(f"{name} must be positive numbers (height, width), or one number, got {value}")
+        raise ValueError(
+            f"{name} must be positive numbers (height, width), or one number, got {value}"
+        )
     return size

@@ -18,7 +18,13 @@ from nmr.neural_renderer.look_at import look_at
 from nmr.neural_renderer.mesh import Mesh
 from nmr.neural_renderer.perspective import perspective
 from nmr.neural_renderer.projection import projection
-from nmr.neural_renderer.rasterize import Rasterize, rasterize, rasterize_depth, rasterize_rgbad, rasterize_silhouettes
+from nmr.neural_renderer.rasterize import (
+    Rasterize,
+    rasterize,
+    rasterize_depth,
+    rasterize_rgbad,
+    rasterize_silhouettes,
+)
 from nmr.neural_renderer.renderer import Renderer
 from nmr.neural_renderer.save_obj import save_obj
 from nmr.neural_renderer.vertices_to_faces import vertices_to_faces

@@ -16,7 +16,11 @@ Numbers = float | Sequence | np.ndarray | Tensor
 
 def like(value: object, name: str, reference: Tensor) -> Tensor:
     """A number, list, tuple, array or tensor with the dtype and device of ``reference``; gradients reach tensors."""
-    value = value if isinstance(value, Tensor) else as_floats(value, name, "numbers in a list, tuple, array or tensor")
+    value = (
+        value
+        if isinstance(value, Tensor)
+        else as_floats(value, name, "numbers in a list, tuple, array or tensor")
+    )
     return value.to(device=reference.device, dtype=reference.dtype)
 
 
@@ -24,7 +28,9 @@ def check_batch(vertices: object) -> Tensor:
     """``vertices`` as ``[B, V, 3]``."""
     checked = check_vertices(vertices)
     if vertices.ndim != 3:
-        raise ValueError(f"vertices must have shape [B, V, 3], got {describe(vertices)}; use vertices[None]")
+        raise ValueError(
+            f"vertices must have shape [B, V, 3], got {describe(vertices)}; use vertices[None]"
+        )
     return checked
 
 
@@ -45,11 +51,17 @@ def integer_faces(faces: object, batch: int) -> Tensor:
     if isinstance(faces, np.ndarray):
         faces = torch.from_numpy(faces)
     if not isinstance(faces, Tensor):
-        raise TypeError(f"faces must be an integer tensor [B, F, 3], got {describe(faces)}; use torch.as_tensor()")
+        raise TypeError(
+            f"faces must be an integer tensor [B, F, 3], got {describe(faces)}; use torch.as_tensor()"
+        )
     if faces.ndim not in (2, 3) or faces.shape[-1] != 3:
-        raise ValueError(f"faces must have shape [B, F, 3], or [F, 3] for all meshes, got {describe(faces)}")
+        raise ValueError(
+            f"faces must have shape [B, F, 3], or [F, 3] for all meshes, got {describe(faces)}"
+        )
     if faces.ndim == 3 and faces.shape[0] not in (1, batch) and batch != 1:
-        raise ValueError(f"faces [B, F, 3] must have the batch size of the vertices, {batch}, got {describe(faces)}")
+        raise ValueError(
+            f"faces [B, F, 3] must have the batch size of the vertices, {batch}, got {describe(faces)}"
+        )
     whole = faces.long()
     if faces.is_floating_point() and not torch.equal(whole.to(faces.dtype), faces):
         raise ValueError(f"faces must be vertex numbers, got {describe(faces)} with fractions")
@@ -59,9 +71,13 @@ def integer_faces(faces: object, batch: int) -> Tensor:
 def check_textures(textures: object, batch: int, num_faces: int) -> Tensor:
     """``textures``, which must be ``[B or 1, F, ts, ts, ts, C]``."""
     if not isinstance(textures, Tensor) or not textures.is_floating_point():
-        raise TypeError(f"textures must be a float tensor [B, F, ts, ts, ts, 3], got {describe(textures)}")
+        raise TypeError(
+            f"textures must be a float tensor [B, F, ts, ts, ts, 3], got {describe(textures)}"
+        )
     if textures.ndim != 6 or len(set(textures.shape[2:5])) != 1 or 0 in textures.shape[2:]:
-        raise ValueError(f"textures must have shape [B, F, ts, ts, ts, 3], got {describe(textures)}")
+        raise ValueError(
+            f"textures must have shape [B, F, ts, ts, ts, 3], got {describe(textures)}"
+        )
     if (textures.shape[0] not in (1, batch) and batch != 1) or textures.shape[1] != num_faces:
         raise ValueError(
             f"textures must have the batch size (or 1) and the number of faces of the mesh, [{batch}, {num_faces}, "

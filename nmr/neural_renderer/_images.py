@@ -27,7 +27,9 @@ def read_image(filename: str) -> np.ndarray:
     try:
         with Image.open(filename, formats=_FORMATS) as image:
             if image.width * image.height > _MOST_PIXELS:
-                raise ValueError(f"{image.width}x{image.height} pixels, at most {_MOST_PIXELS} are read")
+                raise ValueError(
+                    f"{image.width}x{image.height} pixels, at most {_MOST_PIXELS} are read"
+                )
             if image.mode.startswith("I"):
                 grey = np.asarray(image, dtype=np.float32) / 65535
                 return np.repeat(grey[:, :, None], 3, axis=2)
@@ -45,5 +47,7 @@ def write_png(filename: str, image: np.ndarray) -> None:
     except ImportError as error:
         raise ImportError(_PILLOW) from error
     partial = f"{filename}.part"
-    Image.fromarray(np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)).save(partial, format="PNG")
+    Image.fromarray(np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)).save(
+        partial, format="PNG"
+    )
     os.replace(partial, filename)

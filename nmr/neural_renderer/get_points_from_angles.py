@@ -23,8 +23,17 @@ def get_points_from_angles(
     >>> renderer.eye = nr.get_points_from_angles(2.732, 30, 45)
     """
     given = (distance, elevation, azimuth)
-    dtype = next((x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()), torch.float64)
+    dtype = next(
+        (x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()), torch.float64
+    )
     names = ("distance", "elevation", "azimuth")
-    d, e, a = (as_numbers(x, name, "a number or [B]").to(dtype) for x, name in zip(given, names, strict=True))
-    points = points_from_angles(d, e, a) if degrees else points_from_angles(d, torch.rad2deg(e), torch.rad2deg(a))
+    d, e, a = (
+        as_numbers(x, name, "a number or [B]").to(dtype)
+        for x, name in zip(given, names, strict=True)
+    )
+    points = (
+        points_from_angles(d, e, a)
+        if degrees
+        else points_from_angles(d, torch.rad2deg(e), torch.rad2deg(a))
+    )
     return tuple(points.tolist()) if all(isinstance(x, numbers.Real) for x in given) else points

@@ -30,4 +30,6 @@ def install_as(name: str = "neural_renderer", *, replace: bool = False) -> None:
     >>> nr.install_as()
     >>> from neural_renderer.projection import projection
     """
-    alias_package(__package__, name, replace, "neural_renderer", "pip uninstall neural_renderer_pytorch")
+    alias_package(
+        __package__, name, replace, "neural_renderer", "pip uninstall neural_renderer_pytorch"
+    )

@@ -31,7 +31,9 @@ def face_light(
     )
     if not isinstance(intensity_directional, Tensor) and intensity_directional == 0:
         return (intensity_ambient * ambient).expand(*faces.shape[:2], 3)
-    normal = torch.linalg.cross(faces[..., 0, :] - faces[..., 1, :], faces[..., 2, :] - faces[..., 1, :], dim=-1)
+    normal = torch.linalg.cross(
+        faces[..., 0, :] - faces[..., 1, :], faces[..., 2, :] - faces[..., 1, :], dim=-1
+    )
     normal = torch.nn.functional.normalize(normal, dim=-1, eps=1e-5)
     cosine = (normal * direction).sum(-1, keepdim=True).relu()
     return intensity_ambient * ambient + intensity_directional * directional * cosine
@@ -44,7 +46,9 @@ def _per_image(value: Numbers, name: str, faces: Tensor) -> Tensor:
         raise ValueError(f"{name} must have shape [3] or [B, 3], got {list(tensor.shape)}")
     tensor = tensor.reshape(-1, 1, 3)
     if tensor.shape[0] != 1 and faces.shape[0] not in (1, tensor.shape[0]):
-        raise ValueError(f"{name} must have shape [3] or [{faces.shape[0]}, 3], got {[tensor.shape[0], 3]}")
+        raise ValueError(
+            f"{name} must have shape [3] or [{faces.shape[0]}, 3], got {[tensor.shape[0], 3]}"
+        )
     return tensor
 
 
@@ -86,7 +90,11 @@ def lighting(
     >>> lit = nr.lighting(nr.vertices_to_faces(vertices, faces), textures, direction=(0, 1, 0))
     """
     if not isinstance(faces, Tensor) or faces.ndim != 4 or faces.shape[2:] != (3, 3):
-        raise ValueError(f"faces must be corners [B, F, 3, 3] (see vertices_to_faces), got {describe(faces)}")
+        raise ValueError(
+            f"faces must be corners [B, F, 3, 3] (see vertices_to_faces), got {describe(faces)}"
+        )
     textures = check_textures(textures, faces.shape[0], faces.shape[1])
-    light = face_light(faces, intensity_ambient, intensity_directional, color_ambient, color_directional, direction)
+    light = face_light(
+        faces, intensity_ambient, intensity_directional, color_ambient, color_directional, direction
+    )
     return textures * light[:, :, None, None, None, :]

@@ -11,7 +11,12 @@ from torch import Tensor
 from nmr.neural_renderer._images import read_image
 from nmr.obj import Obj, find_image, find_libraries, load, match_materials, read_mtl
 
-texture_wrapping_dict = {"REPEAT": 0, "MIRRORED_REPEAT": 1, "CLAMP_TO_EDGE": 2, "CLAMP_TO_BORDER": 3}
+texture_wrapping_dict = {
+    "REPEAT": 0,
+    "MIRRORED_REPEAT": 1,
+    "CLAMP_TO_EDGE": 2,
+    "CLAMP_TO_BORDER": 3,
+}
 _GREY = 0.5  # colour of faces without a material
 load_mtl = read_mtl  # its published name
 
@@ -84,7 +89,11 @@ def load_obj(
         )
     if not load_texture:
         return vertices, faces
-    return vertices, faces, _textures(filename_obj, obj, texture_size, texture_wrapping, use_bilinear)
+    return (
+        vertices,
+        faces,
+        _textures(filename_obj, obj, texture_size, texture_wrapping, use_bilinear),
+    )
 
 
 def load_textures(
@@ -106,11 +115,18 @@ def load_textures(
 
 def _check_wrapping(wrapping: str) -> None:
     if wrapping not in texture_wrapping_dict:
-        raise ValueError(f"texture_wrapping must be one of {', '.join(texture_wrapping_dict)}, got {wrapping!r}")
+        raise ValueError(
+            f"texture_wrapping must be one of {', '.join(texture_wrapping_dict)}, got {wrapping!r}"
+        )
 
 
 def _textures(
-    filename_obj: str, obj: Obj, texture_size: int, wrapping: str, bilinear: bool, library: str | None = None
+    filename_obj: str,
+    obj: Obj,
+    texture_size: int,
+    wrapping: str,
+    bilinear: bool,
+    library: str | None = None,
 ) -> Tensor:
     folder = os.path.dirname(filename_obj)
     libraries = [library] if library is not None else find_libraries(folder, obj.libraries)
@@ -124,7 +140,9 @@ def _textures(
         colors.update(more_colors)
         images.update(more_images)
     names = match_materials(obj.materials, obj.face_material, {**colors, **images}, filename_obj)
-    textures = np.full((len(obj.faces), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32)
+    textures = np.full(
+        (len(obj.faces), texture_size, texture_size, texture_size, 3), _GREY, dtype=np.float32
+    )
     has_uv = obj.uv_faces[:, 0] >= 0
     numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
     of_face = np.array([numbers[name] for name in names])[obj.face_material]
@@ -140,7 +158,9 @@ def _textures(
     return torch.from_numpy(textures)
 
 
-def bake_textures(image: np.ndarray, uv: np.ndarray, texture_size: int, wrapping: str, bilinear: bool) -> np.ndarray:
+def bake_textures(
+    image: np.ndarray, uv: np.ndarray, texture_size: int, wrapping: str, bilinear: bool
+) -> np.ndarray:
     """Texture cubes ``[F, ts, ts, ts, 3]`` of faces with texture coordinates ``uv [F, 3, 2]`` in ``image [H, W, 3]``.
 
     Texel (i, j, k) is the image at ``(i uv0 + j uv1 + k uv2) / (i + j + k)``, texel (0, 0, 0) at (0, 0); (0, 0) is the
@@ -161,9 +181,15 @@ def bake_textures(image: np.ndarray, uv: np.ndarray, texture_size: int, wrapping
     flipped = image[::-1].astype(np.float32)
     if bilinear:
         grid, source = torch.from_numpy(2 * points - 1), torch.tensor(flipped).permute(2, 0, 1)
-        colors = torch.nn.functional.grid_sample(source[None], grid[None], padding_mode="border", align_corners=True)
+        colors = torch.nn.functional.grid_sample(
+            source[None], grid[None], padding_mode="border", align_corners=True
+        )
         return colors[0].permute(1, 2, 0).reshape(len(uv), ts, ts, ts, 3).numpy()
-    x, y = np.floor(points * np.float32([image.shape[1] - 1, image.shape[0] - 1]) + 0.5).astype(np.int64).T
+    x, y = (
+        np.floor(points * np.float32([image.shape[1] - 1, image.shape[0] - 1]) + 0.5)
+        .astype(np.int64)
+        .T
+    )
     return flipped[y.T, x.T].reshape(len(uv), ts, ts, ts, 3)
 
 

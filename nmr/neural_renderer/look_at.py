@@ -8,7 +8,9 @@ from nmr.cameras import Orthographic
 from nmr.neural_renderer._convert import Numbers, check_batch
 
 
-def look_at(vertices: Tensor, eye: Numbers, at: Numbers = (0, 0, 0), up: Numbers = (0, 1, 0)) -> Tensor:
+def look_at(
+    vertices: Tensor, eye: Numbers, at: Numbers = (0, 0, 0), up: Numbers = (0, 1, 0)
+) -> Tensor:
     """Vertices in the axes of a camera at ``eye`` that looks at ``at``: x right, y up, z forward.
 
     ``out = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)`` and ``n(v) = v / max(|v|,

@@ -15,7 +15,9 @@ class Mesh:
     Without textures, a Parameter of small random numbers is made, to start an optimization from.
     """
 
-    def __init__(self, vertices: Tensor, faces: Tensor, textures: Tensor | None = None, texture_size: int = 4) -> None:
+    def __init__(
+        self, vertices: Tensor, faces: Tensor, textures: Tensor | None = None, texture_size: int = 4
+    ) -> None:
         if not isinstance(vertices, Tensor) or not isinstance(faces, Tensor):
             raise TypeError(
                 f"Mesh takes tensors, vertices [V, 3] and faces [F, 3], got {describe(vertices)} and {describe(faces)}"
@@ -33,7 +35,11 @@ class Mesh:
 
     @classmethod
     def fromobj(
-        cls, filename_obj: str, normalization: bool = True, load_texture: bool = False, texture_size: int = 4
+        cls,
+        filename_obj: str,
+        normalization: bool = True,
+        load_texture: bool = False,
+        texture_size: int = 4,
     ) -> Mesh:
         """The mesh of an .obj file: the arguments are those of :func:`load_obj`."""
         loaded = load_obj(filename_obj, normalization, texture_size, load_texture)

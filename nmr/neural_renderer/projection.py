@@ -48,7 +48,11 @@ def projection(
     >>> nr.projection(vertices, K, R, t, None, 256)
     """
     K = as_numbers(K, "K", "[3, 3] or [B, 3, 3]")
-    if isinstance(orig_size, np.ndarray) and orig_size.shape == (2,) and (K.ndim == 2 or len(K) == 1):
+    if (
+        isinstance(orig_size, np.ndarray)
+        and orig_size.shape == (2,)
+        and (K.ndim == 2 or len(K) == 1)
+    ):
         orig_size = orig_size.tolist()  # a pair
     if isinstance(orig_size, (Tensor, np.ndarray)):
         # One size per image goes into K, which then describes images of size 1.

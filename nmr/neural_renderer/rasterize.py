@@ -26,20 +26,30 @@ class _Cubes:
     """Colours of texture cubes, times the light on the faces."""
 
     textures: Tensor | None  # [B or 1, F, ts, ts, ts, C]
-    light: Tensor | None  # [B or 1, F, 3]; [B or 1, 2F, 3] has another value for each face seen from behind
+    light: (
+        Tensor | None
+    )  # [B or 1, F, 3]; [B or 1, 2F, 3] has another value for each face seen from behind
 
     def sample(self, fragments: Fragments) -> Tensor:
         if self.textures is None:
             raise ValueError("RGB images need textures [B, F, ts, ts, ts, 3], got None")
-        face_index, weights, batch = fragments.sided_face_index, fragments.weights, fragments.mesh.batch
+        face_index, weights, batch = (
+            fragments.sided_face_index,
+            fragments.weights,
+            fragments.mesh.batch,
+        )
         textures = check_textures(self.textures, batch, fragments.faces.shape[-2]).to(weights)
         colors = ops.texture_cubes(textures, face_index, weights, None, fragments.eps)
         if self.light is None:
             return colors
         if self.light.shape[0] not in (1, batch):
-            raise ValueError(f"light for {self.light.shape[0]} images, but {batch} are drawn; give [3] or [{batch}, 3]")
+            raise ValueError(
+                f"light for {self.light.shape[0]} images, but {batch} are drawn; give [3] or [{batch}, 3]"
+            )
         if colors.shape[-1] not in (1, 3):
-            raise ValueError(f"light has three colours: textures must have 1 or 3 channels, got {colors.shape[-1]}")
+            raise ValueError(
+                f"light has three colours: textures must have 1 or 3 channels, got {colors.shape[-1]}"
+            )
         # Faces seen from behind have numbers and lights of their own. For this operator they are further faces; the
         # three corners of a face have the same value.
         corners = torch.arange(self.light.shape[1], device=face_index.device)[:, None].expand(-1, 3)
@@ -67,7 +77,9 @@ def draw(
         faces,
         outputs=outputs,
         colors=_Cubes(textures, light),
-        background=like(background_color, "background_color", vertices) if "rgb" in outputs else 0.0,
+        background=like(background_color, "background_color", vertices)
+        if "rgb" in outputs
+        else 0.0,
         image_size=height_and_width(image_size),
         anti_aliasing=anti_aliasing,
         fill_back=fill_back,
@@ -76,7 +88,9 @@ def draw(
         clip=False,  # as published
         eps=eps,
     )
-    drawn: dict[str, Tensor | None] = dict.fromkeys(("rgb", "alpha", "depth")) | dict(zip(outputs, images, strict=True))
+    drawn: dict[str, Tensor | None] = dict.fromkeys(("rgb", "alpha", "depth")) | dict(
+        zip(outputs, images, strict=True)
+    )
     if "rgb" in outputs:
         drawn["rgb"] = drawn["rgb"].permute(0, 3, 1, 2).contiguous()
     return drawn
@@ -85,9 +99,13 @@ def draw(
 def _soup(faces: object) -> tuple[Tensor, Tensor]:
     """Corners ``[B, F, 3, 3]`` as vertices ``[B, 3F, 3]`` and faces."""
     if not isinstance(faces, Tensor) or faces.ndim != 4 or faces.shape[2:] != (3, 3):
-        raise ValueError(f"faces must be corners [B, F, 3, 3] (see vertices_to_faces), got {describe(faces)}")
+        raise ValueError(
+            f"faces must be corners [B, F, 3, 3] (see vertices_to_faces), got {describe(faces)}"
+        )
     if faces.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"faces must be float32 or float64, got {describe(faces)}; call faces.float()")
+        raise TypeError(
+            f"faces must be float32 or float64, got {describe(faces)}; call faces.float()"
+        )
     return faces.flatten(1, 2), torch.arange(3 * faces.shape[1], device=faces.device).view(-1, 3)
 
 
@@ -219,9 +237,13 @@ class Rasterize(torch.nn.Module):
         self.return_alpha = return_alpha
         self.return_depth = return_depth
 
-    def forward(self, faces: Tensor, textures: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, faces: Tensor, textures: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         settings = (self.image_size, False, self.near, self.far, self.eps, self.background_color)
         wanted = (self.return_rgb, self.return_alpha, self.return_depth)
         images = rasterize_rgbad(faces, textures, *settings, *wanted)
-        rgb, alpha, depth = (faces.new_empty(0) if image is None else image.flip(-2) for image in images.values())
+        rgb, alpha, depth = (
+            faces.new_empty(0) if image is None else image.flip(-2) for image in images.values()
+        )
         return (rgb.permute(0, 2, 3, 1) if self.return_rgb else rgb), alpha, depth

@@ -70,7 +70,11 @@ class Renderer(torch.nn.Module):
     >>> rgb, depth, alpha = renderer(vertices, faces, textures)
     """
 
-    camera_up = (0, 1, 0)  # an attribute of the class: renderers saved whole by the published code lack it
+    camera_up = (
+        0,
+        1,
+        0,
+    )  # an attribute of the class: renderers saved whole by the published code lack it
 
     def __init__(
         self,
@@ -103,14 +107,17 @@ class Renderer(torch.nn.Module):
         self.camera_mode = camera_mode
         self._mode()
         self.K, self.R, self.t, self.dist_coeffs = (
-            torch.tensor(x, dtype=torch.float32) if isinstance(x, np.ndarray) else x for x in (K, R, t, dist_coeffs)
+            torch.tensor(x, dtype=torch.float32) if isinstance(x, np.ndarray) else x
+            for x in (K, R, t, dist_coeffs)
         )
         if dist_coeffs is None:
             self.dist_coeffs = torch.zeros(1, 5)
         self.orig_size = orig_size
         self.perspective = perspective
         self.viewing_angle = viewing_angle
-        tangent = math.tan(math.radians(viewing_angle))  # 0 is possible for cameras that do not use the angle
+        tangent = math.tan(
+            math.radians(viewing_angle)
+        )  # 0 is possible for cameras that do not use the angle
         self.eye = [0, 0, -(1 / tangent + 1)] if tangent else None
         self.camera_direction = camera_direction
         self.near = near
@@ -128,7 +135,16 @@ class Renderer(torch.nn.Module):
         super().__setattr__(name, value)
 
     def forward(
-        self, vertices, faces, textures=None, mode=None, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
+        self,
+        vertices,
+        faces,
+        textures=None,
+        mode=None,
+        K=None,
+        R=None,
+        t=None,
+        dist_coeffs=None,
+        orig_size=None,
     ):
         """:meth:`render` for ``mode=None``, else the method that ``mode`` names: "rgb", "silhouettes" or "depth"."""
         camera = (K, R, t, dist_coeffs, orig_size)
@@ -142,27 +158,41 @@ class Renderer(torch.nn.Module):
             return self.render_depth(vertices, faces, *camera)
         raise ValueError(f"mode must be None, 'rgb', 'silhouettes' or 'depth', got {mode!r}")
 
-    def render_silhouettes(self, vertices, faces, K=None, R=None, t=None, dist_coeffs=None, orig_size=None) -> Tensor:
+    def render_silhouettes(
+        self, vertices, faces, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
+    ) -> Tensor:
         """Coverage ``[B, h, w]``, row 0 = top.
 
         ``vertices [B, V, 3]`` float32 or float64; ``faces [B, F, 3]`` (``[1, F, 3]`` or ``[F, 3]`` for all meshes). One
         mesh and a camera with B poses give B images. Raises TypeError or ValueError for wrong types, shapes and ranges.
         """
-        return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("alpha",))["alpha"]
+        return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("alpha",))[
+            "alpha"
+        ]
 
-    def render_depth(self, vertices, faces, K=None, R=None, t=None, dist_coeffs=None, orig_size=None) -> Tensor:
+    def render_depth(
+        self, vertices, faces, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
+    ) -> Tensor:
         """Depth ``[B, h, w]``, row 0 = top, 100 on background; arguments as :meth:`render_silhouettes`."""
-        return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("depth",))["depth"]
+        return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("depth",))[
+            "depth"
+        ]
 
-    def render_rgb(self, vertices, faces, textures, K=None, R=None, t=None, dist_coeffs=None, orig_size=None) -> Tensor:
+    def render_rgb(
+        self, vertices, faces, textures, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
+    ) -> Tensor:
         """Lit colours ``[B, 3, h, w]``, row 0 = top; ``textures [B or 1, F, ts, ts, ts, 3]`` in [0, 1]."""
-        return self._draw(vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb",))["rgb"]
+        return self._draw(vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb",))[
+            "rgb"
+        ]
 
     def render(
         self, vertices, faces, textures, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """``(rgb [B, 3, h, w], depth [B, h, w], alpha [B, h, w])``, in one pass; arguments as :meth:`render_rgb`."""
-        images = self._draw(vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb", "alpha", "depth"))
+        images = self._draw(
+            vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb", "alpha", "depth")
+        )
         return images["rgb"], images["depth"], images["alpha"]
 
     def _draw(self, vertices, faces, textures, camera, outputs) -> dict[str, Tensor | None]:
@@ -233,7 +263,9 @@ class Renderer(torch.nn.Module):
         if self.eye is None:
             raise ValueError(f"camera_mode={self.camera_mode!r} needs an eye; set renderer.eye")
         if mode == "look" and self.perspective:
-            camera = Look(self.eye, self.camera_direction, self.camera_up, half_fov_deg=self.viewing_angle)
+            camera = Look(
+                self.eye, self.camera_direction, self.camera_up, half_fov_deg=self.viewing_angle
+            )
         elif mode == "look":
             camera = orthographic_look(self.eye, self.camera_direction, self.camera_up)
         elif self.perspective:

@@ -14,7 +14,9 @@ from nmr.neural_renderer._images import write_png
 _EPS = 1e-5  # keeps texture coordinates below the last texel
 
 
-def create_texture_image(textures: Tensor, texture_size_out: int = 16) -> tuple[np.ndarray, np.ndarray]:
+def create_texture_image(
+    textures: Tensor, texture_size_out: int = 16
+) -> tuple[np.ndarray, np.ndarray]:
     """One image that holds the texture cubes of all faces, and the texture coordinates that find them there.
 
     Parameters
@@ -48,12 +50,18 @@ def create_texture_image(textures: Tensor, texture_size_out: int = 16) -> tuple[
     # The pixels next to the diagonal repeat it, so that interpolation at this edge mixes in no other colour.
     rim = np.arange(size - 1)
     tiles[:, rim, rim + 1] = tiles[:, rim, rim]
-    image = tiles.reshape(rows, columns, size, size, 3).swapaxes(1, 2).reshape(rows * size, columns * size, 3)
+    image = (
+        tiles.reshape(rows, columns, size, size, 3)
+        .swapaxes(1, 2)
+        .reshape(rows * size, columns * size, 3)
+    )
 
     row, column = np.divmod(np.arange(num_faces), columns)
     low = np.stack([column, row], axis=-1) * size
     high = low + size - 1
-    uv = np.stack([low, np.stack([low[:, 0], high[:, 1]], axis=-1), high], axis=1).astype(np.float32)
+    uv = np.stack([low, np.stack([low[:, 0], high[:, 1]], axis=-1), high], axis=1).astype(
+        np.float32
+    )
     uv /= np.array([image.shape[1] - 1, image.shape[0] - 1], dtype=np.float32)
     return image[::-1], uv
 
@@ -81,7 +89,9 @@ def _one_mesh(textures: Tensor) -> Tensor:
     )
 
 
-def save_obj(filename: str | os.PathLike, vertices: Tensor, faces: Tensor, textures: Tensor | None = None) -> None:
+def save_obj(
+    filename: str | os.PathLike, vertices: Tensor, faces: Tensor, textures: Tensor | None = None
+) -> None:
     """Writes a mesh; with textures also ``name.mtl`` and the image ``name.png``, in the folder of ``name.obj``.
 
     Parameters
@@ -109,13 +119,17 @@ def save_obj(filename: str | os.PathLike, vertices: Tensor, faces: Tensor, textu
         raise ValueError(f"filename must end in .obj, got {os.fspath(filename)!r}")
     for name, tensor in (("vertices", vertices), ("faces", faces)):
         if not isinstance(tensor, Tensor) or tensor.ndim != 2 or tensor.shape[1] != 3:
-            raise ValueError(f"{name} must be those of one mesh, a tensor [N, 3], got {describe(tensor)}; take [0]")
+            raise ValueError(
+                f"{name} must be those of one mesh, a tensor [N, 3], got {describe(tensor)}; take [0]"
+            )
     points, corners = vertices.detach().cpu().numpy(), (faces.detach().cpu().long() + 1).numpy()
     name = os.path.basename(base)
     lines = []
     if textures is not None:
         if len(_one_mesh(textures)) != len(corners):
-            raise ValueError(f"textures must be one per face, {len(corners)}, got {describe(textures)}")
+            raise ValueError(
+                f"textures must be one per face, {len(corners)}, got {describe(textures)}"
+            )
         image, uv = create_texture_image(textures)
         write_png(f"{base}.png", image)
         _write_text(f"{base}.mtl", ["newmtl material_1", f"map_Kd {name}.png"])
@@ -126,7 +140,10 @@ def save_obj(filename: str | os.PathLike, vertices: Tensor, faces: Tensor, textu
     else:
         lines += ["vt {:.9g} {:.9g}".format(*point) for point in uv.reshape(-1, 2).tolist()]
         lines.append("usemtl material_1")
-        lines += [f"f {a}/{3 * i + 1} {b}/{3 * i + 2} {c}/{3 * i + 3}" for i, (a, b, c) in enumerate(corners.tolist())]
+        lines += [
+            f"f {a}/{3 * i + 1} {b}/{3 * i + 2} {c}/{3 * i + 3}"
+            for i, (a, b, c) in enumerate(corners.tolist())
+        ]
     _write_text(f"{base}{ending}", lines)
 
 

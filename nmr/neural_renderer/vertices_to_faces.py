@@ -30,4 +30,6 @@ def vertices_to_faces(vertices: Tensor, faces: Tensor) -> Tensor:
     batch = faces.shape[0] if faces.ndim == 3 else vertices.shape[0]
     first = vertices.shape[1] * torch.arange(batch, device=faces.device)
     # embedding, not indexing: its backward pass sums in a fixed order.
-    return torch.nn.functional.embedding(faces + first[:, None, None], vertices.expand(batch, -1, -1).flatten(0, 1))
+    return torch.nn.functional.embedding(
+        faces + first[:, None, None], vertices.expand(batch, -1, -1).flatten(0, 1)
+    )

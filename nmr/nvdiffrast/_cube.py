@@ -26,7 +26,9 @@ def places(directions: Tensor, derivatives: Tensor | None) -> Places:
     """The places that directions ``[B, H, W, 3]`` with derivatives ``[B, H, W, 6]`` point to."""
     largest = directions.detach().abs().max(-1).values
     valid = (largest > 0) & directions.isfinite().all(-1)
-    directions = torch.where(valid.unsqueeze(-1), directions, directions.new_tensor([1.0, 0.0, 0.0]))
+    directions = torch.where(
+        valid.unsqueeze(-1), directions, directions.new_tensor([1.0, 0.0, 0.0])
+    )
     axis = directions.detach().abs().argmax(-1)
     along = directions.gather(-1, axis.unsqueeze(-1))
     face = 2 * axis + (along[..., 0] < 0)
@@ -35,8 +37,12 @@ def places(directions: Tensor, derivatives: Tensor | None) -> Places:
     slopes = None
     if derivatives is not None:
         derivatives = torch.where(valid.unsqueeze(-1), derivatives, 0).unflatten(-1, (3, 2))
-        onto = (frame.unsqueeze(-1) * derivatives).sum(-2).movedim(0, -2)  # [B, H, W, (column, row), (X, Y)]
-        forward = derivatives.gather(-2, axis[..., None, None].expand(*axis.shape, 1, 2)) * along.sign().unsqueeze(-1)
+        onto = (
+            (frame.unsqueeze(-1) * derivatives).sum(-2).movedim(0, -2)
+        )  # [B, H, W, (column, row), (X, Y)]
+        forward = derivatives.gather(
+            -2, axis[..., None, None].expand(*axis.shape, 1, 2)
+        ) * along.sign().unsqueeze(-1)
         slopes = ((onto - at.unsqueeze(-1) * forward) / along.abs().unsqueeze(-1) / 2).flatten(-2)
     return Places(face, (at + 1) / 2, slopes, valid)
 
@@ -60,9 +66,14 @@ def _neighbours(size: int) -> tuple[Tensor, Tensor]:
     row, column = torch.meshgrid(centres, centres, indexing="ij")
     columns, rows = torch.tensor(_COLUMNS).double(), torch.tensor(_ROWS).double()
     outward = (
-        torch.eye(3, dtype=torch.float64).repeat_interleave(2, 0) * torch.tensor([1.0, -1.0] * 3).double()[:, None]
+        torch.eye(3, dtype=torch.float64).repeat_interleave(2, 0)
+        * torch.tensor([1.0, -1.0] * 3).double()[:, None]
     )
-    grid = column[..., None] * columns[:, None, None] + row[..., None] * rows[:, None, None] + outward[:, None, None]
+    grid = (
+        column[..., None] * columns[:, None, None]
+        + row[..., None] * rows[:, None, None]
+        + outward[:, None, None]
+    )
     place = places(grid, None)
     at = (place.at * size).floor().long().clamp(0, size - 1)
     texels = place.face * size * size + at[..., 1] * size + at[..., 0]
@@ -71,7 +82,13 @@ def _neighbours(size: int) -> tuple[Tensor, Tensor]:
         for y, near_y in ((0, inner[0]), (size + 1, inner[1])):
             for x, near_x in ((0, inner[0]), (size + 1, inner[1])):
                 corners.append(
-                    torch.stack([texels[face, near_y, near_x], texels[face, y, near_x], texels[face, near_y, x]])
+                    torch.stack(
+                        [
+                            texels[face, near_y, near_x],
+                            texels[face, y, near_x],
+                            texels[face, near_y, x],
+                        ]
+                    )
                 )
                 texels[face, y, x] = 6 * size * size + len(corners) - 1
     return texels.flatten(), torch.stack(corners)

@@ -85,7 +85,9 @@ def rasterize(
     >>> rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, torch.tensor([[0, 1, 2]]), (8, 8))
     """
     if _context(glctx).active_depth_peeler is not None:
-        raise RuntimeError("rasterize cannot be called inside of a DepthPeeler; call rasterize_next_layer()")
+        raise RuntimeError(
+            "rasterize cannot be called inside of a DepthPeeler; call rasterize_next_layer()"
+        )
     scene = _Scene.checked(pos, tri, resolution, ranges)
     return scene.weights(scene.face_index(None), grad_db)
 
@@ -112,7 +114,9 @@ class DepthPeeler:
 
     def __enter__(self) -> DepthPeeler:
         if self.raster_ctx is None or self.raster_ctx.active_depth_peeler is not None:
-            raise RuntimeError("a DepthPeeler is entered once, and one at a time in each context; create another")
+            raise RuntimeError(
+                "a DepthPeeler is entered once, and one at a time in each context; create another"
+            )
         self.raster_ctx.active_depth_peeler = self
         self._next = 0
         return self
@@ -124,7 +128,9 @@ class DepthPeeler:
     def rasterize_next_layer(self) -> tuple[Tensor, Tensor]:
         """As :func:`rasterize`, without the surfaces of the calls before."""
         if self._next is None:
-            raise RuntimeError("rasterize_next_layer is called inside of `with DepthPeeler(...) as peeler:`")
+            raise RuntimeError(
+                "rasterize_next_layer is called inside of `with DepthPeeler(...) as peeler:`"
+            )
         if self._layers is None or self._next == self._layers.shape[-1]:
             self._layers = self._scene.face_index(max(4, 2 * self._next))
         self._next += 1
@@ -143,11 +149,20 @@ class _Scene(NamedTuple):
     def checked(pos: object, tri: object, resolution: object, ranges: object) -> _Scene:
         pos = _positions(pos)
         tri = _faces(tri, pos)
-        size = check_image_size(list(resolution) if hasattr(resolution, "__iter__") else resolution, _LARGEST)
+        size = check_image_size(
+            list(resolution) if hasattr(resolution, "__iter__") else resolution, _LARGEST
+        )
         if pos.ndim == 3:
             return _Scene(pos, tri, size, None)
-        if not isinstance(ranges, Tensor) or ranges.ndim != 2 or ranges.shape[1] != 2 or ranges.is_floating_point():
-            raise ValueError(f"pos [V, 4] needs ranges, an integer tensor [B, 2], got {describe(ranges)}")
+        if (
+            not isinstance(ranges, Tensor)
+            or ranges.ndim != 2
+            or ranges.shape[1] != 2
+            or ranges.is_floating_point()
+        ):
+            raise ValueError(
+                f"pos [V, 4] needs ranges, an integer tensor [B, 2], got {describe(ranges)}"
+            )
         ranges = ranges.tolist()
         if any(first < 0 or count < 0 or first + count > len(tri) for first, count in ranges):
             raise ValueError(f"ranges must lie within the {len(tri)} faces of tri, got {ranges}")
@@ -159,10 +174,16 @@ class _Scene(NamedTuple):
             return _face_index(self.pos.detach(), self.tri, self.size, layers)
         images = []
         for first, count in self.ranges:
-            image = _face_index(self.pos.detach(), self.tri[first : first + count], self.size, layers)
+            image = _face_index(
+                self.pos.detach(), self.tri[first : first + count], self.size, layers
+            )
             images.append(torch.where(image < 0, image, image + first))
         shape = (0, *self.size) if layers is None else (0, *self.size, layers)
-        return torch.cat(images) if images else torch.empty(shape, dtype=torch.int32, device=self.pos.device)
+        return (
+            torch.cat(images)
+            if images
+            else torch.empty(shape, dtype=torch.int32, device=self.pos.device)
+        )
 
     def weights(self, face_index: Tensor, grad_db: bool) -> tuple[Tensor, Tensor]:
         rast, rast_db = ops.clip_weights(self.pos, self.tri, face_index)
@@ -176,7 +197,9 @@ def _face_index(pos: Tensor, tri: Tensor, size: tuple[int, int], layers: int | N
     w = pos[..., 3:]
     # z / w is linear on the screen, also in perspective. The kernels have row 0 at y = 1.
     points = pos[..., :3].double() / torch.where(w > 0, w, float("nan")).double()
-    points = (points * points.new_tensor([1.0, -1.0, 1.0])).to(dtype if source is None else torch.float64)
+    points = (points * points.new_tensor([1.0, -1.0, 1.0])).to(
+        dtype if source is None else torch.float64
+    )
     near, far = (math.copysign(1 + torch.finfo(points.dtype).eps, side) for side in (-1, 1))
     if layers is None:
         index = ops.rasterize(points, tri, starts, *size, True, near, far, False)
@@ -203,7 +226,9 @@ def _in_front(pos: Tensor, tri: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, T
     batch, vertices = pos.shape[:2]
     new_starts = F.pad(counts.cumsum(0), (0, 0, 1, 0))
     num_new, num_drawn = new_starts[-1].tolist()
-    faces, source, _, ends = ops.clip_faces(depths, tri, None, plane, new_starts, num_new, num_drawn)
+    faces, source, _, ends = ops.clip_faces(
+        depths, tri, None, plane, new_starts, num_new, num_drawn
+    )
     a, b = (pos.double().view(-1, 4)[ends[:, k]] for k in (0, 1))
     new = a + (plane - a[:, 3:]) / (b[:, 3:] - a[:, 3:]) * (b - a)
     parts = zip(pos.double(), new.split(counts[:, 0].tolist()), strict=True)
@@ -245,7 +270,9 @@ def interpolate(
         check_choice(diff_attrs, "diff_attrs", ("all",))
     chosen = attr if isinstance(diff_attrs, str) else attr[..., [int(n) for n in diff_attrs]]
     slopes = _pixels(rast_db, "rast_db", 4).to(rast)
-    by_x, by_y = (at(chosen, u, v, -u - v) for u, v in ((slopes[..., k], slopes[..., k + 2]) for k in (0, 1)))
+    by_x, by_y = (
+        at(chosen, u, v, -u - v) for u, v in ((slopes[..., k], slopes[..., k + 2]) for k in (0, 1))
+    )
     return values, torch.stack([by_x, by_y], dim=-1).flatten(-2)
 
 
@@ -267,12 +294,14 @@ class _Mip(NamedTuple):
             grids.append([[first + n * height * width, height, width] for n in range(images)])
             first += images * height * width
             texels.append(level.reshape(-1, channels))
-        return texels[0] if len(texels) == 1 else torch.cat(texels), torch.tensor(grids, device="cpu").transpose(
-            0, 1
-        ).contiguous()
+        return texels[0] if len(texels) == 1 else torch.cat(texels), torch.tensor(
+            grids, device="cpu"
+        ).transpose(0, 1).contiguous()
 
 
-def texture_construct_mip(tex: Tensor, max_mip_level: int | None = None, cube_mode: bool = False) -> _Mip:
+def texture_construct_mip(
+    tex: Tensor, max_mip_level: int | None = None, cube_mode: bool = False
+) -> _Mip:
     """The mipmaps of a texture for the argument ``mip`` of :func:`texture`.
 
     If tex requires a gradient, :func:`texture` makes them anew, so that the gradient passes through them.
@@ -282,14 +311,18 @@ def texture_construct_mip(tex: Tensor, max_mip_level: int | None = None, cube_mo
     most = max(sizes).bit_length() - 1
     if max_mip_level is not None:
         if int(max_mip_level) != max_mip_level or max_mip_level < 0:
-            raise ValueError(f"max_mip_level must be an integer of at least 0, got {max_mip_level!r}")
+            raise ValueError(
+                f"max_mip_level must be an integer of at least 0, got {max_mip_level!r}"
+            )
         most = min(most, int(max_mip_level))
     images = math.prod(tex.shape[:-3])
     grids, count = level_grids([sizes] * images, most + 1)
     texels = ops.mipmaps(tex.reshape(-1, tex.shape[-1]), grids, count)
     each = texels.view(images, count // images, tex.shape[-1])
     levels = [
-        each[:, first : first + height * width].reshape(*tex.shape[:-3], height, width, tex.shape[-1])
+        each[:, first : first + height * width].reshape(
+            *tex.shape[:-3], height, width, tex.shape[-1]
+        )
         for first, height, width in grids[0].tolist()
     ]
     return _Mip(levels, (texels, grids))
@@ -320,11 +353,15 @@ def texture(
     check_choice(boundary_mode, "boundary_mode", ("wrap", "clamp", "zero", "cube"))
     cube = boundary_mode == "cube"
     if filter_mode == "auto":
-        filter_mode = "linear" if uv_da is None and mip_level_bias is None else "linear-mipmap-linear"
+        filter_mode = (
+            "linear" if uv_da is None and mip_level_bias is None else "linear-mipmap-linear"
+        )
     tex = _texture_of(tex, cube)
     uv = _pixels(uv, "uv", 3 if cube else 2).to(tex)
     if tex.shape[0] not in (1, len(uv)):
-        raise ValueError(f"tex must have batch size 1 or {len(uv)}, that of uv, got {describe(tex)}")
+        raise ValueError(
+            f"tex must have batch size 1 or {len(uv)}, that of uv, got {describe(tex)}"
+        )
     uv_da = None if uv_da is None else _pixels(uv_da, "uv_da", 6 if cube else 4).to(tex)
     place = _cube.places(uv, uv_da) if cube else _cube.Places(None, uv, uv_da, None)
     if filter_mode == "nearest":
@@ -333,9 +370,15 @@ def texture(
         if uv_da is None and mip_level_bias is None:
             raise ValueError(f"filter_mode={filter_mode!r} needs uv_da or mip_level_bias")
         levels = _mipmaps(tex, mip, max_mip_level, cube)
-        last = min([len(levels.levels) - 1] if max_mip_level is None else [len(levels.levels) - 1, int(max_mip_level)])
+        last = min(
+            [len(levels.levels) - 1]
+            if max_mip_level is None
+            else [len(levels.levels) - 1, int(max_mip_level)]
+        )
         level = _level(place.derivatives, mip_level_bias, tex, last)
-        colors = _filtered(levels, place, level if filter_mode.endswith("linear") else level.round(), boundary_mode)
+        colors = _filtered(
+            levels, place, level if filter_mode.endswith("linear") else level.round(), boundary_mode
+        )
     else:
         colors = _filtered(_Mip([tex], None), place, None, boundary_mode)
     return colors if place.valid is None else torch.where(place.valid.unsqueeze(-1), colors, 0)
@@ -353,12 +396,16 @@ def _mipmaps(tex: Tensor, mip: object, max_mip_level: int | None, cube: bool) ->
                 )
         return _Mip(levels, None)
     if mip is not None and not isinstance(mip, _Mip):
-        raise TypeError(f"mip must be made by texture_construct_mip, or a list of tensors, got {describe(mip)}")
+        raise TypeError(
+            f"mip must be made by texture_construct_mip, or a list of tensors, got {describe(mip)}"
+        )
     if mip is None or (tex.requires_grad and torch.is_grad_enabled()):
         count = max_mip_level if mip is None else len(mip.levels) - 1
         return texture_construct_mip(tex, count, cube)
     if mip.levels[0].shape != tex.shape:
-        raise ValueError(f"mip belongs to a texture {list(mip.levels[0].shape)}, tex is {describe(tex)}")
+        raise ValueError(
+            f"mip belongs to a texture {list(mip.levels[0].shape)}, tex is {describe(tex)}"
+        )
     return mip
 
 
@@ -367,7 +414,9 @@ def _level(derivatives: Tensor | None, bias: Tensor | None, tex: Tensor, last: i
     level = 0
     if derivatives is not None:
         height, width = tex.shape[-3:-1]
-        s_x, s_y, t_x, t_y = (derivatives * derivatives.new_tensor([width, width, height, height])).unbind(-1)
+        s_x, s_y, t_x, t_y = (
+            derivatives * derivatives.new_tensor([width, width, height, height])
+        ).unbind(-1)
         # Half the trace of J J^T, and the distance of its eigenvalues from it.
         half = (s_x**2 + s_y**2 + t_x**2 + t_y**2) / 2
         apart = ((s_x**2 + s_y**2 - t_x**2 - t_y**2) / 2) ** 2 + (s_x * t_x + s_y * t_y) ** 2
@@ -383,7 +432,9 @@ def _filtered(mip: _Mip, place: _cube.Places, level: Tensor | None, boundary_mod
     if boundary_mode in ("wrap", "clamp"):
         texels, grids = mip.pack()
         wrap = "repeat" if boundary_mode == "wrap" else "clamp"
-        upright = torch.stack([place.at[..., 0], 1 - place.at[..., 1]], dim=-1)  # row 0 of the kernel is v = 1
+        upright = torch.stack(
+            [place.at[..., 0], 1 - place.at[..., 1]], dim=-1
+        )  # row 0 of the kernel is v = 1
 
         def sample(level: Tensor | None) -> Tensor:
             return sample_places(texels, grids, level, upright, wrap)
@@ -405,9 +456,14 @@ def _with_borders(mip: _Mip, place: _cube.Places) -> Callable[[Tensor | None], T
     The border of an image is zero, that of a face of a cube map has the texels of its neighbours.
     """
     cube = place.face is not None
-    padded = [_cube.with_borders(image) if cube else F.pad(image, (0, 0, 1, 1, 1, 1)) for image in mip.levels]
+    padded = [
+        _cube.with_borders(image) if cube else F.pad(image, (0, 0, 1, 1, 1, 1))
+        for image in mip.levels
+    ]
     texels, grids = _Mip(padded, None).pack()
-    sizes = place.at.new_tensor([image.shape[-3:-1][::-1] for image in mip.levels])  # [L, 2]: width, height
+    sizes = place.at.new_tensor(
+        [image.shape[-3:-1][::-1] for image in mip.levels]
+    )  # [L, 2]: width, height
 
     def sample(level: Tensor | None) -> Tensor:
         size = sizes[0] if level is None else sizes[level.long()]
@@ -447,7 +503,12 @@ class _Topology(NamedTuple):
 def antialias_construct_topology_hash(tri: Tensor) -> _Topology:
     """What :func:`antialias` needs to know of faces that stay the same, for its argument ``topology_hash``."""
     tri = check_faces(tri, 1, tri.device if isinstance(tri, Tensor) else torch.device("cpu"), "tri")
-    ends = torch.stack([tri.roll(-1, dims=1), tri.roll(-2, dims=1)], dim=-1).view(-1, 2).sort(dim=1).values
+    ends = (
+        torch.stack([tri.roll(-1, dims=1), tri.roll(-2, dims=1)], dim=-1)
+        .view(-1, 2)
+        .sort(dim=1)
+        .values
+    )
     key = ends[:, 0] * (int(tri.max()) + 1 if tri.numel() else 1) + ends[:, 1]
     key, order = key.sort(stable=True)
     starts = torch.ones_like(key, dtype=torch.bool)
@@ -488,7 +549,9 @@ def antialias(
             f"topology_hash must be made by antialias_construct_topology_hash, got {describe(topology_hash)}"
         )
     if topology_hash.twins.shape != tri.shape:
-        raise ValueError(f"topology_hash belongs to faces {list(topology_hash.twins.shape)}, tri is {describe(tri)}")
+        raise ValueError(
+            f"topology_hash belongs to faces {list(topology_hash.twins.shape)}, tri is {describe(tri)}"
+        )
     if pos_gradient_boost != 1:
         pos = pos_gradient_boost * pos - (pos_gradient_boost - 1) * pos.detach()
     pos = pos if pos.ndim == 3 else pos.unsqueeze(0)
@@ -507,7 +570,9 @@ def _context(glctx: object) -> RasterizeCudaContext:
 def _floats(value: object, name: str, wanted: str, ndims: tuple[int, ...]) -> Tensor:
     value = cast_under_autocast(value)
     if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"{name} must be a float32 or float64 tensor {wanted}, got {describe(value)}")
+        raise TypeError(
+            f"{name} must be a float32 or float64 tensor {wanted}, got {describe(value)}"
+        )
     if value.ndim not in ndims:
         raise ValueError(f"{name} must have shape {wanted}, got {describe(value)}")
     return value
@@ -533,7 +598,9 @@ def _faces(tri: object, like: Tensor) -> Tensor:
     if tri.ndim != 2:
         raise ValueError(f"tri must have shape [F, 3], got {describe(tri)}")
     if like.dtype == torch.float32 and len(tri) >= 2**24:
-        raise ValueError(f"rast in float32 numbers at most {2**24 - 1} faces, got {len(tri)}; use float64")
+        raise ValueError(
+            f"rast in float32 numbers at most {2**24 - 1} faces, got {len(tri)}; use float64"
+        )
     return tri
 
 

@@ -29,12 +29,25 @@ P, R = ParamSpec("P"), TypeVar("R")
 _LIBRARY = torch.library.Library("nmr", "FRAGMENT")
 _MAYBE = Optional[Tensor]  # noqa: UP045, equal to Tensor | None
 # In torch's schema language. Lists of tensors would have no gradient.
-_TYPES = {Tensor: "Tensor", _MAYBE: "Tensor?", bool: "bool", int: "SymInt", float: "float", list[bool]: "bool[]"}
+_TYPES = {
+    Tensor: "Tensor",
+    _MAYBE: "Tensor?",
+    bool: "bool",
+    int: "SymInt",
+    float: "float",
+    list[bool]: "bool[]",
+}
 _PLAIN = {Tensor, torch.nn.Parameter, type(None), bool, int, float, list}
 
 
 def kernel(
-    results: str, *, gradients: str = "", keep: str = "", constant: str = "", used_by: str = "", twice=None
+    results: str,
+    *,
+    gradients: str = "",
+    keep: str = "",
+    constant: str = "",
+    used_by: str = "",
+    twice=None,
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorates a function that allocates the results of a kernel, given its arguments: the operator ``nmr::<name>``.
 
@@ -68,13 +81,17 @@ def kernel(
         if gradients:
             kept = {"keep": keep.split(), "constant": constant.split()}
             call.backward = _add_gradient(call, hints, results.split(), gradients.split(), **kept)
-            _refuse_gradient(call.backward, used_by) if twice is None else _add_second(call.backward, twice)
+            _refuse_gradient(call.backward, used_by) if twice is None else _add_second(
+                call.backward, twice
+            )
         return call
 
     return decorate
 
 
-def _operator(name: str, hints: dict, returned: type, allocate: Callable, results: list[str]) -> Callable:
+def _operator(
+    name: str, hints: dict, returned: type, allocate: Callable, results: list[str]
+) -> Callable:
     """Registers a kernel, its fake (``allocate``) and its vmap rule: one call per item."""
     several = get_origin(returned) is tuple
     names, first = list(hints), next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
@@ -89,7 +106,9 @@ def _operator(name: str, hints: dict, returned: type, allocate: Callable, result
         wanted = given.pop("wanted", None)
         given.update(zip(results, outputs if several else (outputs,), strict=True))
         if wanted is not None:
-            given.update((result, None) for result, want in zip(results, wanted, strict=True) if not want)
+            given.update(
+                (result, None) for result, want in zip(results, wanted, strict=True) if not want
+            )
         getattr(_C, name)(**given, num_threads=torch.get_num_threads())
         return outputs
 
@@ -113,7 +132,11 @@ def _operator(name: str, hints: dict, returned: type, allocate: Callable, result
         return tuple(map(torch.stack, zip(*items, strict=True))), (0,) * len(results)
 
     arguments = ", ".join(f"{_TYPES[hint]} {argument}" for argument, hint in hints.items())
-    of_results = f"({', '.join(_TYPES[hint] for hint in get_args(returned))})" if several else _TYPES[returned]
+    of_results = (
+        f"({', '.join(_TYPES[hint] for hint in get_args(returned))})"
+        if several
+        else _TYPES[returned]
+    )
     _LIBRARY.define(f"{name}({arguments}) -> {of_results}", tags=(torch.Tag.pt2_compliant_tag,))
     _LIBRARY.impl(name, run, "CompositeExplicitAutograd")
     op = getattr(torch.ops.nmr, name).default
@@ -129,11 +152,18 @@ def _gradient_is_wanted(args) -> bool:
     tensors = [x for x in args if isinstance(x, Tensor)]
     if torch.is_grad_enabled() and any([x.requires_grad for x in tensors]):
         return True
-    return forward_ad._current_level >= 0 and any([forward_ad.unpack_dual(x).tangent is not None for x in tensors])
+    return forward_ad._current_level >= 0 and any(
+        [forward_ad.unpack_dual(x).tangent is not None for x in tensors]
+    )
 
 
 def _add_gradient(
-    forward: Callable, hints: dict, results: list[str], gradients: list[str], keep: list[str], constant: list[str]
+    forward: Callable,
+    hints: dict,
+    results: list[str],
+    gradients: list[str],
+    keep: list[str],
+    constant: list[str],
 ) -> Callable:
     """Registers the operator of the gradients, and with it the gradient of ``forward``."""
     names, count = list(hints), len(hints)
@@ -155,7 +185,10 @@ def _add_gradient(
     added = {results[k]: Tensor for k in kept}
     added |= {f"grad_{results[k]}": Tensor if len(results) == 1 else _MAYBE for k in upstream}
     returned = tuple[(Tensor,) * len(of)] if len(of) > 1 else Tensor
-    name, found = f"{forward.op.name().removeprefix('nmr::')}_backward", [f"grad_{name}" for name in gradients]
+    name, found = (
+        f"{forward.op.name().removeprefix('nmr::')}_backward",
+        [f"grad_{name}" for name in gradients],
+    )
     backward = _operator(name, hints | added | {"wanted": list[bool]}, returned, allocate, found)
 
     def set_up(ctx, inputs, output):
@@ -171,7 +204,9 @@ def _add_gradient(
         found: list[Tensor | None] = [None] * count
         if any(wanted) and any(grad is not None for grad in grads):
             arguments, saved = [None] * count, ctx.saved_tensors
-            for k, value in zip((*tensors, *numbers), (*saved[: len(tensors)], *ctx.numbers), strict=True):
+            for k, value in zip(
+                (*tensors, *numbers), (*saved[: len(tensors)], *ctx.numbers), strict=True
+            ):
                 arguments[k] = value
             grads = backward(*arguments, *saved[len(tensors) :], *grads, wanted)
             for k, want, grad in zip(of, wanted, (grads,) if len(of) == 1 else grads, strict=True):

@@ -32,7 +32,11 @@ def look_at(
 
 @kernel("points", gradients="vertices camera distortion", used_by="a camera's transform")
 def project(
-    vertices: Tensor, camera: Tensor, distortion: Tensor | None, starts: Tensor | None, perspective: bool
+    vertices: Tensor,
+    camera: Tensor,
+    distortion: Tensor | None,
+    starts: Tensor | None,
+    perspective: bool,
 ) -> Tensor:
     """Vertices ``[B or 1, V, 3]`` or packed ``[N, 3]`` in renderer space, ``[B, V, 3]`` or ``[N, 3]``.
 
@@ -42,5 +46,7 @@ def project(
     """
     if starts is not None:
         return vertices.new_empty(vertices.shape)
-    sizes = [x.shape[0] for x in (vertices, camera, distortion) if x is not None and x.shape[0] != 1]
+    sizes = [
+        x.shape[0] for x in (vertices, camera, distortion) if x is not None and x.shape[0] != 1
+    ]
     return vertices.new_empty((sizes[0] if sizes else 1, *vertices.shape[1:]))

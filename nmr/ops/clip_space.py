@@ -21,7 +21,12 @@ def clip_weights(positions: Tensor, faces: Tensor, face_index: Tensor) -> tuple[
 
 @kernel("blended", gradients="colors positions", used_by="antialias")
 def antialias(
-    colors: Tensor, rast: Tensor, positions: Tensor, faces: Tensor, face_index: Tensor, twins: Tensor
+    colors: Tensor,
+    rast: Tensor,
+    positions: Tensor,
+    faces: Tensor,
+    face_index: Tensor,
+    twins: Tensor,
 ) -> Tensor:
     """Colours ``[B, H, W, C]`` blended between neighbours that a silhouette edge separates.
 

@@ -58,7 +58,9 @@ def clip_faces(
     """
     shapes = (num_drawn, 3), (num_drawn,), (num_drawn, 3), (num_new, 4)
     types = torch.int64, torch.int32, torch.int64, torch.int64
-    return tuple(vertices.new_empty(shape, dtype=dtype) for shape, dtype in zip(shapes, types, strict=True))
+    return tuple(
+        vertices.new_empty(shape, dtype=dtype) for shape, dtype in zip(shapes, types, strict=True)
+    )
 
 
 @kernel("face_index")
@@ -91,10 +93,14 @@ def rasterize_layers(
     perspective: bool,
 ) -> Tensor:
     """Face indices of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest first, then -1."""
-    return vertices.new_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
+    return vertices.new_empty(
+        (batch_size(vertices, starts), height, width, layers), dtype=torch.int32
+    )
 
 
-@kernel("alpha face_index", gradients="vertices", constant="face_index", used_by="render_silhouette")
+@kernel(
+    "alpha face_index", gradients="vertices", constant="face_index", used_by="render_silhouette"
+)
 def silhouette(
     vertices: Tensor,
     faces: Tensor,

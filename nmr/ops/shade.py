@@ -44,10 +44,14 @@ def normals(vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool
 
     smooth: normals of vertices, like ``vertices``: the direction of the sum of these products. 0 without an area.
     """
-    return vertices.new_empty(vertices.shape if smooth else (*vertices.shape[:-2], *faces.shape[-2:]))
+    return vertices.new_empty(
+        vertices.shape if smooth else (*vertices.shape[:-2], *faces.shape[-2:])
+    )
 
 
-@kernel("lit", gradients="colors normals parameters vertices weights", used_by="render_rgb with lights")
+@kernel(
+    "lit", gradients="colors normals parameters vertices weights", used_by="render_rgb with lights"
+)
 def lit(
     colors: Tensor | None,
     normals: Tensor,

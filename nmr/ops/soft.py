@@ -7,7 +7,12 @@ from ._kernel import kernel
 from .raster import batch_size
 
 
-@kernel("transmittance", gradients="vertices sigma", keep="transmittance", used_by="render_soft_silhouette")
+@kernel(
+    "transmittance",
+    gradients="vertices sigma",
+    keep="transmittance",
+    used_by="render_soft_silhouette",
+)
 def soft_silhouette(
     vertices: Tensor,
     faces: Tensor,
@@ -46,7 +51,9 @@ def soft_layers(
 
     Each face counts once: f if it is seen from its front, else F + f. sigma is float64 ``[]``.
     """
-    return vertices.new_empty((batch_size(vertices, starts), height, width, layers), dtype=torch.int32)
+    return vertices.new_empty(
+        (batch_size(vertices, starts), height, width, layers), dtype=torch.int32
+    )
 
 
 @kernel("weights depth distances", gradients="vertices", used_by="render_soft")

@@ -17,4 +17,6 @@ if command == "unpack":
         (folder / f"{number}").write_bytes(bytes.fromhex(line))
 else:
     found = {*lines, *(path.read_bytes().hex() for path in folder.iterdir())}
-    CORPUS.write_text("".join(f"{line}\n" for line in sorted(found, key=lambda line: (len(line), line))))
+    CORPUS.write_text(
+        "".join(f"{line}\n" for line in sorted(found, key=lambda line: (len(line), line)))
+    )

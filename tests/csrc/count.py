@@ -39,7 +39,14 @@ def count(workload: str) -> dict[str, int]:
     """Instructions per image of each kernel that stages.h declares, with all that it calls, by name."""
     with tempfile.TemporaryDirectory() as folder:
         output = f"{folder}/callgrind.out"
-        run("valgrind", "--tool=callgrind", f"--callgrind-out-file={output}", workload, str(IMAGES), str(RUNS))
+        run(
+            "valgrind",
+            "--tool=callgrind",
+            f"--callgrind-out-file={output}",
+            workload,
+            str(IMAGES),
+            str(RUNS),
+        )
         report = run("callgrind_annotate", "--inclusive=yes", "--threshold=100", output)
     pattern = r"^ *([\d,]+) .*:(?:void )?nmr::(\w+)(?:<float>)?\(nmr::\w+(?:<float>)? const&\)"
     found = defaultdict(int)  # lambdas and lines of code match, too, but have smaller numbers
@@ -62,7 +69,9 @@ def main() -> None:
         ratio = instructions / bound if bound else 0
         exceeded |= ratio > SLACK
         verdict = f"{ratio:.3f} of the bound" if bound else f"no bound is stored for {key}"
-        print(f"{name}: {instructions} instructions per image, {verdict}{': MORE THAN IS ALLOWED' * (ratio > SLACK)}")
+        print(
+            f"{name}: {instructions} instructions per image, {verdict}{': MORE THAN IS ALLOWED' * (ratio > SLACK)}"
+        )
     sys.exit(exceeded)
 
 

@@ -13,8 +13,12 @@ from learn3d.data.readers import kato
 def dart_shapes(count: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Vertices and faces of objects with a thick front and a thin back."""
     sphere, faces = nmr.icosphere(2)
-    width = torch.from_numpy(np.random.default_rng(0).uniform(0.9, 1.1, (count, 1, 3))) * torch.tensor([0.3, 0.1, 0.5])
-    taper = torch.stack([1 - 0.9 * sphere[:, 2], 1 - 0.9 * sphere[:, 2], torch.ones(len(sphere))], 1)
+    width = torch.from_numpy(
+        np.random.default_rng(0).uniform(0.9, 1.1, (count, 1, 3))
+    ) * torch.tensor([0.3, 0.1, 0.5])
+    taper = torch.stack(
+        [1 - 0.9 * sphere[:, 2], 1 - 0.9 * sphere[:, 2], torch.ones(len(sphere))], 1
+    )
     return (sphere * taper * width).float(), faces
 
 

@@ -12,9 +12,19 @@ from collections.abc import Iterator
 @contextlib.contextmanager
 def dask_cluster() -> Iterator[tuple[str, subprocess.Popen]]:
     """Address and process of the scheduler. It gives a task up when its first worker dies; workers are replaced."""
-    environment = {"PYTHONPATH": os.pathsep.join(sys.path), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen([sys.executable, __file__], **pipes, env=os.environ | environment) as process:
+    environment = {
+        "PYTHONPATH": os.pathsep.join(sys.path),
+        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
+    }
+    pipes = {
+        "stdin": subprocess.PIPE,
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.DEVNULL,
+        "text": True,
+    }
+    with subprocess.Popen(
+        [sys.executable, __file__], **pipes, env=os.environ | environment
+    ) as process:
         yield process.stdout.readline().strip(), process
         process.stdin.close()
 
@@ -22,6 +32,8 @@ def dask_cluster() -> Iterator[tuple[str, subprocess.Popen]]:
 if __name__ == "__main__":
     from distributed import LocalCluster
 
-    with LocalCluster(2, threads_per_worker=1, dashboard_address=None, worker_dashboard_address=None) as cluster:
+    with LocalCluster(
+        2, threads_per_worker=1, dashboard_address=None, worker_dashboard_address=None
+    ) as cluster:
         print(cluster.scheduler_address, flush=True)
         sys.stdin.read()

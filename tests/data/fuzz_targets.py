@@ -80,13 +80,17 @@ def layout_target(tmp: Path, layout: str) -> Target:
     else:
         source.mkdir()
         write_meshes(source)
-        config = DatasetConfig(output=folder, category="chair", source=source, layout=layout, **SETTINGS[layout])
+        config = DatasetConfig(
+            output=folder, category="chair", source=source, layout=layout, **SETTINGS[layout]
+        )
         make_dataset(config)
     first = {
         "dvr": lambda: (folder / "03001627" / "softras_test.lst").read_text().split()[0],
         "kar": lambda: json.loads((folder / "splits.json").read_text())["03001627"]["test"][0],
         "photos": lambda: next(
-            row.split(",")[0] for row in (folder / "chair" / "poses.csv").read_text().split("\n") if ",test" in row
+            row.split(",")[0]
+            for row in (folder / "chair" / "poses.csv").read_text().split("\n")
+            if ",test" in row
         ),
     }.get(layout, str)()
     load = reader(layout).load
@@ -107,15 +111,21 @@ def layout_target(tmp: Path, layout: str) -> Target:
         if dataset.points is not None:
             assert np.isfinite(dataset.points).all()
 
-    return Target(folder, {name.replace("ID", first): how for name, how in FILES[layout].items()}, read)
+    return Target(
+        folder, {name.replace("ID", first): how for name, how in FILES[layout].items()}, read
+    )
 
 
 class StandIn:
     """As much of a method as a checkpoint asks for, after a step."""
 
     def __init__(self) -> None:
-        self.networks = {"encoder": torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))}
-        self.optimizers = {"encoder": torch.optim.Adam(self.networks["encoder"].parameters(), fused=True)}
+        self.networks = {
+            "encoder": torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))
+        }
+        self.optimizers = {
+            "encoder": torch.optim.Adam(self.networks["encoder"].parameters(), fused=True)
+        }
 
     def step(self) -> None:
         self.networks["encoder"](torch.ones(2, 3)).sum().backward()
@@ -144,7 +154,9 @@ def checkpoint_target(tmp: Path) -> Target:
 
 def weights_target(tmp: Path) -> Target:
     torch.save({"conv1.weight": torch.arange(6.0), "bn1.bias": torch.zeros(2)}, tmp / "a.pth")
-    torch.save({"conv1.weight": torch.arange(6.0)}, tmp / "b.pth", _use_new_zipfile_serialization=False)
+    torch.save(
+        {"conv1.weight": torch.arange(6.0)}, tmp / "b.pth", _use_new_zipfile_serialization=False
+    )
 
     def read(folder: Path) -> None:
         for name in ("a.pth", "b.pth"):
@@ -154,7 +166,9 @@ def weights_target(tmp: Path) -> Target:
 
 
 def config_target(tmp: Path) -> Target:
-    config = configure(data=Path("d"), category="chair", output=Path("o"), preset="peng2020-kar", view_bins="15x20")
+    config = configure(
+        data=Path("d"), category="chair", output=Path("o"), preset="peng2020-kar", view_bins="15x20"
+    )
     (tmp / "config.json").write_text(json.dumps(config_to_dict(config)))
 
     def read(folder: Path) -> None:
@@ -166,7 +180,10 @@ def config_target(tmp: Path) -> Target:
 
 def results_target(tmp: Path) -> Target:
     (tmp / "test.json").write_text(stub_work.result().model_dump_json())
-    lines = [json.dumps({"step": step, "split": "train", "total": 1 / step, "mmd": 2.0}) for step in range(1, 6)]
+    lines = [
+        json.dumps({"step": step, "split": "train", "total": 1 / step, "mmd": 2.0})
+        for step in range(1, 6)
+    ]
     (tmp / "metrics.jsonl").write_text("\n".join(lines) + "\n")
 
     def read(folder: Path) -> None:
@@ -193,7 +210,9 @@ def photo_target(tmp: Path) -> Target:
                 colors, mask = read_photo(folder / name, folder / "mask.png")
                 assert colors.shape == (*mask.shape, 3)
 
-    return Target(tmp, dict.fromkeys([*names, "mask.png"], m.damage) | {"a.png": m.damage_png}, read)
+    return Target(
+        tmp, dict.fromkeys([*names, "mask.png"], m.damage) | {"a.png": m.damage_png}, read
+    )
 
 
 OBJ = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0.5\nv 0.5 0.5 2\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl red\n"
@@ -215,20 +234,29 @@ def mesh_target(tmp: Path) -> Target:
     folder = tmp / "formats"
     ball = trimesh.creation.icosphere(1)
     ball.visual.vertex_colors = np.arange(4 * len(ball.vertices)).reshape(-1, 4) % 256
-    scene = trimesh.Scene([ball, trimesh.creation.box(transform=trimesh.transformations.translation_matrix([1, 2, 3]))])
+    scene = trimesh.Scene(
+        [
+            ball,
+            trimesh.creation.box(transform=trimesh.transformations.translation_matrix([1, 2, 3])),
+        ]
+    )
     for name in ("a.off", "a.ply", "a.stl", "a.glb"):
         (scene if name == "a.glb" else ball).export(folder / name)
     ball.export(folder / "b.ply", encoding="ascii")
     for name, content in scene.export(file_type="gltf").items():
         (folder / name).write_bytes(content)
-    plain = [path.name for path in folder.iterdir() if path.suffix in (".stl", ".glb", ".bin", ".ply")]
+    plain = [
+        path.name for path in folder.iterdir() if path.suffix in (".stl", ".glb", ".bin", ".ply")
+    ]
     damaged |= dict.fromkeys(plain, m.damage) | dict.fromkeys(["a.off", "b.ply"], m.damage_text)
 
     def read(folder: Path) -> None:
         for read_one in meshes.mesh_sources(folder).values():
             with contextlib.suppress(*ERRORS):
                 checked = meshes.check(read_one())
-                assert np.isfinite(checked.vertices).all() and checked.faces.max() < len(checked.vertices)
+                assert np.isfinite(checked.vertices).all() and checked.faces.max() < len(
+                    checked.vertices
+                )
 
     return Target(folder, damaged | {"model.gltf": m.damage_json}, read)
 

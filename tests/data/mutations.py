@@ -34,7 +34,11 @@ def damage(rng: random.Random, content: bytes) -> bytes:
     """A few changes of any kind to plain bytes."""
     data = bytearray(content)
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
-        at = rng.randrange(len(data) + 1) if rng.random() < 0.6 else rng.randrange(min(len(data), 200) + 1)
+        at = (
+            rng.randrange(len(data) + 1)
+            if rng.random() < 0.6
+            else rng.randrange(min(len(data), 200) + 1)
+        )
         length, other = rng.choice([1, 2, 4, 8, 40, 1000]), rng.randrange(len(data) + 1)
         value = rng.choice(SIZES).to_bytes(8, rng.choice(["little", "big"]))
         end, new = rng.choice(
@@ -114,7 +118,9 @@ def damage_zip(inner: Mutation = damage) -> Mutation:
             others = ["../x.npy", "/x.npy", "a\\b.npy", "x\x00.npy", name[:-1]]
             members.append((name if kind < 0.9 else rng.choice(others), data))
         out = io.BytesIO()
-        method = rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
+        method = rng.choice(
+            [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2]
+        )
         with zipfile.ZipFile(out, "w", method) as archive:
             for name, data in members:
                 archive.writestr(name, data)
@@ -129,7 +135,9 @@ def damage_npy(rng: random.Random, content: bytes) -> bytes:
         return damage(rng, content)
     (length,) = struct.unpack_from("<H", content, 8)
     pattern = rng.choice(list(HEADERS))
-    header = re.sub(pattern, lambda _: rng.choice(HEADERS[pattern]), content[10 : 10 + length]).rstrip()
+    header = re.sub(
+        pattern, lambda _: rng.choice(HEADERS[pattern]), content[10 : 10 + length]
+    ).rstrip()
     header += b" " * max(0, 118 - len(header)) + b"\n"
     return content[:8] + struct.pack("<H", len(header)) + header + content[10 + length :]
 
@@ -146,14 +154,19 @@ def damage_png(rng: random.Random, content: bytes) -> bytes:
     chosen = rng.choice(chunks)
     if chosen[0] == b"IHDR" and rng.random() < 0.7:
         sizes = [rng.choice([0, 1, 64, 80, 2049, 60_000, 2**31 - 1]) for _ in range(2)]
-        chosen[1] = struct.pack(">II", *sizes) + bytes(rng.choice([0, 1, 2, 3, 4, 6, 8, 16, 255]) for _ in range(5))
+        chosen[1] = struct.pack(">II", *sizes) + bytes(
+            rng.choice([0, 1, 2, 3, 4, 6, 8, 16, 255]) for _ in range(5)
+        )
     elif chosen[0] == b"IDAT" and rng.random() < 0.5:
         chosen[1] = zlib.compress(rng.choice([b"", b"\0" * 10, b"\7" * 100_000, b"\0" * 3_000_000]))
     else:
         chosen[1] = damage(rng, chosen[1]) if rng.random() < 0.7 else chosen[1]
-        chosen[0] = rng.choice([chosen[0], chosen[0], b"tRNS", b"PLTE", b"zTXt", b"iCCP", b"eXIf", b"acTL", b"IEND"])
+        chosen[0] = rng.choice(
+            [chosen[0], chosen[0], b"tRNS", b"PLTE", b"zTXt", b"iCCP", b"eXIf", b"acTL", b"IEND"]
+        )
     parts = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
     ]
     return content[:8] + b"".join(parts)
 

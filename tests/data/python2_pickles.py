@@ -25,16 +25,32 @@ def python2_pickle(images: list[np.ndarray]) -> bytes:
     """Protocol 2 as Python 2 and its numpy wrote it: byte strings everywhere, module names of numpy 1."""
 
     def dtype(code: bytes, flags: int) -> bytes:
-        state = b"(K\x03" + short_string(b"|") + b"NNN" + b"J\xff\xff\xff\xff" * 2 + b"K" + bytes([flags]) + b"tb"
+        state = (
+            b"(K\x03"
+            + short_string(b"|")
+            + b"NNN"
+            + b"J\xff\xff\xff\xff" * 2
+            + b"K"
+            + bytes([flags])
+            + b"tb"
+        )
         return b"cnumpy\ndtype\n" + short_string(code) + b"K\x00K\x01\x87R" + state
 
     def array(shape: tuple[int, ...], kind: bytes, data: bytes) -> bytes:
-        sizes = b"(" + b"".join(b"\x8a" + bytes([2]) + struct.pack("<h", n) for n in shape) + b"t"  # Python 2's longs
-        make = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85" + short_string(b"b") + b"\x87R"
+        sizes = (
+            b"(" + b"".join(b"\x8a" + bytes([2]) + struct.pack("<h", n) for n in shape) + b"t"
+        )  # Python 2's longs
+        make = (
+            b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85"
+            + short_string(b"b")
+            + b"\x87R"
+        )
         return make + b"(K\x01" + sizes + kind + b"\x89" + data + b"tb"
 
     def string(data: bytes) -> bytes:
         return b"T" + struct.pack("<i", len(data)) + data
 
-    items = b"".join(array(image.shape, dtype(b"u1", 0), string(image.tobytes())) for image in images)
+    items = b"".join(
+        array(image.shape, dtype(b"u1", 0), string(image.tobytes())) for image in images
+    )
     return b"\x80\x02" + array((len(images),), dtype(b"O8", 63), b"](" + items + b"e") + b"."

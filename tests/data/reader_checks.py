@@ -42,8 +42,12 @@ def silhouette_iou(dataset: ViewDataset, vertices: np.ndarray, faces: np.ndarray
     """IoU [M] of the data set's masks and of a mesh in the object frame, drawn by nmr with the data set's cameras."""
     batch = dataset.batch(torch.arange(len(dataset)))
     vertices = torch.from_numpy(vertices).float().expand(len(dataset), -1, -1)
-    drawn = nmr.render_silhouette(vertices, torch.from_numpy(faces), batch.cameras, image_size=64, anti_aliasing=True)
-    return torch.minimum(drawn, batch.masks).sum((1, 2)) / torch.maximum(drawn, batch.masks).sum((1, 2))
+    drawn = nmr.render_silhouette(
+        vertices, torch.from_numpy(faces), batch.cameras, image_size=64, anti_aliasing=True
+    )
+    return torch.minimum(drawn, batch.masks).sum((1, 2)) / torch.maximum(drawn, batch.masks).sum(
+        (1, 2)
+    )
 
 
 def cut_short(path: Path) -> None:

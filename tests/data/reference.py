@@ -42,12 +42,18 @@ def face_index(
     index = torch.full((H, W), -1)
     for f, corners in enumerate(vertices[with_back_faces(faces, fill_back)]):
         (x, y, z), flat = corners.unbind(1), corners[:, :2].double()
-        if not corners[:, :2].isfinite().all() or z.isnan().any() or torch.linalg.det(flat[1:] - flat[0]) == 0:
+        if (
+            not corners[:, :2].isfinite().all()
+            or z.isnan().any()
+            or torch.linalg.det(flat[1:] - flat[0]) == 0
+        ):
             continue
         left, right = _cross(corners[2], corners[0], corners[1])
         if left < right:
             continue  # clockwise
-        inside = (points >= corners[:, :2].amin(0)).all(-1) & (points <= corners[:, :2].amax(0)).all(-1)
+        inside = (points >= corners[:, :2].amin(0)).all(-1) & (
+            points <= corners[:, :2].amax(0)
+        ).all(-1)
         for a, b in ((0, 1), (1, 2), (2, 0)):
             left, right = _cross(points, corners[a], corners[b])
             inside &= ~(left < right)
@@ -56,11 +62,19 @@ def face_index(
         weights = []
         for k in range(3):
             a, b = (k + 1) % 3, (k + 2) % 3
-            w = (Y[a] - Y[b]) / det * x_pixel + (X[b] - X[a]) / det * y_pixel + (X[a] * Y[b] - X[b] * Y[a]) / det
+            w = (
+                (Y[a] - Y[b]) / det * x_pixel
+                + (X[b] - X[a]) / det * y_pixel
+                + (X[a] * Y[b] - X[b] * Y[a]) / det
+            )
             weights.append(w.nan_to_num(0.0).clamp(0, 1))
         total = weights[0] + weights[1] + weights[2]
         w0, w1, w2 = (w / total for w in weights)
-        zp = 1 / (w0 / z[0] + w1 / z[1] + w2 / z[2]) if perspective else w0 * z[0] + w1 * z[1] + w2 * z[2]
+        zp = (
+            1 / (w0 / z[0] + w1 / z[1] + w2 / z[2])
+            if perspective
+            else w0 * z[0] + w1 * z[1] + w2 * z[2]
+        )
         nearest = inside & (zp > near) & (zp < depth)
         depth[nearest] = zp[nearest]
         index[nearest] = f
@@ -78,10 +92,17 @@ def _screen_weights(corners: Tensor) -> Tensor:
     H, W = corners.shape[:2]
     x, y, _ = corners.unbind(-1)
     X, Y = (x * W + W - 1) / 2, (y * H + H - 1) / 2
-    x_pixel, y_pixel = torch.meshgrid(torch.arange(W).to(corners), torch.arange(H).to(corners), indexing="xy")
+    x_pixel, y_pixel = torch.meshgrid(
+        torch.arange(W).to(corners), torch.arange(H).to(corners), indexing="xy"
+    )
     a, b = [1, 2, 0], [2, 0, 1]
     dx, dy = X[..., b] - X[..., a], Y[..., a] - Y[..., b]
-    linear = dy * x_pixel[..., None] + dx * y_pixel[..., None] + X[..., a] * Y[..., b] - X[..., b] * Y[..., a]
+    linear = (
+        dy * x_pixel[..., None]
+        + dx * y_pixel[..., None]
+        + X[..., a] * Y[..., b]
+        - X[..., b] * Y[..., a]
+    )
     screen = (linear / (X * dy).sum(-1, keepdim=True)).clamp(0, 1)
     return screen / screen.sum(-1, keepdim=True)
 
@@ -141,7 +162,9 @@ def silhouette_gradient(
 ) -> Tensor:
     """NMR's gradient ``[V, 3]`` of one image, from its index map ``[H, W]`` and the gradient ``[h, w]`` of alpha."""
     image = (index >= 0).to(vertices)[..., None]
-    return edge_gradient(vertices, faces, index, image, grad_alpha[..., None], anti_aliasing, fill_back, eps)
+    return edge_gradient(
+        vertices, faces, index, image, grad_alpha[..., None], anti_aliasing, fill_back, eps
+    )
 
 
 def edge_gradient(
@@ -168,8 +191,13 @@ def edge_gradient(
         pixel = (vertices[face, :2] * size + size - 1) / 2
         for p in range(3):
             q, o = (p + 1) % 3, (p + 2) % 3
-            for axis in (0, 1):  # 0: lines of constant x, swept along y, which moves y; 1: the other way round
-                lines, line_image, line_grad = (t.transpose(0, 1) if axis == 0 else t for t in (index, image, grad))
+            for axis in (
+                0,
+                1,
+            ):  # 0: lines of constant x, swept along y, which moves y; 1: the other way round
+                lines, line_image, line_grad = (
+                    t.transpose(0, 1) if axis == 0 else t for t in (index, image, grad)
+                )
                 corners = pixel if axis == 0 else pixel.flip(1)
                 pull_p, pull_q = _sweep_edge(
                     corners[p], corners[q], corners[o], axis, f, lines, line_image, line_grad, eps
@@ -180,7 +208,15 @@ def edge_gradient(
 
 
 def _sweep_edge(
-    p: Tensor, q: Tensor, o: Tensor, axis: int, f: int, lines: Tensor, image: Tensor, grad: Tensor, eps: float
+    p: Tensor,
+    q: Tensor,
+    o: Tensor,
+    axis: int,
+    f: int,
+    lines: Tensor,
+    image: Tensor,
+    grad: Tensor,
+    eps: float,
 ) -> tuple[float, float]:
     """Gradients of the sweep coordinates of p and q; points are (scan, sweep), ``lines[n]`` is the line at scan n."""
     num_lines, length = lines.shape
@@ -215,7 +251,13 @@ def _sweep_edge(
         for end, other in ((p, q), (q, p)):
             if other[0] == n:
                 continue
-            travel = (q[0] - p[0]) / ((q[0] - n) if end is p else (n - p[0])) * (m - crossing) * 2 / length
+            travel = (
+                (q[0] - p[0])
+                / ((q[0] - n) if end is p else (n - p[0]))
+                * (m - crossing)
+                * 2
+                / length
+            )
             travel = torch.where(travel > 0, travel + eps, travel - eps)
             pull = float((gain / travel).sum())
             if end is p:
@@ -247,7 +289,9 @@ def local_gradient(
     corners = vertices[with_back_faces(faces, True)[index.clamp_min(0)]]
     pulls = [
         _one_pixel_moves(x, grad, ends, eps)
-        for x, grad, ends in _along_both_axes(index, corners, grad, anti_aliasing, image, perspective)
+        for x, grad, ends in _along_both_axes(
+            index, corners, grad, anti_aliasing, image, perspective
+        )
     ]
     at_pixels = torch.stack([pulls[0], pulls[1].T, torch.zeros_like(pulls[0])], dim=-1)
     drawn = index >= 0
@@ -259,7 +303,9 @@ def local_gradient(
 def _along_both_axes(index, corners, grad, anti_aliasing, image, perspective):
     """Image, gradient and ends of surfaces along the rows, and the same of the transposed raster."""
     H, W = index.shape
-    x, y = torch.meshgrid((2 * torch.arange(W) + 1 - W) / W, (2 * torch.arange(H) + 1 - H) / H, indexing="xy")
+    x, y = torch.meshgrid(
+        (2 * torch.arange(W) + 1 - W) / W, (2 * torch.arange(H) + 1 - H) / H, indexing="xy"
+    )
     points = torch.stack([x, y, torch.ones_like(x)], dim=-1).double()
     grad = _raster_gradient(grad, anti_aliasing)
     if image is None:
@@ -269,13 +315,19 @@ def _along_both_axes(index, corners, grad, anti_aliasing, image, perspective):
         yield t(image), t(grad), _ends(t(index), t(corners).double(), t(points), perspective)
 
 
-def _ends(index: Tensor, corners: Tensor, points: Tensor, perspective: bool) -> tuple[Tensor, Tensor]:
+def _ends(
+    index: Tensor, corners: Tensor, points: Tensor, perspective: bool
+) -> tuple[Tensor, Tensor]:
     """Whether the surface in a pixel ends before its right neighbour ``[H, W - 1]``, and that in the right one."""
-    planes = torch.linalg.pinv(torch.cat([corners[..., :2], torch.ones_like(corners[..., :1])], dim=-1))
+    planes = torch.linalg.pinv(
+        torch.cat([corners[..., :2], torch.ones_like(corners[..., :1])], dim=-1)
+    )
     z = corners[..., 2:]
     planes = (planes @ (1 / z if perspective else -z)).squeeze(-1)  # nearness = planes . (x, y, 1)
     left, right = (slice(None), slice(None, -1)), (slice(None), slice(1, None))
-    one_surface = (corners[left][:, :, :, None] == corners[right][:, :, None]).all(-1).any(-1).any(-1)
+    one_surface = (
+        (corners[left][:, :, :, None] == corners[right][:, :, None]).all(-1).any(-1).any(-1)
+    )
     ends = []
     for own, other in ((left, right), (right, left)):
         nearer = [
@@ -288,14 +340,21 @@ def _ends(index: Tensor, corners: Tensor, points: Tensor, perspective: bool) -> 
     return ends[0], ends[1]
 
 
-def _one_pixel_moves(image: Tensor, grad: Tensor, ends: tuple[Tensor, Tensor], eps: float) -> Tensor:
+def _one_pixel_moves(
+    image: Tensor, grad: Tensor, ends: tuple[Tensor, Tensor], eps: float
+) -> Tensor:
     """d loss / d (coordinate along the rows) of the point seen in each pixel, ``[H, W]``."""
     per_pixel = image.shape[1] / 2
     step = image[:, 1:] - image[:, :-1]
-    right, left = (step * grad[:, 1:]).sum(-1) * per_pixel, -(step * grad[:, :-1]).sum(-1) * per_pixel
+    right, left = (
+        (step * grad[:, 1:]).sum(-1) * per_pixel,
+        -(step * grad[:, :-1]).sum(-1) * per_pixel,
+    )
     none = torch.zeros_like(image[:, :1, 0])
     # sums over both pairs of a pixel
-    right, left = (torch.cat([none, x * ends[1]], 1) + torch.cat([x * ends[0], none], 1) for x in (right, left))
+    right, left = (
+        torch.cat([none, x * ends[1]], 1) + torch.cat([x * ends[0], none], 1) for x in (right, left)
+    )
     moves = torch.where(right > left, -right, left)
     still = (torch.maximum(right, left) <= 0) | ((right - left).abs() < eps)
     return torch.where(still, torch.zeros_like(moves), moves)
@@ -382,14 +441,24 @@ def soft_colors(
         weights = weights / z if perspective else weights
         depth = 1 / weights.sum(-1) if perspective else weights @ z
         weights = weights * depth[..., None] if perspective else weights
-        counts = (inside | (square < sigma * math.log(1 / dist_eps - 1))) & (depth > near) & (depth < far)
-        covers.append(torch.where(counts, torch.sigmoid(torch.where(inside, square, -square) / sigma), 0.0))
+        counts = (
+            (inside | (square < sigma * math.log(1 / dist_eps - 1)))
+            & (depth > near)
+            & (depth < far)
+        )
+        covers.append(
+            torch.where(counts, torch.sigmoid(torch.where(inside, square, -square) / sigma), 0.0)
+        )
         depths.append(torch.where(counts, depth, far))
         values.append(weights @ colors[face])
     depth, order = torch.stack(depths, -1).sort(dim=-1, stable=True)
     covers, depth = torch.stack(covers, -1).gather(-1, order)[..., :layers], depth[..., :layers]
-    values = torch.stack(values, -2).gather(-2, order[..., None].expand(*order.shape, colors.shape[1]))[..., :layers, :]
-    closeness = torch.cat([(far - depth) / (far - near), torch.full_like(depth[..., :1], background_eps)], dim=-1)
+    values = torch.stack(values, -2).gather(
+        -2, order[..., None].expand(*order.shape, colors.shape[1])
+    )[..., :layers, :]
+    closeness = torch.cat(
+        [(far - depth) / (far - near), torch.full_like(depth[..., :1], background_eps)], dim=-1
+    )
     covers = torch.cat([covers, torch.ones_like(covers[..., :1])], dim=-1)
     share = torch.softmax(covers.log() + closeness / gamma, dim=-1).unsqueeze(-1)
     values = torch.cat([values, background.expand(height, width, 1, -1)], dim=-2)

@@ -20,7 +20,12 @@ from typing import Any
 import learn3d
 from learn3d.config import TrainConfig, config_to_dict
 
-ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "CUDA_VISIBLE_DEVICES": "",
+}
 EVENTS = {"open", "os.rename", "os.remove", "os.link", "os.mkdir", "os.rmdir"}
 LIMIT = 240.0  # seconds for a run; then it exits with status 1 and its log shows all stacks
 
@@ -33,10 +38,17 @@ class RunServer:
     """
 
     def __enter__(self) -> RunServer:
-        packages = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+        packages = [
+            str(Path(learn3d.__file__).parents[1]),
+            *filter(None, [os.environ.get("PYTHONPATH")]),
+        ]
         environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
         self._process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+            text=True,
         )
         return self
 
@@ -66,7 +78,9 @@ def serve() -> None:
     read, sets = training.load_data, None
     for line in sys.stdin:
         config = config_from_dict(json.loads(line)["config"])
-        sets = sets or {split: read(config, split) for split in ("train", "val")}  # once, and not in every copy
+        sets = sets or {
+            split: read(config, split) for split in ("train", "val")
+        }  # once, and not in every copy
         training.load_data = lambda _, split, sets=sets: sets[split]
         print(json.dumps(_fork(json.loads(line))), flush=True)
 
@@ -117,7 +131,9 @@ def _watch(folder: str, kill_at: int | None, half: bool) -> list[int]:
             return
         count[0] += 1
         if count[0] == kill_at:
-            if half and event == "os.rename" and os.stat(arguments[0]).st_nlink == 1:  # not a second name of a file
+            if (
+                half and event == "os.rename" and os.stat(arguments[0]).st_nlink == 1
+            ):  # not a second name of a file
                 os.truncate(arguments[0], os.stat(arguments[0]).st_size // 2)
             os.kill(os.getpid(), signal.SIGKILL)
 
@@ -126,5 +142,7 @@ def _watch(folder: str, kill_at: int | None, half: bool) -> list[int]:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, also by what is tested
+    signal.signal(
+        signal.SIGHUP, signal.SIG_DFL
+    )  # under nohup it is ignored, also by what is tested
     serve()

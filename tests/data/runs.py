@@ -18,7 +18,9 @@ from learn3d.runs.checkpoint import Metadata, Progress
 def check_same(folder: Path, other: Path) -> None:
     """Weights, optimizers, random state, best networks, metrics and pictures of two runs agree to the bit."""
     for name in ("last", "best"):
-        (ours, about), (theirs, about_other) = (checkpoint.load(f / f"{name}.safetensors") for f in (folder, other))
+        (ours, about), (theirs, about_other) = (
+            checkpoint.load(f / f"{name}.safetensors") for f in (folder, other)
+        )
         assert ours.keys() == theirs.keys()
         assert [key for key in ours if not same_bits(ours[key], theirs[key])] == []
         described = []
@@ -27,7 +29,10 @@ def check_same(folder: Path, other: Path) -> None:
             described.append(values)
         assert described[0] == described[1]
     assert (folder / "metrics.jsonl").read_text() == (other / "metrics.jsonl").read_text()
-    pictures = [{path.name: path.read_bytes() for path in (f / "pictures").iterdir()} for f in (folder, other)]
+    pictures = [
+        {path.name: path.read_bytes() for path in (f / "pictures").iterdir()}
+        for f in (folder, other)
+    ]
     assert pictures[0] == pictures[1]
     assert len(run_folder.checkpoints(folder)) == len(run_folder.checkpoints(other)) == 2
     assert not list(folder.rglob(".*")), "locks and half-written files are gone"
@@ -36,7 +41,9 @@ def check_same(folder: Path, other: Path) -> None:
 def metadata(step: int = 3, **changes: Any) -> Metadata:
     """The metadata of a checkpoint."""
     config = configure(data="data", category="chair", output="run")
-    about = Metadata(config, DatasetInfo(24, inverted=False), Progress(step=step), "72 images", {"torch": "2"})
+    about = Metadata(
+        config, DatasetInfo(24, inverted=False), Progress(step=step), "72 images", {"torch": "2"}
+    )
     return dataclasses.replace(about, **changes)
 
 

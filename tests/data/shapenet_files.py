@@ -111,7 +111,9 @@ def write_dvr(folder: Path, lists: dict[str, list[str]], world: np.ndarray | Non
             shown = draw(eye, right, np.tan(np.radians(15)), 64, boxes)
             save(root / "image" / f"{k:04d}.png", rgb(shown))
             save(root / "mask" / f"{k:04d}.png", np.where(shown, 255, 0).astype(np.uint8))
-            rotation = np.stack([right, np.cross(unit(-eye), right), unit(-eye)])  # x right, y down, z away
+            rotation = np.stack(
+                [right, np.cross(unit(-eye), right), unit(-eye)]
+            )  # x right, y down, z away
             matrix = np.eye(4)
             matrix[:3, :3], matrix[:3, 3] = rotation @ world.T, -rotation @ eye
             cameras[f"world_mat_{k}"], cameras[f"world_mat_inv_{k}"] = matrix, np.linalg.inv(matrix)
@@ -120,7 +122,9 @@ def write_dvr(folder: Path, lists: dict[str, list[str]], world: np.ndarray | Non
         vertices, faces = box_mesh(boxes)
         corner = vertices[faces[rng.integers(0, len(faces), 500)]]
         points = (corner * rng.dirichlet([1, 1, 1], 500)[..., None]).sum(1) @ world.T
-        np.savez(root / "pointcloud.npz", points=points.astype(np.float16), normals=np.zeros_like(points))
+        np.savez(
+            root / "pointcloud.npz", points=points.astype(np.float16), normals=np.zeros_like(points)
+        )
     for split, ids in lists.items():
         (folder / CHAIR / f"softras_{split}.lst").write_text("\n".join(ids) + "\n")
 
@@ -133,7 +137,11 @@ def write_kar(folder: Path, lists: dict[str, list[str]], size: int = 224):
         root = folder / "renders" / CHAIR / name
         rows = []
         for k in range(20):
-            azimuth, elevation, distance = rng.uniform(-180, 180), rng.uniform(-20, 40), rng.uniform(1.9, 2.3)
+            azimuth, elevation, distance = (
+                rng.uniform(-180, 180),
+                rng.uniform(-20, 40),
+                rng.uniform(1.9, 2.3),
+            )
             eye = nmr_eye(azimuth, elevation, distance)
             right = unit(np.cross(UP, -eye))  # a left-handed frame
             shown = draw(swap_frames(eye), swap_frames(right), 16 / 60, size, boxes)
@@ -144,7 +152,9 @@ def write_kar(folder: Path, lists: dict[str, list[str]], size: int = 224):
         (root / "view.txt").write_text("\n".join(rows) + "\n")
         # Index (i, j, k) is the cell at (-z, y, x) of NMR's frame.
         centre = cell_centres()
-        volume = inside(swap_frames(np.stack([centre[..., 2], centre[..., 1], -centre[..., 0]], axis=-1)), boxes)
+        volume = inside(
+            swap_frames(np.stack([centre[..., 2], centre[..., 1], -centre[..., 0]], axis=-1)), boxes
+        )
         path = folder / "voxels" / "modelVoxels32" / CHAIR / f"{name}.mat"
         path.parent.mkdir(parents=True, exist_ok=True)
         scipy.io.savemat(path, {"Volume": volume.astype(np.uint8)})

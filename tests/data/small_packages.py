@@ -18,9 +18,22 @@ AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
 
 def box(low: tuple, high: tuple) -> tuple[np.ndarray, list[list[int]]]:
     corners = np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])], float
+        [
+            [x, y, z]
+            for x in (low[0], high[0])
+            for y in (low[1], high[1])
+            for z in (low[2], high[2])
+        ],
+        float,
     )
-    return corners, [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return corners, [
+        [0, 1, 3, 2],
+        [4, 6, 7, 5],
+        [0, 4, 5, 1],
+        [2, 3, 7, 6],
+        [0, 2, 6, 4],
+        [1, 5, 7, 3],
+    ]
 
 
 def obj_text(*boxes: tuple[tuple, tuple]) -> str:
@@ -54,21 +67,34 @@ AIRPLANE = (
     ac_object("tip", (-0.5, -1, 3.5), (0.5, 0, 4)),
     ac_object("fin", (4, 1, -0.1), (5, 3, 0.1)),
 )
-CHAIR = obj_text(((0, 4, 0), (4, 5, 4)), ((0, 5, 0), (4, 10, 0.5)), ((0, 0, 0), (4, 4, 0.5)), ((0, 0, 3.5), (4, 4, 4)))
+CHAIR = obj_text(
+    ((0, 4, 0), (4, 5, 4)),
+    ((0, 5, 0), (4, 10, 0.5)),
+    ((0, 0, 0), (4, 4, 0.5)),
+    ((0, 0, 3.5), (4, 4, 4)),
+)
 TABLE = obj_text(((0, 4, 0), (8, 5, 5)), ((3, 0, 2), (5, 4, 3)))
 
 
 def deb(folder: Path, name: str, files: dict[str, bytes]) -> Path:
     """A Debian package of these files in the folder."""
     with tempfile.TemporaryDirectory() as root:
-        about = {"Package": name, "Version": "1:2.0-1", "Architecture": "all", "Maintainer": "x", "Description": "x"}
+        about = {
+            "Package": name,
+            "Version": "1:2.0-1",
+            "Architecture": "all",
+            "Maintainer": "x",
+            "Description": "x",
+        }
         control = "".join(f"{key}: {value}\n" for key, value in about.items())
         for path, content in {"DEBIAN/control": control.encode(), **files}.items():
             (Path(root) / path).parent.mkdir(parents=True, exist_ok=True)
             (Path(root) / path).write_bytes(content)
         folder.mkdir(exist_ok=True)
         file = folder / f"{name}_1%3a2.0-1_all.deb"
-        subprocess.run(["dpkg-deb", "--build", "-Znone", root, file], check=True, capture_output=True)
+        subprocess.run(
+            ["dpkg-deb", "--build", "-Znone", root, file], check=True, capture_output=True
+        )
     return file
 
 
@@ -85,7 +111,13 @@ def catalogue(entries: list[dict], models: dict[str, str]) -> bytes:
 
 
 def entry(name: str, stem: str, **more: str) -> dict:
-    return {"name": name, "category": "Living room", "model": f"/m/{stem}.obj", "creator": "A. Maker", **more}
+    return {
+        "name": name,
+        "category": "Living room",
+        "model": f"/m/{stem}.obj",
+        "creator": "A. Maker",
+        **more,
+    }
 
 
 def fetch(folder: Path, debs: Path | None) -> Report:

@@ -34,7 +34,12 @@ class Soaked(log.RunLog):
             with open("/proc/self/statm") as file:
                 resident = int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
             files = len(os.listdir("/proc/self/fd"))
-            values = {"step": step, "resident": resident, "files": files, "threads": threading.active_count()}
+            values = {
+                "step": step,
+                "resident": resident,
+                "files": files,
+                "threads": threading.active_count(),
+            }
             print(json.dumps(values | {"cpu": cpu}), flush=True)
             self.cpu_before = time.process_time()
 

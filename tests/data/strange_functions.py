@@ -47,7 +47,13 @@ def fail(path: Path) -> None:
 
 def arrays(path: Path) -> dict[str, object]:
     large = np.arange(2**20, dtype=np.int32).reshape(1024, 1024)
-    return {"large": large, "fortran": np.asfortranarray(large), "row": large[:, 3], "small": np.eye(3), "word": "x"}
+    return {
+        "large": large,
+        "fortran": np.asfortranarray(large),
+        "row": large[:, 3],
+        "small": np.eye(3),
+        "word": "x",
+    }
 
 
 def modules(path: Path) -> list[str]:

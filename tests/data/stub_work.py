@@ -19,8 +19,21 @@ from learn3d.terminal import stop_on_signal
 
 def result(**changes: Any) -> Result:
     """The measurement of a run."""
-    numbers = {"precision": 0.5, "recall": 0.5, "chamfer_l1": 0.1, "f_score": 0.6, "mmd": 0.7, "mmd_paper": 0.5}
-    numbers |= {"voxel_iou": 0.5, "voxel_iou_kato19": 0.4, "silhouette_iou": None, "hollow": 0.0, "seconds": 60.0}
+    numbers = {
+        "precision": 0.5,
+        "recall": 0.5,
+        "chamfer_l1": 0.1,
+        "f_score": 0.6,
+        "mmd": 0.7,
+        "mmd_paper": 0.5,
+    }
+    numbers |= {
+        "voxel_iou": 0.5,
+        "voxel_iou_kato19": 0.4,
+        "silhouette_iou": None,
+        "hollow": 0.0,
+        "seconds": 60.0,
+    }
     counts = {"images": 120, "iterations": 6, "step": 6, "seed": 0}
     texts = {"checkpoint": "run/last.safetensors", "method": "Proposed", "preset": "peng2020-kato"}
     texts |= {"category": "airplane", "data": "/data", "command": "learn3d train ..."}
@@ -58,7 +71,9 @@ def work(config: TrainConfig) -> bool:
         voxel_iou=iou,
         voxel_iou_kato19=iou - 0.05,
         mmd=1 - base,
-        objects=[ObjectMeans(name, 24, mean, mean) for name, mean in zip("abcde", means, strict=True)],
+        objects=[
+            ObjectMeans(name, 24, mean, mean) for name, mean in zip("abcde", means, strict=True)
+        ],
     )
     write_json(config.output / "test.json", measured.model_dump())
     write_json(config.output / CONFIG, config_to_dict(config))
@@ -74,6 +89,10 @@ def run_tasks_here(tasks: Sequence[Task], workers: Workers) -> list[str]:
     """Run tasks in this process: starting Python and torch takes seconds."""
     for task in tasks:
         task.log.parent.mkdir(parents=True, exist_ok=True)
-        with open(task.log, "a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+        with (
+            open(task.log, "a") as log,
+            contextlib.redirect_stdout(log),
+            contextlib.redirect_stderr(log),
+        ):
             assert task.function(*task.arguments)
     return []

@@ -49,7 +49,12 @@ class FixedMethod(Method):
     image_size = 64
 
     def __init__(self) -> None:
-        self.networks, self.optimizers, self.device, self.precision = nn.ModuleDict(), {}, torch.device("cpu"), "fp32"
+        self.networks, self.optimizers, self.device, self.precision = (
+            nn.ModuleDict(),
+            {},
+            torch.device("cpu"),
+            "fp32",
+        )
 
     def create_networks(self):
         raise NotImplementedError

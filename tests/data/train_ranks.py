@@ -25,13 +25,17 @@ from learn3d.runs.distributed import join_ranks, rank
 from learn3d.terminal import without_traceback
 
 
-def linear(rate: float, network: torch.nn.Module, learning_rate: float, betas: object = None) -> torch.optim.Optimizer:
+def linear(
+    rate: float, network: torch.nn.Module, learning_rate: float, betas: object = None
+) -> torch.optim.Optimizer:
     """Adam with so large an eps that its steps are `rate` times the gradient.
 
     Otherwise its first steps have the size of the learning rate, even if the gradient is nothing but rounding.
     """
     eps = 1e4
-    return torch.optim.Adam([p for p in network.parameters() if p.requires_grad], lr=rate * eps, eps=eps)
+    return torch.optim.Adam(
+        [p for p in network.parameters() if p.requires_grad], lr=rate * eps, eps=eps
+    )
 
 
 def step(take_step, kill, method, batch, now):

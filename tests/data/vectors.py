@@ -12,7 +12,9 @@ import numpy as np
 
 _FOLDERS = [
     Path(__file__).parent / "vectors",
-    Path(os.environ.get("NMR_VECTORS") or Path(__file__).resolve().parents[3] / "shared" / "vectors"),
+    Path(
+        os.environ.get("NMR_VECTORS") or Path(__file__).resolve().parents[3] / "shared" / "vectors"
+    ),
 ]
 
 

@@ -29,7 +29,9 @@ from learn3d.training import train
 @pytest.fixture(scope="session")
 def read_metrics() -> Callable[[Path], list[dict[str, object]]]:
     """Reads the metrics.jsonl of a run folder."""
-    return lambda folder: [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return lambda folder: [
+        json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()
+    ]
 
 
 def tiny_arrays(objects: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +40,9 @@ def tiny_arrays(objects: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     images = np.zeros((objects, 24, 4, 64, 64), np.uint8)
     voxels = np.zeros((objects, 32, 32, 32), bool)
     for i, (h, w) in enumerate(rng.integers(8, 24, (objects, 2))):
-        images[i, :, :3, 32 - h : 32 + h, 32 - w : 32 + w] = rng.integers(0, 256, (24, 3, 2 * h, 2 * w), np.uint8)
+        images[i, :, :3, 32 - h : 32 + h, 32 - w : 32 + w] = rng.integers(
+            0, 256, (24, 3, 2 * h, 2 * w), np.uint8
+        )
         images[i, :, 3, 32 - h : 32 + h, 32 - w : 32 + w] = 255
         voxels[i, 16 - h // 2 : 16 + h // 2, 8:24, 16 - w // 2 : 16 + w // 2] = True
     return images, voxels
@@ -75,18 +79,28 @@ def tiny_config(tiny_folder: Path) -> Callable[..., TrainConfig]:
     """
 
     def make(output: Path, **options: object) -> TrainConfig:
-        defaults = {"iterations": 4, "batch_size": 4, "precision": "fp32", "log_every": 1, "max_val_images": 4}
+        defaults = {
+            "iterations": 4,
+            "batch_size": 4,
+            "precision": "fp32",
+            "log_every": 1,
+            "max_val_images": 4,
+        }
         options = {"preset": "peng2020-kato"} | options
         preset = PRESETS[full_name(options["preset"])].settings
         if isinstance(preset, PoseInvariantSettings) and preset.encoder == "conv":
             options = {"encoder": "conv-small", "generator": "sphere-small"} | options
-        return configure(**({"data": tiny_folder, "category": "airplane", "output": output} | defaults | options))
+        return configure(
+            **({"data": tiny_folder, "category": "airplane", "output": output} | defaults | options)
+        )
 
     return make
 
 
 @pytest.fixture(scope="session")
-def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable[..., TrainConfig]) -> Iterator[Path]:
+def finished_run(
+    tmp_path_factory: pytest.TempPathFactory, tiny_config: Callable[..., TrainConfig]
+) -> Iterator[Path]:
     """The folder of a run of four steps that nothing interrupted. Do not change it."""
     folder = tmp_path_factory.mktemp("runs") / "finished"
     summary = train(tiny_config(folder))
@@ -106,15 +120,25 @@ def tiny_names() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def tiny_run(tiny_names: None, tiny_config: Callable[..., TrainConfig]) -> Callable[..., TrainConfig]:
+def tiny_run(
+    tiny_names: None, tiny_config: Callable[..., TrainConfig]
+) -> Callable[..., TrainConfig]:
     """Makes a configuration of six steps of milliseconds with everything in them, every two steps."""
-    small = {"encoder": "conv-small", "generator": "sphere-small", "batch_size": 2, "threads": 1, "iterations": 6}
+    small = {
+        "encoder": "conv-small",
+        "generator": "sphere-small",
+        "batch_size": 2,
+        "threads": 1,
+        "iterations": 6,
+    }
     often = {"log_every": 1, "validate_every": 2, "checkpoint_every": 2, "pictures_every": 2}
     return lambda output, **options: tiny_config(output, **(small | often | options))
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tiny_run: Callable[..., TrainConfig], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def undisturbed(
+    tiny_run: Callable[..., TrainConfig], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """The folder of such a run that nothing disturbed. Do not change it."""
     folder = tmp_path_factory.mktemp("undisturbed") / "run"
     train(tiny_run(folder))
@@ -122,7 +146,9 @@ def undisturbed(tiny_run: Callable[..., TrainConfig], tmp_path_factory: pytest.T
 
 
 @pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+def command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
     """Calls `learn3d` with these words; its exit status and what it wrote to both outputs."""
 
     def call(*words: object) -> tuple[int, str, str]:

@@ -45,9 +45,13 @@ def with_truth(dataset: ViewDataset, shape: Meshes) -> ViewDataset:
     return dataclasses.replace(dataset, voxels=np.repeat(voxels, dataset.num_objects, axis=0))
 
 
-def egg(scale: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), flat: float = 1.0) -> Meshes:
+def egg(
+    scale: float = 1.0, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), flat: float = 1.0
+) -> Meshes:
     sphere, faces = nmr.icosphere(3)
-    return Meshes(scale * sphere[None] * torch.tensor([0.45, 0.3, 0.2 * flat]) + torch.tensor(shift), faces)
+    return Meshes(
+        scale * sphere[None] * torch.tensor([0.45, 0.3, 0.2 * flat]) + torch.tensor(shift), faces
+    )
 
 
 def test_perfect_prediction_has_iou_one(tiny_set) -> None:
@@ -59,7 +63,9 @@ def test_perfect_prediction_has_iou_one(tiny_set) -> None:
     worse = evaluate(Constant(egg()), with_truth(tiny_set, egg(0.75)), max_images=5, detailed=True)
     assert 0.3 < worse.voxel_iou < 0.6  # near 0.75^3
     assert worse.means["voxel_iou_kato19"] != worse.voxel_iou
-    assert worse.values["recall"].tolist() == [1] * 5, "all of the truth is in the larger prediction"
+    assert worse.values["recall"].tolist() == [1] * 5, (
+        "all of the truth is in the larger prediction"
+    )
     assert torch.equal(worse.values["precision"], worse.values["voxel_iou"])
     assert worse.means["chamfer_l1"] > 0.04
 
@@ -68,19 +74,25 @@ def test_surface_of_the_truth_is_in_the_object_frame(tiny_set) -> None:
     moved, mirrored = (egg(0.5, (0.2, 0.1, z)) for z in (-0.15, 0.15))
     truth = with_truth(tiny_set, moved)
     assert evaluate(Constant(moved), truth, max_images=3, detailed=True).means["chamfer_l1"] < 0.02
-    assert evaluate(Constant(mirrored), truth, max_images=3, detailed=True).means["chamfer_l1"] > 0.1
+    assert (
+        evaluate(Constant(mirrored), truth, max_images=3, detailed=True).means["chamfer_l1"] > 0.1
+    )
 
 
 def test_points_of_the_data_set_are_the_truth_if_it_has_them(tiny_set) -> None:
     points = np.zeros((tiny_set.num_objects, 10, 3), np.float32)
-    result = evaluate(Constant(egg()), dataclasses.replace(tiny_set, points=points), max_images=2, detailed=True)
+    result = evaluate(
+        Constant(egg()), dataclasses.replace(tiny_set, points=points), max_images=2, detailed=True
+    )
     assert 0.2 <= result.means["chamfer_l1"] < 0.45  # from the centre to the egg
 
 
 def test_an_empty_prediction_has_an_f_score_and_no_distance(tiny_set) -> None:
     half = torch.zeros(2, 64, 64, 64)
     half[0, 16:48, 16:48, 16:48] = 1
-    result = evaluate(Constant(Grids(half)), with_truth(tiny_set, egg()), max_images=2, detailed=True)
+    result = evaluate(
+        Constant(Grids(half)), with_truth(tiny_set, egg()), max_images=2, detailed=True
+    )
     distance, f_score = result.values["chamfer_l1"], result.values["f_score"]
     assert distance.isnan().tolist() == [False, True]
     assert f_score[0] > 0 and f_score[1] == 0
@@ -90,7 +102,9 @@ def test_an_empty_prediction_has_an_f_score_and_no_distance(tiny_set) -> None:
 
 def test_grids_are_pooled_and_brought_into_the_axes(tiny_set) -> None:
     shape = egg()
-    grid = nmr.voxelize(shape.vertices + torch.tensor([0.5, 0.6, 0.45]), shape.faces, size=64).float()
+    grid = nmr.voxelize(
+        shape.vertices + torch.tensor([0.5, 0.6, 0.45]), shape.faces, size=64
+    ).float()
     moved = with_truth(tiny_set, egg(shift=(0.0, 0.1, -0.05)))
     assert evaluate(Constant(Grids(grid)), moved, max_images=2).voxel_iou > 0.8
     pascal = dataclasses.replace(tiny_set, convention=PASCAL3D)
@@ -100,13 +114,18 @@ def test_grids_are_pooled_and_brought_into_the_axes(tiny_set) -> None:
 
 def test_without_voxels_silhouettes_at_other_cameras_are_compared(tiny_set) -> None:
     shape = egg()
-    masks = nmr.render_silhouette(shape.vertices, shape.faces, tiny_set.poses.cameras(), image_size=64)
+    masks = nmr.render_silhouette(
+        shape.vertices, shape.faces, tiny_set.poses.cameras(), image_size=64
+    )
     images = tiny_set.images.copy()
     images[:, 3] = (255 * masks).round()
     photographs = dataclasses.replace(tiny_set, images=images, voxels=None)
     result = evaluate(Constant(shape), photographs, detailed=True)
     assert result.means.keys() == {"silhouette_iou", "mmd", "mmd_paper"}
-    assert (result.selection_metric, result.means["silhouette_iou"]) == ("silhouette_iou", pytest.approx(1, abs=0.01))
+    assert (result.selection_metric, result.means["silhouette_iou"]) == (
+        "silhouette_iou",
+        pytest.approx(1, abs=0.01),
+    )
     flat = Constant(egg(flat=0.1))  # the same from views 0 and 12
     facing = photographs.select(np.flatnonzero(np.isin(photographs.view_ids, (0, 6))))
     own, other = (evaluate(flat, facing).values["silhouette_iou"][k::2].mean() for k in (1, 0))
@@ -122,14 +141,18 @@ def test_novel_views_select_networks_even_if_voxels_are_known(tiny_set) -> None:
     result = evaluate(Constant(flat), facing)
     assert result.selection_metric == "silhouette_iou"
     single = evaluate(Constant(flat), facing.select(np.flatnonzero(facing.view_ids == 0)))
-    assert (single.selection_metric, single.means.get("silhouette_iou")) == ("voxel_iou", None), "no novel views"
+    assert (single.selection_metric, single.means.get("silhouette_iou")) == ("voxel_iou", None), (
+        "no novel views"
+    )
 
 
 def test_without_poses_voxels_are_compared_and_silhouettes_are_not(tiny_set) -> None:
     known = with_truth(tiny_set, egg())
     unknown = dataclasses.replace(known, poses=None)
     means = evaluate(Constant(egg()), known).means
-    assert evaluate(Constant(egg()), unknown).means == {k: v for k, v in means.items() if k != "silhouette_iou"}
+    assert evaluate(Constant(egg()), unknown).means == {
+        k: v for k, v in means.items() if k != "silhouette_iou"
+    }
     nothing = evaluate(Constant(egg()), dataclasses.replace(unknown, voxels=None))
     assert nothing.means.keys() == {"mmd"}
 
@@ -140,12 +163,17 @@ def test_images_without_iou_are_left_out(tiny_set) -> None:
     voxels[0] = False
     result = evaluate(nothing, dataclasses.replace(tiny_set, voxels=voxels))
     assert (result.voxel_iou, int(result.values["voxel_iou"].isnan().sum())) == (0, 24)
-    assert evaluate(nothing, dataclasses.replace(tiny_set, voxels=np.zeros_like(voxels))).voxel_iou is None
+    assert (
+        evaluate(nothing, dataclasses.replace(tiny_set, voxels=np.zeros_like(voxels))).voxel_iou
+        is None
+    )
 
 
 def test_meshes_beyond_the_grid_are_counted(tiny_set) -> None:
     beyond = egg(shift=(0.1, 0.0, 0.0))
-    whole, opened = (tiny_set.convention.voxelize(mesh.vertices, mesh.faces) for mesh in (egg(), beyond))
+    whole, opened = (
+        tiny_set.convention.voxelize(mesh.vertices, mesh.faces) for mesh in (egg(), beyond)
+    )
     assert opened.sum() < 0.7 * whole.sum(), "an open shape has no inside"
     assert evaluate(Constant(beyond), tiny_set).means["hollow"] == 1
 
@@ -167,7 +195,9 @@ def test_shapes_may_be_aligned_before_they_are_compared(tiny_set) -> None:
     assert evaluate(method, dataset, max_images=4, align=align).voxel_iou > 0.99
 
 
-@pytest.mark.parametrize(("objects", "count"), [(25, 24), (25, 5), (24, 25), (18, 73), (18, 200), (1, 7), (2, 48)])
+@pytest.mark.parametrize(
+    ("objects", "count"), [(25, 24), (25, 5), (24, 25), (18, 73), (18, 200), (1, 7), (2, 48)]
+)
 def test_spread_samples_meet_views_and_objects_evenly(objects: int, count: int) -> None:
     object_ids, view_ids = np.repeat(np.arange(objects), 24), np.tile(np.arange(24), objects)
     samples = spread_samples(object_ids, view_ids, count)
@@ -179,7 +209,9 @@ def test_spread_samples_meet_views_and_objects_evenly(objects: int, count: int) 
         counts = torch.bincount(numbers, minlength=size)
         assert len(counts) == size
         assert counts.max() - counts.min() <= 1
-    assert torch.equal(spread_samples(object_ids, view_ids, objects * 24), torch.arange(objects * 24))
+    assert torch.equal(
+        spread_samples(object_ids, view_ids, objects * 24), torch.arange(objects * 24)
+    )
 
 
 def test_mean_mmd_is_the_mean_over_pairs() -> None:
@@ -189,26 +221,41 @@ def test_mean_mmd_is_the_mean_over_pairs() -> None:
     pairs = list(itertools.combinations([codes[views == k] for k in range(4)], 2))
     found = mean_mmd(codes, views, ("mmd", "mmd_paper"))
     for name in ("mmd", "mmd_paper"):
-        expected = [mean_mmd(torch.cat(pair), torch.arange(20) // 10, (name,))[name] for pair in pairs]
+        expected = [
+            mean_mmd(torch.cat(pair), torch.arange(20) // 10, (name,))[name] for pair in pairs
+        ]
         assert found[name] == pytest.approx(np.mean(expected), rel=1e-5)
 
 
 def test_mean_mmd_uses_equally_many_codes_of_each_view(monkeypatch) -> None:
     codes = torch.randn(9, 4, generator=torch.Generator().manual_seed(0))
     views = torch.tensor([0, 0, 0, 0, 0, 5, 5, 5, 5])
-    assert mean_mmd(codes, views)["mmd"] == mean_mmd(torch.cat([codes[:4], codes[5:]]), torch.arange(8) // 4)["mmd"]
+    assert (
+        mean_mmd(codes, views)["mmd"]
+        == mean_mmd(torch.cat([codes[:4], codes[5:]]), torch.arange(8) // 4)["mmd"]
+    )
     single = torch.tensor([0, 0, 0, 0, 5, 5, 5, 5, 7])
-    assert mean_mmd(codes, single) == mean_mmd(codes[:8], single[:8]), "a single code of a view does not count"
+    assert mean_mmd(codes, single) == mean_mmd(codes[:8], single[:8]), (
+        "a single code of a view does not count"
+    )
     for views_without_pairs in (torch.arange(9), torch.zeros(9, dtype=torch.int64)):
         assert mean_mmd(codes, views_without_pairs) == {}
     monkeypatch.setattr(evaluation, "CODES_PER_VIEW", 3)
-    assert mean_mmd(codes, views)["mmd"] == mean_mmd(torch.cat([codes[:3], codes[5:8]]), torch.arange(6) // 3)["mmd"]
+    assert (
+        mean_mmd(codes, views)["mmd"]
+        == mean_mmd(torch.cat([codes[:3], codes[5:8]]), torch.arange(6) // 3)["mmd"]
+    )
 
 
 def test_evaluate_runs_reports_and_tabulates(finished_run, capsys) -> None:
     (result,) = evaluate_runs([finished_run], split="test")
     said = capsys.readouterr().err.splitlines()
-    assert (result.category, result.method, result.step, result.images) == ("airplane", "Proposed", 4, 24)
+    assert (result.category, result.method, result.step, result.images) == (
+        "airplane",
+        "Proposed",
+        4,
+        24,
+    )
     ((_, images, iou, _),) = result.objects
     assert (images, iou) == (24, pytest.approx(result.voxel_iou, abs=1e-5))
     assert "last.safetensors" in said[0]
@@ -217,7 +264,9 @@ def test_evaluate_runs_reports_and_tabulates(finished_run, capsys) -> None:
     assert len(lines) == 3 and f"{result.voxel_iou:.4f}" in lines[1]
 
 
-def test_a_run_on_several_categories_is_measured_on_each(finished_run, monkeypatch, tiny_set) -> None:
+def test_a_run_on_several_categories_is_measured_on_each(
+    finished_run, monkeypatch, tiny_set
+) -> None:
     monkeypatch.setattr(
         "learn3d.runs.checkpoint.load_dataset",
         lambda *where, **options: dataclasses.replace(tiny_set, category=where[2]),
@@ -250,12 +299,15 @@ ALL = (KATO, KAR, PASCAL3D)
 
 
 @pytest.mark.parametrize(
-    ("convention", "published"), [(KATO, "iou_CVPR18"), (KAR, "iou_NIPS17"), (PASCAL3D, "iou_Pascal3D")]
+    ("convention", "published"),
+    [(KATO, "iou_CVPR18"), (KAR, "iou_NIPS17"), (PASCAL3D, "iou_Pascal3D")],
 )
 def test_iou_after_the_axis_rule_is_the_published_one(convention, published):
     v = load_vector("voxel_iou")
     predicted, target = (torch.from_numpy(v[name].astype(bool)) for name in ("predicted", "target"))
-    np.testing.assert_allclose(voxel_iou(convention.to_axes(predicted), target).numpy(), v[published], rtol=1e-6)
+    np.testing.assert_allclose(
+        voxel_iou(convention.to_axes(predicted), target).numpy(), v[published], rtol=1e-6
+    )
     for other in (voxel_iou(c.to_axes(predicted), target)[0] for c in ALL if c is not convention):
         assert abs(float(other) - v[published][0]) > 1e-4  # the rule matters here
 

@@ -35,7 +35,10 @@ def test_the_core_never_imports_the_studio():
     known = modules()
     core = {name: path for name, path in known.items() if not name.startswith("learn3d.studio")}
     assert len(core) < len(known)
-    found = {name: [other for other in imports(path, known) if ".studio" in other] for name, path in core.items()}
+    found = {
+        name: [other for other in imports(path, known) if ".studio" in other]
+        for name, path in core.items()
+    }
     assert {name: others for name, others in found.items() if others} == {}
 
 
@@ -49,6 +52,8 @@ def test_no_module_imports_itself_over_others():
 def test_the_loop_needs_few_modules(tmp_path: Path):
     code = "import sys, learn3d.training; print(*(name for name in sys.modules if name.split('.')[0] == 'learn3d'))"
     words = [sys.executable, "-c", code]
-    loaded = subprocess.run(words, capture_output=True, text=True, check=True, cwd=tmp_path).stdout.split()
+    loaded = subprocess.run(
+        words, capture_output=True, text=True, check=True, cwd=tmp_path
+    ).stdout.split()
     assert not [name for name in loaded if ".studio" in name]
     assert len(loaded) <= 52

@@ -24,7 +24,11 @@ from learn3d.networks.discriminators import pose_discriminator
 
 @pytest.fixture(scope="module")
 def case() -> dict[str, Tensor]:
-    return {k: torch.from_numpy(v) for k, v in load_vector("loss_adversarial").items() if v.dtype.kind in "fi"}
+    return {
+        k: torch.from_numpy(v)
+        for k, v in load_vector("loss_adversarial").items()
+        if v.dtype.kind in "fi"
+    }
 
 
 @pytest.fixture
@@ -37,7 +41,9 @@ def discriminator(case) -> torch.nn.Sequential:
 
 
 def close(actual: Tensor, expected: Tensor, tolerance: float = 2e-6) -> None:
-    torch.testing.assert_close(actual, expected, rtol=0, atol=tolerance * float(expected.abs().max()))
+    torch.testing.assert_close(
+        actual, expected, rtol=0, atol=tolerance * float(expected.abs().max())
+    )
 
 
 @pytest.mark.parametrize("name", ["adv_code", "adv_paper", "prior_code", "prior_paper"])
@@ -86,7 +92,10 @@ def test_prior_of_zero_codes_has_the_gradient_zero(form: str) -> None:
 
 def test_low_precision_inputs_give_float32_losses() -> None:
     logits, codes = torch.randn(2, 24).bfloat16(), torch.randn(2, 8).bfloat16()
-    losses = [domain_confusion_loss(logits, "log"), pose_classification_loss(logits, torch.tensor([0, 5]))]
+    losses = [
+        domain_confusion_loss(logits, "log"),
+        pose_classification_loss(logits, torch.tensor([0, 5])),
+    ]
     losses += [gaussian_prior_loss(codes, "norm")]
     assert all(loss.dtype == torch.float32 for loss in losses)
 
@@ -102,21 +111,37 @@ def mmd_of_views(x: Tensor, y: Tensor, name: str = "mmd") -> float:
 
 
 def test_mmd_vectors() -> None:
-    case = {k: torch.from_numpy(v) for k, v in load_vector("loss_mmd").items() if v.dtype.kind == "f"}
-    source, target = case["source"].clone().requires_grad_(), case["target"].clone().requires_grad_()
-    value = mmd(*(squared_distances(*pair) for pair in ((source, source), (target, target), (source, target))))
+    case = {
+        k: torch.from_numpy(v) for k, v in load_vector("loss_mmd").items() if v.dtype.kind == "f"
+    }
+    source, target = (
+        case["source"].clone().requires_grad_(),
+        case["target"].clone().requires_grad_(),
+    )
+    value = mmd(
+        *(
+            squared_distances(*pair)
+            for pair in ((source, source), (target, target), (source, target))
+        )
+    )
     value.backward()
     close(value, case["mmd"])
-    assert mmd_of_views(source.detach(), target.detach()) == pytest.approx(float(case["mmd"]), rel=1e-5)
+    assert mmd_of_views(source.detach(), target.detach()) == pytest.approx(
+        float(case["mmd"]), rel=1e-5
+    )
     close(source.grad, case["grad_source"], 1e-5)
     close(target.grad, case["grad_target"], 1e-5)
-    assert mmd_of_views(source.detach(), source.detach()) == pytest.approx(float(case["mmd_same"]), abs=1e-6)
+    assert mmd_of_views(source.detach(), source.detach()) == pytest.approx(
+        float(case["mmd_same"]), abs=1e-6
+    )
 
 
 def test_mmd_as_printed_equals_its_double_sum() -> None:
     generator = torch.Generator().manual_seed(0)
     x, y = torch.randn(5, 3, generator=generator), torch.randn(5, 3, generator=generator) + 1
-    bandwidth = sum((a - b).square().sum() for a, b in itertools.permutations(torch.cat([x, y]), 2)) / (10 * 9)
+    bandwidth = sum(
+        (a - b).square().sum() for a, b in itertools.permutations(torch.cat([x, y]), 2)
+    ) / (10 * 9)
 
     def mean_kernel(p: Tensor, q: Tensor) -> Tensor:
         return sum(torch.exp(-(a - b).square().sum() / bandwidth) for a in p for b in q) / 25
@@ -134,16 +159,23 @@ def test_silhouette_pyramid_equals_its_sum() -> None:
     for p, t in zip(prediction, target, strict=True):
         for level in range(5):
             size = 48 // 2**level
-            a, b = (image.unfold(0, 2**level, 2**level).unfold(1, 2**level, 2**level).mean((2, 3)) for image in (p, t))
+            a, b = (
+                image.unfold(0, 2**level, 2**level).unfold(1, 2**level, 2**level).mean((2, 3))
+                for image in (p, t)
+            )
             assert a.shape == (size, size)
             expected += float((a / a.norm() - b / b.norm()).square().sum()) / 3
     assert float(silhouette_pyramid_loss(prediction, target)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_silhouette_pyramid_of_equal_and_of_empty_images() -> None:
-    disc = ((torch.arange(64) - 32)[:, None] ** 2 + (torch.arange(64) - 32) ** 2 < 300).float()[None]
+    disc = ((torch.arange(64) - 32)[:, None] ** 2 + (torch.arange(64) - 32) ** 2 < 300).float()[
+        None
+    ]
     empty = torch.zeros(1, 64, 64, requires_grad=True)
-    assert float(silhouette_pyramid_loss(disc / 2, disc)) == pytest.approx(0, abs=1e-10)  # the grey does not count
+    assert float(silhouette_pyramid_loss(disc / 2, disc)) == pytest.approx(
+        0, abs=1e-10
+    )  # the grey does not count
     loss = silhouette_pyramid_loss(empty, disc)
     assert loss.item() == pytest.approx(5)
     loss.backward()
@@ -162,7 +194,9 @@ def test_energy_distance_equals_its_sum() -> None:
     within = torch.stack([distance(p, q) for p, q in itertools.permutations(drawn, 2)]).mean()
     found, wanted = silhouette_energy_distance(drawn, real), 2 * across - within
     torch.testing.assert_close(found, wanted)
-    torch.testing.assert_close(*(torch.autograd.grad(value, drawn, retain_graph=True) for value in (found, wanted)))
+    torch.testing.assert_close(
+        *(torch.autograd.grad(value, drawn, retain_graph=True) for value in (found, wanted))
+    )
 
 
 def test_energy_distance_is_least_for_the_same_distribution() -> None:
@@ -170,7 +204,11 @@ def test_energy_distance_is_least_for_the_same_distribution() -> None:
     kinds = torch.stack([F.pad(torch.ones(8), (0, 8)), F.pad(torch.ones(12), (4, 0))])
     real = kinds.repeat(50, 1)
     same = silhouette_energy_distance(real, real)
-    for other in (kinds.mean(0).repeat(100, 1), kinds[:1].repeat(100, 1), kinds[[0, 0, 0, 1]].repeat(25, 1)):
+    for other in (
+        kinds.mean(0).repeat(100, 1),
+        kinds[:1].repeat(100, 1),
+        kinds[[0, 0, 0, 1]].repeat(25, 1),
+    ):
         assert silhouette_energy_distance(other, real) > same + 0.01
     empty = torch.zeros(3, 9, requires_grad=True)
     loss = silhouette_energy_distance(empty, torch.zeros(2, 9))

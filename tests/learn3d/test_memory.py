@@ -24,7 +24,9 @@ print(faults() - before)
 def test_large_buffers_are_reused():
     faults = {}
     for mode in ("keep", "plain"):
-        run = subprocess.run([sys.executable, "-I", "-c", CODE, mode], capture_output=True, text=True)
+        run = subprocess.run(
+            [sys.executable, "-I", "-c", CODE, mode], capture_output=True, text=True
+        )
         if run.stderr.strip() == "unavailable":
             pytest.skip("needs Linux with glibc")
         assert run.returncode == 0, run.stderr

@@ -27,7 +27,10 @@ def workers(request) -> Workers:
 
 
 def steps(folder: Path, *names: str, seconds: float = 0.0) -> list[Task]:
-    return [Task(name, stub_steps.steps, (folder, name, seconds), folder / f"{name}.log") for name in names]
+    return [
+        Task(name, stub_steps.steps, (folder, name, seconds), folder / f"{name}.log")
+        for name in names
+    ]
 
 
 def finished(folder: Path, *names: str) -> bool:
@@ -59,7 +62,9 @@ def test_tasks_of_all_kinds(workers, tmp_path, capsys, monkeypatch) -> None:
     assert said.count("/6] ") == 6 and "\n[6/6] " in said
 
 
-def test_an_interruption_lets_tasks_save_and_the_next_call_goes_on(workers, tmp_path, capsys) -> None:
+def test_an_interruption_lets_tasks_save_and_the_next_call_goes_on(
+    workers, tmp_path, capsys
+) -> None:
     def interrupt() -> None:
         wait_for(lambda: begun(tmp_path, "a"), "the task")
         os.kill(os.getpid(), signal.SIGINT)
@@ -99,7 +104,10 @@ def test_a_scheduler_that_is_missing_or_ends(tmp_path, capsys) -> None:
 
         threading.Thread(target=kill).start()
         assert run_tasks(steps(tmp_path, "a", seconds=0.5), Workers(cluster=address)) == ["a"]
-    assert "the Dask scheduler ended; start it, and the same command goes on" in capsys.readouterr().err
+    assert (
+        "the Dask scheduler ended; start it, and the same command goes on"
+        in capsys.readouterr().err
+    )
     wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
 
 

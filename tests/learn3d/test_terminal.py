@@ -31,7 +31,9 @@ sys.exit(main())
 def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
     command = [sys.executable, "-m", "learn3d", "make-dataset", "--output", str(tmp_path / "data")]
     command += ["--category", "chair", "--procedural", "500"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         deadline = time.monotonic() + 120
         while not list(tmp_path.glob("data/.make_dataset_*/new")) and time.monotonic() < deadline:
             assert process.poll() is None, process.stderr.read()
@@ -43,7 +45,9 @@ def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
     assert list((tmp_path / "data").iterdir()) == []
 
 
-@pytest.mark.parametrize("error", [ValueError("a"), FileNotFoundError("b"), FloatingPointError("c"), TypeError("d")])
+@pytest.mark.parametrize(
+    "error", [ValueError("a"), FileNotFoundError("b"), FloatingPointError("c"), TypeError("d")]
+)
 def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(error: Exception, capsys) -> None:
     @without_traceback
     def main() -> int:
@@ -58,21 +62,31 @@ def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(error: Exception,
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
-@pytest.mark.parametrize(("call", "stream", "status"), [("say", "stdout", 1), ("note", "stderr", 0)])
-def test_a_lost_result_is_an_error_and_lost_progress_is_none(call: str, stream: str, status: int) -> None:
+@pytest.mark.parametrize(
+    ("call", "stream", "status"), [("say", "stdout", 1), ("note", "stderr", 0)]
+)
+def test_a_lost_result_is_an_error_and_lost_progress_is_none(
+    call: str, stream: str, status: int
+) -> None:
     with open("/dev/full", "w") as full:
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | {stream: full}
-        result = subprocess.run([sys.executable, "-c", PROGRAM.format(call=call)], **streams, timeout=120)
+        result = subprocess.run(
+            [sys.executable, "-c", PROGRAM.format(call=call)], **streams, timeout=120
+        )
     assert result.returncode == status
     assert call == "note" or result.stderr == b"error: [Errno 28] No space left on device\n"
 
 
-@pytest.mark.parametrize("program", [["-c", PROGRAM.format(call="say")], ["-m", "learn3d", "train", "--help"]])
+@pytest.mark.parametrize(
+    "program", [["-c", PROGRAM.format(call="say")], ["-m", "learn3d", "train", "--help"]]
+)
 def test_an_output_that_nobody_reads_is_no_error(program: list[str]) -> None:
     """As with `| head`."""
     reading, writing = os.pipe()
     os.close(reading)
-    result = subprocess.run([sys.executable, *program], stdout=writing, stderr=subprocess.PIPE, timeout=120)
+    result = subprocess.run(
+        [sys.executable, *program], stdout=writing, stderr=subprocess.PIPE, timeout=120
+    )
     os.close(writing)
     assert (result.returncode, result.stderr) == (0, b"")
 
@@ -87,7 +101,10 @@ def test_columns_are_as_wide_as_their_widest_cell() -> None:
 def test_names_of_strangers_give_a_terminal_no_commands(tmp_path, capsys, command) -> None:
     title, turned, broken = "\x1b]0;title\x07", "\u202etxt.exe", os.fsdecode(b"\xff")
     say(f"a\tb\n{title} \x9b31m {turned} {broken} Ångström 椅子")
-    assert capsys.readouterr().out == "a\tb\n\\x1b]0;title\\x07 \\x9b31m \\u202etxt.exe \\udcff Ångström 椅子\n"
+    assert (
+        capsys.readouterr().out
+        == "a\tb\n\\x1b]0;title\\x07 \\x9b31m \\u202etxt.exe \\udcff Ångström 椅子\n"
+    )
     for name in "abc":
         (tmp_path / f"{name}.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 1\n3 0 1 2\n")
     (tmp_path / os.fsdecode(b"\xff\x1b[2J.off")).write_text("no mesh")

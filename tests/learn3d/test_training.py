@@ -33,7 +33,9 @@ def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
 
 def make_step(config: TrainConfig, data: ViewDataset, step=take_step):
     """Networks by name, and a function that takes one step with them."""
-    method = create_method(config.settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
+    method = create_method(
+        config.settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0
+    )
     batch = data.batch(torch.tensor([0, 25, 50, 7]))
     return method.networks, lambda iteration: step(method, batch, iteration)
 
@@ -50,20 +52,29 @@ def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
         assert ("classification" in losses, "confusion" in losses) == (odd, not odd)
 
 
-def gradients(config: TrainConfig, data: ViewDataset, iteration: int) -> dict[str, list[torch.Tensor]]:
+def gradients(
+    config: TrainConfig, data: ViewDataset, iteration: int
+) -> dict[str, list[torch.Tensor]]:
     networks, step = make_step(config, data, backpropagate)
     step(iteration)
-    return {name: [p.grad for p in n.parameters() if p.grad is not None] for name, n in networks.items()}
+    return {
+        name: [p.grad for p in n.parameters() if p.grad is not None] for name, n in networks.items()
+    }
 
 
 def test_classification_reaches_the_discriminator_and_confusion_the_encoder_only(
     tiny_config, tiny_set, tmp_path
 ) -> None:
-    for iteration, weight, changed in ((1, "lambda_classification", ()), (2, "lambda_adversarial", ("encoder",))):
+    for iteration, weight, changed in (
+        (1, "lambda_classification", ()),
+        (2, "lambda_adversarial", ("encoder",)),
+    ):
         with_loss = gradients(tiny_config(tmp_path), tiny_set, iteration)
         without = gradients(tiny_config(tmp_path, **{weight: 0.0}), tiny_set, iteration)
         for name in ("encoder", "generator"):
-            same = all(torch.equal(a, b) for a, b in zip(with_loss[name], without[name], strict=True))
+            same = all(
+                torch.equal(a, b) for a, b in zip(with_loss[name], without[name], strict=True)
+            )
             assert same == (name not in changed)
         assert bool(with_loss["discriminator"]) == (iteration == 1)
         assert not without["discriminator"]
@@ -72,7 +83,9 @@ def test_classification_reaches_the_discriminator_and_confusion_the_encoder_only
     assert set(step(1)) == {"projection", "smoothness", "total"}
 
 
-def test_printed_losses_differ_from_those_of_the_published_code(tiny_config, tiny_set, tmp_path) -> None:
+def test_printed_losses_differ_from_those_of_the_published_code(
+    tiny_config, tiny_set, tmp_path
+) -> None:
     printed = tiny_config(tmp_path, adversarial_form="probability", prior_form="norm")
     a, b = (make_step(config, tiny_set)[1](2) for config in (tiny_config(tmp_path), printed))
     assert {name for name in a if a[name] != b[name]} == {"confusion", "prior", "total"}
@@ -81,7 +94,12 @@ def test_printed_losses_differ_from_those_of_the_published_code(tiny_config, tin
 @pytest.mark.parametrize(("samples", "batch"), [(24, 5), (24, 24), (7, 20)])
 def test_batches_go_through_every_epoch_completely(samples: int, batch: int) -> None:
     def draw(seed: int) -> torch.Tensor:
-        return torch.cat([shuffled_epochs(samples, batch, seed=seed, step=step) for step in range(1, 3 * samples + 1)])
+        return torch.cat(
+            [
+                shuffled_epochs(samples, batch, seed=seed, step=step)
+                for step in range(1, 3 * samples + 1)
+            ]
+        )
 
     drawn = draw(0)
     epochs = drawn.reshape(-1, samples)
@@ -94,10 +112,14 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
     names = {path.name for path in finished_run.iterdir()}
     assert {"config.json", "last.safetensors", "best.safetensors"} < names
     metrics = read_metrics(finished_run)
-    assert [(m["step"], m["split"]) for m in metrics] == [(s, "train") for s in (1, 2, 3, 4)] + [(4, "val")]
+    assert [(m["step"], m["split"]) for m in metrics] == [(s, "train") for s in (1, 2, 3, 4)] + [
+        (4, "val")
+    ]
     assert "confusion" in metrics[1]
     assert 0 <= metrics[-1]["voxel_iou"] <= 1
-    assert "mmd" not in metrics[-1], "four images of one object: a code per view, which is none to compare"
+    assert "mmd" not in metrics[-1], (
+        "four images of one object: a code per view, which is none to compare"
+    )
     assert (finished_run / "pictures" / "000004.png").stat().st_size > 1000
     assert list((finished_run / "tensorboard").iterdir())
 
@@ -120,17 +142,23 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
         ({"precision": "bf16"}, "precision: 'fp32' in the run, 'bf16' asked for"),
     ],
 )
-def test_resume_refuses_other_options(tiny_config, finished_run, options: dict, message: str) -> None:
+def test_resume_refuses_other_options(
+    tiny_config, finished_run, options: dict, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         train(tiny_config(finished_run, **options), resume=True)
 
 
-def test_resume_finds_its_data_in_another_folder(tiny_config, tiny_folder, finished_run, tmp_path) -> None:
+def test_resume_finds_its_data_in_another_folder(
+    tiny_config, tiny_folder, finished_run, tmp_path
+) -> None:
     shutil.copytree(tiny_folder, tmp_path / "moved")
     before = {path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()}
     summary = train(tiny_config(finished_run, data=tmp_path / "moved"), resume=True)
     assert (summary.progress.step, summary.finished, summary.progress.best_step) == (4, True, 4)
-    assert {path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()} == before
+    assert {
+        path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()
+    } == before
 
 
 @pytest.mark.parametrize("change", ["images", "poses"])
@@ -142,7 +170,9 @@ def test_resume_refuses_other_data(tiny_config, finished_run, monkeypatch, chang
         images = train_set.images.copy()
         images[20, 0, 30, 30] ^= 1
         poses = dataclasses.replace(train_set.poses, azimuth_deg=train_set.poses.azimuth_deg + 1)
-        return dataclasses.replace(train_set, **{change: {"images": images, "poses": poses}[change]})
+        return dataclasses.replace(
+            train_set, **{change: {"images": images, "poses": poses}[change]}
+        )
 
     monkeypatch.setattr(training, "load_data", load_changed)
     with pytest.raises(ValueError, match="other training data: 72 images with the CRC-32"):
@@ -162,7 +192,9 @@ def test_resume_refuses_another_mirror_plane(tiny_config, finished_run, monkeypa
         train(tiny_config(finished_run), resume=True)
 
 
-def test_the_best_of_other_validation_images_is_forgotten(tiny_config, finished_run, tmp_path) -> None:
+def test_the_best_of_other_validation_images_is_forgotten(
+    tiny_config, finished_run, tmp_path
+) -> None:
     run = shutil.copytree(finished_run, tmp_path / "run")
     assert train(tiny_config(run), resume=True).progress.best_step > 0
     other = tiny_config(run, max_val_images=6)
@@ -181,7 +213,10 @@ def test_resume_without_a_checkpoint(tiny_config, run_folder) -> None:
     [
         ({"augment": ("crop",)}, "crop must be the first augmentation, and needs"),
         ({"preset": "peng2020-kato-vpl", "batch_size": 1}, "batches of at least 2, got 1"),
-        ({"preset": "gadelha2017-kato", "encoder_from_step": 1, "elevation_deg": 20.0}, "PrGAN needs images from 24"),
+        (
+            {"preset": "gadelha2017-kato", "encoder_from_step": 1, "elevation_deg": 20.0},
+            "PrGAN needs images from 24",
+        ),
     ],
 )
 def test_what_no_step_can_be_taken_with_leaves_the_older_run(
@@ -194,7 +229,9 @@ def test_what_no_step_can_be_taken_with_leaves_the_older_run(
     assert {path.name for path in run.iterdir()} == before
 
 
-def test_nan_loss_stops_before_the_step_and_names_the_last_checkpoint(tiny_config, run_folder, monkeypatch) -> None:
+def test_nan_loss_stops_before_the_step_and_names_the_last_checkpoint(
+    tiny_config, run_folder, monkeypatch
+) -> None:
     calls = []
 
     def loss(prediction, target):
@@ -203,7 +240,10 @@ def test_nan_loss_stops_before_the_step_and_names_the_last_checkpoint(tiny_confi
 
     monkeypatch.setattr(nmr.losses, "soft_iou_loss", loss)
     config = tiny_config(run_folder, preset=VANILLA, checkpoint_every=2)
-    with pytest.raises(FloatingPointError, match=r"not finite at iteration 3 \(projection nan.*last good checkpoint"):
+    with pytest.raises(
+        FloatingPointError,
+        match=r"not finite at iteration 3 \(projection nan.*last good checkpoint",
+    ):
         train(config)
     tensors, metadata = checkpoint.load(run_folder / "last.safetensors")
     assert metadata.progress.step == 2
@@ -221,21 +261,31 @@ def test_empty_masks_are_said_and_nothing_but_empty_ones_refused(
     assert f"warning: 5 of {len(images)} test images have an empty mask" in capsys.readouterr().err
     images[:] = 0
     before = {path.name for path in run_folder.iterdir()}
-    with pytest.raises(ValueError, match=f"all {len(images)} test images of airplane have an empty mask"):
+    with pytest.raises(
+        ValueError, match=f"all {len(images)} test images of airplane have an empty mask"
+    ):
         train(tiny_run(run_folder, iterations=1), overwrite=True)
     assert {path.name for path in run_folder.iterdir()} == before
 
 
 @pytest.mark.parametrize("preset", ["peng2020-kato", "peng2020-kato-vpl", "multi-view-kato"])
 @pytest.mark.parametrize(("plane", "fixed"), [(37.5, True), (None, False)])
-def test_symmetry_auto_is_the_plane_that_the_data_have(preset: str, plane: float | None, fixed: bool) -> None:
-    settings = dataclasses.replace(PRESETS[preset].settings, symmetry="auto", generator="sphere-small")
+def test_symmetry_auto_is_the_plane_that_the_data_have(
+    preset: str, plane: float | None, fixed: bool
+) -> None:
+    settings = dataclasses.replace(
+        PRESETS[preset].settings, symmetry="auto", generator="sphere-small"
+    )
     shape = DatasetInfo(24, inverted=False, mirror_plane_deg=plane)
-    generator = create_method(settings, shape, device="cpu", precision="fp32", seed=0).networks["generator"]
+    generator = create_method(settings, shape, device="cpu", precision="fp32", seed=0).networks[
+        "generator"
+    ]
     assert (generator.mirror is not None) == fixed
 
 
-def test_the_plane_is_found_before_the_first_step_and_kept(tiny_config, run_folder, monkeypatch) -> None:
+def test_the_plane_is_found_before_the_first_step_and_kept(
+    tiny_config, run_folder, monkeypatch
+) -> None:
     monkeypatch.setattr(training, "find_mirror_plane", lambda dataset: 37.5)
     train(tiny_config(run_folder, symmetry="auto"))
     method, config, metadata = checkpoint.load_method(run_folder / "best.safetensors")

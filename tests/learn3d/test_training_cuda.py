@@ -23,7 +23,8 @@ def test_train_resume_and_evaluate(precision: str, tiny_config, run_folder, read
     tensors, _ = checkpoint.load(run_folder / "last.safetensors")
     assert "random.cuda" in tensors
     on_gpu, on_cpu = (
-        evaluate_runs([run_folder], split="test", device=device)[0].voxel_iou for device in ("cuda", "cpu")
+        evaluate_runs([run_folder], split="test", device=device)[0].voxel_iou
+        for device in ("cuda", "cpu")
     )
     assert on_gpu == pytest.approx(on_cpu, abs=0.02)
 
@@ -33,7 +34,9 @@ def test_plus_compares_masks_of_novel_views(tiny_config, run_folder, read_metric
     assert all(m["novel_view"] > 0 for m in read_metrics(run_folder) if m["split"] == "train")
 
 
-def test_first_losses_are_those_of_the_cpu(tiny_config, finished_run, run_folder, read_metrics) -> None:
+def test_first_losses_are_those_of_the_cpu(
+    tiny_config, finished_run, run_folder, read_metrics
+) -> None:
     train(tiny_config(run_folder, device="cuda", iterations=1))
     (ours, *_), (theirs, *_) = read_metrics(run_folder), read_metrics(finished_run)
     for name in ("projection", "smoothness", "classification", "prior"):

@@ -57,9 +57,16 @@ def test_opencv_pixels(count, column):
     d[:count] = DISTORTION[:count]
     shape = (-1, 1) if column else (-1,)
     camera = cameras.from_opencv(
-        K, rotation(1), T.reshape(shape), d[:count].reshape(shape) if count else None, height=SIZE, width=SIZE
+        K,
+        rotation(1),
+        T.reshape(shape),
+        d[:count].reshape(shape) if count else None,
+        height=SIZE,
+        width=SIZE,
     )
-    np.testing.assert_allclose(pixels(camera, points()), opencv_pixels(points(), K, rotation(1), T, d), atol=1e-10)
+    np.testing.assert_allclose(
+        pixels(camera, points()), opencv_pixels(points(), K, rotation(1), T, d), atol=1e-10
+    )
 
 
 def test_pixel_center_is_where_counting_begins():
@@ -118,7 +125,9 @@ def gl_ortho(left, right, bottom, top, n, f):
 def test_opengl_pixels_and_round_trip(make):
     projection = make(-0.3, 0.2, -0.1, 0.4, 0.5, 20.0)
     camera = cameras.from_opengl(gl_view(), projection)
-    np.testing.assert_allclose(pixels(camera, points()), opengl_pixels(points(), gl_view(), projection), atol=1e-10)
+    np.testing.assert_allclose(
+        pixels(camera, points()), opengl_pixels(points(), gl_view(), projection), atol=1e-10
+    )
     view, back = cameras.to_opengl(camera, near=0.5, far=20.0)
     np.testing.assert_allclose(view[0], gl_view(), atol=1e-12)
     np.testing.assert_allclose(back[0], projection, atol=1e-12)
@@ -147,11 +156,18 @@ def test_pytorch3d_pixels_and_round_trip(height, width, orthographic):
     camera = cameras.from_pytorch3d(
         rotation(4), T, [FOCAL], [PRINCIPAL], image_size=(height, width), orthographic=orthographic
     )
-    wanted = pytorch3d_pixels(points(), rotation(4), T, FOCAL, PRINCIPAL, height, width, orthographic)
+    wanted = pytorch3d_pixels(
+        points(), rotation(4), T, FOCAL, PRINCIPAL, height, width, orthographic
+    )
     np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
     back = cameras.to_pytorch3d(camera, image_size=(height, width))
     assert back["in_ndc"] is True and back["image_size"].tolist() == [[height, width]]
-    for name, value in {"R": rotation(4), "T": T, "focal_length": FOCAL, "principal_point": PRINCIPAL}.items():
+    for name, value in {
+        "R": rotation(4),
+        "T": T,
+        "focal_length": FOCAL,
+        "principal_point": PRINCIPAL,
+    }.items():
         np.testing.assert_allclose(back[name][0], value, atol=1e-12)
 
 
@@ -159,7 +175,9 @@ def test_pytorch3d_pixels_and_round_trip(height, width, orthographic):
 def test_pytorch3d_screen_space(height, width):
     """f_ndc = 2 f / s, p_ndc = -(p - size / 2) 2 / s with s the shorter side."""
     s, focal, principal = min(height, width), np.array([50.0, 45.0]), np.array([27.0, 22.0])
-    camera = cameras.from_pytorch3d(rotation(4), T, [focal], [principal], in_ndc=False, image_size=(height, width))
+    camera = cameras.from_pytorch3d(
+        rotation(4), T, [focal], [principal], in_ndc=False, image_size=(height, width)
+    )
     ndc = -(principal - np.array([width, height]) / 2) * 2 / s
     wanted = pytorch3d_pixels(points(), rotation(4), T, focal * 2 / s, ndc, height, width)
     np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
@@ -183,14 +201,19 @@ CAMERAS = {
     "Look": nmr.Look([0.1, 0.2, -2.0], [0.0, -0.1, 1.0]),
     "Orthographic": nmr.Orthographic([0.1, 0.2, -2.0], scale=0.8),
     "Pinhole": nmr.Pinhole(
-        np.diag([60.0, 55.0, 1.0]) + [[0, 0, 22], [0, 0, 26], [0, 0, 0]], rotation(1), T, orig_size=48
+        np.diag([60.0, 55.0, 1.0]) + [[0, 0, 22], [0, 0, 26], [0, 0, 0]],
+        rotation(1),
+        T,
+        orig_size=48,
     ),
 }
 
 
 def through(camera, convention):
     if convention == "opencv":
-        return cameras.from_opencv(*cameras.to_opencv(camera, height=40, width=60), height=40, width=60)
+        return cameras.from_opencv(
+            *cameras.to_opencv(camera, height=40, width=60), height=40, width=60
+        )
     if convention == "opengl":
         return cameras.from_opengl(*cameras.to_opengl(camera, near=0.1, far=10.0))
     arguments = cameras.to_pytorch3d(camera)
@@ -205,7 +228,9 @@ def test_every_camera_survives_every_convention(name, convention):
         pytest.skip("OpenCV has no orthographic camera")
     vertices = torch.from_numpy(points())[None]
     expected = camera.for_image(40, 60) if convention == "opencv" else camera
-    torch.testing.assert_close(through(camera, convention).transform(vertices), expected.transform(vertices))
+    torch.testing.assert_close(
+        through(camera, convention).transform(vertices), expected.transform(vertices)
+    )
 
 
 @pytest.mark.parametrize("size", [(40, 60), (60, 40)])
@@ -236,7 +261,9 @@ def test_a_proper_rotation_for_mirrored_vertices():
     torch.testing.assert_close(proper.transform(vertices @ mirror), wanted)
     given = cameras.to_pytorch3d(CAMERAS["Look"])
     proper = cameras.from_pytorch3d(**given | {"R": mirror @ given["R"]})
-    torch.testing.assert_close(proper.transform(vertices @ mirror), CAMERAS["Look"].transform(vertices))
+    torch.testing.assert_close(
+        proper.transform(vertices @ mirror), CAMERAS["Look"].transform(vertices)
+    )
 
 
 def test_conversions_are_differentiable():
@@ -246,19 +273,25 @@ def test_conversions_are_differentiable():
     vertices = torch.from_numpy(points(n=4))[None]
 
     def opencv(K, R, t, d):
-        return through(cameras.from_opencv(K, R, t, d, height=SIZE, width=SIZE), "opencv").transform(vertices)
+        return through(
+            cameras.from_opencv(K, R, t, d, height=SIZE, width=SIZE), "opencv"
+        ).transform(vertices)
 
     assert torch.autograd.gradcheck(opencv, tuple(map(parameter, (K, rotation(1), T, DISTORTION))))
 
     def pytorch3d(R, t, f, p, eye):
         first = cameras.from_pytorch3d(R, t, f, p, image_size=(4, 5))
         second = through(nmr.LookAt(eye), "pytorch3d")
-        return through(first, "pytorch3d").transform(vertices) + through(second, "opengl").transform(vertices)
+        return through(first, "pytorch3d").transform(vertices) + through(
+            second, "opengl"
+        ).transform(vertices)
 
     values = rotation(4), T, [FOCAL], [PRINCIPAL], [0.1, 0.2, -2.0]
     assert torch.autograd.gradcheck(pytorch3d, tuple(map(parameter, values)))
     fov = parameter([40.0, 50.0])
-    assert torch.autograd.gradcheck(lambda x: cameras.from_pytorch3d_fov(rotation(4), T, x).transform(vertices), fov)
+    assert torch.autograd.gradcheck(
+        lambda x: cameras.from_pytorch3d_fov(rotation(4), T, x).transform(vertices), fov
+    )
 
 
 def chain(vertices, matrix, intrinsics, distortion, origin, extent, perspective):
@@ -269,31 +302,51 @@ def chain(vertices, matrix, intrinsics, distortion, origin, extent, perspective)
         k1, k2, p1, p2, k3 = distortion[:, None].unbind(-1)
         r2 = x**2 + y**2
         radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        x, y = (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y)
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+            y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+        )
     q = torch.stack([x, y], dim=-1) / extent[:, None, None]
     xy = q @ intrinsics[:, :, :2].mT + intrinsics[:, None, :, 2]
     return torch.cat([xy, u[..., 2:]], dim=-1)
 
 
-def random_arguments(batch, num_vertices, *, shared=False, distorted=True, dtype=torch.float64, seed=0):
+def random_arguments(
+    batch, num_vertices, *, shared=False, distorted=True, dtype=torch.float64, seed=0
+):
     """vertices, matrix, intrinsics, distortion, origin, extent: all general, all vertices in front of the camera."""
     torch.manual_seed(seed)
     vertices = torch.rand(1 if shared else batch, num_vertices, 3, dtype=torch.float64) - 0.5
     matrix, intrinsics = torch.randn(batch, 3, 4), torch.randn(batch, 2, 3)
     matrix[:, 2] = torch.tensor([0.1, -0.2, 1.0, 3.0])
-    distortion = 0.01 * torch.randn(batch, 5) if distorted else None  # all vertices are within its reach
-    arguments = vertices, matrix, intrinsics, distortion, 0.1 * torch.randn(batch, 3), 0.5 + torch.rand(batch)
+    distortion = (
+        0.01 * torch.randn(batch, 5) if distorted else None
+    )  # all vertices are within its reach
+    arguments = (
+        vertices,
+        matrix,
+        intrinsics,
+        distortion,
+        0.1 * torch.randn(batch, 3),
+        0.5 + torch.rand(batch),
+    )
     return [None if x is None else x.to(dtype) for x in arguments]
 
 
-def project(vertices, matrix, intrinsics, distortion, origin, extent, perspective=True, starts=None):
+def project(
+    vertices, matrix, intrinsics, distortion, origin, extent, perspective=True, starts=None
+):
     origin = torch.zeros_like(matrix[:, 0, :3]) if origin is None else origin
     extent = torch.ones_like(matrix[:, 0, 0]) if extent is None else extent
-    camera = torch.cat([matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)], dim=1)
+    camera = torch.cat(
+        [matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)], dim=1
+    )
     return ops.project(vertices, camera, distortion, starts, perspective)
 
 
-@pytest.mark.parametrize("perspective, distorted", [(True, True), (True, False), (False, False), (False, True)])
+@pytest.mark.parametrize(
+    "perspective, distorted", [(True, True), (True, False), (False, False), (False, True)]
+)
 @pytest.mark.parametrize("shared", [False, True])
 def test_project_is_the_chain_and_its_gradient(perspective, distorted, shared):
     """1100 vertices: several chunks, and a last group that is not full."""
@@ -304,7 +357,9 @@ def test_project_is_the_chain_and_its_gradient(perspective, distorted, shared):
     torch.testing.assert_close(got, wanted, rtol=1e-12, atol=1e-12)
     kwargs = {"grad_outputs": upstream, "allow_unused": True, "materialize_grads": True}
     for a, b in zip(
-        torch.autograd.grad(got, inputs, **kwargs), torch.autograd.grad(wanted, inputs, **kwargs), strict=True
+        torch.autograd.grad(got, inputs, **kwargs),
+        torch.autograd.grad(wanted, inputs, **kwargs),
+        strict=True,
     ):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
 

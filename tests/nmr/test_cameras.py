@@ -21,7 +21,9 @@ from nmr.cameras import Projection, points_from_angles
 def test_the_origin_is_at_the_centre_at_the_eye_distance():
     camera = nmr.LookAt.from_angles(2.5, [0.0, 30.0, -40.0], [0.0, 77.0, 200.0])
     out = camera.transform(torch.zeros(1, 1, 3))
-    torch.testing.assert_close(out, torch.tensor([[[0.0, 0.0, 2.5]]]).expand(3, 1, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        out, torch.tensor([[[0.0, 0.0, 2.5]]]).expand(3, 1, 3), atol=1e-6, rtol=0
+    )
 
 
 @pytest.mark.parametrize("fov", [30.0, torch.tensor(30.0), torch.tensor([30.0]), [30.0]])
@@ -60,7 +62,9 @@ VECTOR_CAMERAS = {
     "look_up": lambda a: identity_intrinsics(nmr.Look(a["eye"], a["direction"], a["up"])),
     "perspective_30": lambda a: nmr.LookAt([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=30.0),
     "perspective_15": lambda a: nmr.LookAt([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=15.0),
-    "perspective_14.9314": lambda a: nmr.Look([0.0, 0.0, 0.0], half_fov_deg=torch.tensor([14.9314])),
+    "perspective_14.9314": lambda a: nmr.Look(
+        [0.0, 0.0, 0.0], half_fov_deg=torch.tensor([14.9314])
+    ),
     "projection": lambda a: nmr.Pinhole(a["K"], a["R"], a["t"], a["dist_coeffs"], orig_size=256),
 }
 
@@ -70,17 +74,24 @@ def test_published_values_and_gradients(name):
     v = load_vector("cameras")
     prefix = f"{name}_in_"
     arguments = {
-        key.removeprefix(prefix): torch.from_numpy(v[key]).requires_grad_() for key in v if key.startswith(prefix)
+        key.removeprefix(prefix): torch.from_numpy(v[key]).requires_grad_()
+        for key in v
+        if key.startswith(prefix)
     }
     camera, wanted = VECTOR_CAMERAS[name](arguments), v[f"{name}_out"]
     out = camera.transform(arguments["vertices"])
     out.backward(torch.from_numpy(v["upstream"]))
     if name == "projection":  # the published one rounds pixels, this one does not
         np.testing.assert_allclose(out.detach().numpy(), wanted, rtol=0, atol=1e-6)
-    elif name.startswith("perspective"):  # the published tangent is rounded up or down, ours to the nearest number
+    elif name.startswith(
+        "perspective"
+    ):  # the published tangent is rounded up or down, ours to the nearest number
         plain = camera.projection(torch.float32)
         tangents = [plain.extent] + [plain.extent.nextafter(torch.tensor(x)) for x in (0.0, 9.0)]
-        outs = [replace(plain, extent=x).transform(arguments["vertices"]).detach().numpy() for x in tangents]
+        outs = [
+            replace(plain, extent=x).transform(arguments["vertices"]).detach().numpy()
+            for x in tangents
+        ]
         assert np.array_equal(out.detach().numpy(), outs[0])
         assert any(np.array_equal(x, wanted) for x in outs)
     else:
@@ -97,7 +108,10 @@ def test_the_tangent_is_rounded_to_nearest():
     wanted = np.tan(np.radians(degrees).astype(np.float32).astype(np.float64)).astype(np.float32)
     many = nmr.LookAt([0.0, 0.0, -1.0], half_fov_deg=torch.tensor(degrees, dtype=torch.float64))
     assert np.array_equal(many.projection(torch.float32).extent.numpy(), wanted)
-    each = [nmr.LookAt([0.0, 0.0, -1.0], half_fov_deg=x).projection(torch.float32).extent.item() for x in degrees]
+    each = [
+        nmr.LookAt([0.0, 0.0, -1.0], half_fov_deg=x).projection(torch.float32).extent.item()
+        for x in degrees
+    ]
     assert np.array_equal(np.float32(each), wanted)
 
 
@@ -139,7 +153,8 @@ def test_gradcheck_in_all_parameters(name):
     torch.manual_seed(0)
     points = torch.rand(1, 5, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(
-        lambda points, *parameters: make(*parameters).transform(points), (points, *map(parameter, values))
+        lambda points, *parameters: make(*parameters).transform(points),
+        (points, *map(parameter, values)),
     )
 
 
@@ -155,7 +170,9 @@ CAMERAS = {
     "LookAt": lambda e: nmr.LookAt(e),
     "Look": lambda e: nmr.Look(e, -e.detach(), half_fov_deg=torch.full(e.shape[:-1], 40.0)),
     "Orthographic": lambda e: nmr.Orthographic(e),
-    "Pinhole": lambda e: nmr.Pinhole(CALIBRATION[0], torch.eye(3), e + 4.0, [0.1, 0, 0, 0.1, 0.2], orig_size=256),
+    "Pinhole": lambda e: nmr.Pinhole(
+        CALIBRATION[0], torch.eye(3), e + 4.0, [0.1, 0, 0, 0.1, 0.2], orig_size=256
+    ),
 }
 
 
@@ -166,7 +183,9 @@ def test_packed_is_one_by_one(name, one_camera):
     torch.manual_seed(0)
     sizes = [5, 600, 0, 33]
     meshes = [torch.rand(n, 3) - 0.5 for n in sizes]
-    eye = (torch.tensor([[0.0, 0.0, -2.0]]) + 0.1 * torch.randn(1 if one_camera else 4, 3)).requires_grad_()
+    eye = (
+        torch.tensor([[0.0, 0.0, -2.0]]) + 0.1 * torch.randn(1 if one_camera else 4, 3)
+    ).requires_grad_()
     vertices = torch.cat(meshes).requires_grad_()
     first = torch.tensor([0, *np.cumsum(sizes)])
     starts = torch.stack([first, torch.tensor([0, 3, 9, 9, 20])], dim=1)
@@ -177,7 +196,10 @@ def test_packed_is_one_by_one(name, one_camera):
     eye_sum = torch.zeros_like(eye)
     for b, mesh in enumerate(meshes):
         rows = slice(first[b], first[b + 1])
-        alone, own_eye = mesh.clone().requires_grad_(), eye[0 if one_camera else b].detach().clone().requires_grad_()
+        alone, own_eye = (
+            mesh.clone().requires_grad_(),
+            eye[0 if one_camera else b].detach().clone().requires_grad_(),
+        )
         out = camera(own_eye).transform(alone)
         out.backward(upstream[None, rows])
         assert torch.equal(out[0], packed[rows]) and torch.equal(alone.grad, vertices.grad[rows])
@@ -214,7 +236,9 @@ def test_a_right_handed_camera_shows_the_picture_flipped(make):
     vertices = vertices * (1 + 0.5 * torch.tensor([1.0, 0.3, 0.1]) * (vertices[:, :1] > 0))
     left, right = make(), make(right_handed=True)
     size = dict(image_size=32)
-    assert torch.equal(right.transform(vertices), left.transform(vertices) * torch.tensor([-1.0, 1.0, 1.0]))
+    assert torch.equal(
+        right.transform(vertices), left.transform(vertices) * torch.tensor([-1.0, 1.0, 1.0])
+    )
     depth = nmr.render_depth(vertices, faces, left, **size)
     assert depth.min() < 90
     torch.testing.assert_close(nmr.render_depth(vertices, faces, right, **size), depth.flip(2))
@@ -225,7 +249,9 @@ def test_a_right_handed_camera_shows_the_picture_flipped(make):
     torch.testing.assert_close(normals, nmr.render_normals(vertices, faces, left, **size).flip(2))
     if not isinstance(right, nmr.Orthographic):
         rotation = nmr.cameras.to_opencv(right, height=32, width=32)[1]
-        torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(len(rotation), dtype=rotation.dtype))
+        torch.testing.assert_close(
+            torch.linalg.det(rotation), torch.ones(len(rotation), dtype=rotation.dtype)
+        )
 
 
 def test_warnings_name_the_line_that_made_the_camera():
@@ -274,24 +300,48 @@ def test_vertices_without_an_image(dtype):
     fov = torch.tensor(30.0, dtype=dtype, requires_grad=True)
     vertices = torch.cat([bad, good], dim=1).requires_grad_()
     out = nmr.LookAt(eye, half_fov_deg=fov).transform(vertices)
-    assert (out[0, :6, :2] == inf).all() and out[0, :6, 2].isfinite().all() and out[0, 6:].isfinite().all()
+    assert (
+        (out[0, :6, :2] == inf).all()
+        and out[0, :6, 2].isfinite().all()
+        and out[0, 6:].isfinite().all()
+    )
     upstream = torch.ones_like(out)
     upstream[0, :6] = nan
     grads = torch.autograd.grad(out, (vertices, eye, fov), upstream)
     assert not grads[0][0, :6].any() and grads[0][0, 6:].all()
     out = nmr.LookAt(eye, half_fov_deg=fov).transform(good)
-    for a, b in zip(grads[1:], torch.autograd.grad(out, (eye, fov), torch.ones_like(out)), strict=True):
+    for a, b in zip(
+        grads[1:], torch.autograd.grad(out, (eye, fov), torch.ones_like(out)), strict=True
+    ):
         assert torch.equal(a, b)
 
 
 def test_the_optical_axis_has_a_gradient():
     """Upstream takes the root of r^2, whose derivative is not finite on the axis (defect 14, fixed)."""
-    camera = nmr.Pinhole(CALIBRATION, torch.eye(3), [0.0, 0.0, 2.0], [0.1, 0.2, 0.1, 0.2, 0.3], orig_size=256)
+    camera = nmr.Pinhole(
+        CALIBRATION, torch.eye(3), [0.0, 0.0, 2.0], [0.1, 0.2, 0.1, 0.2, 0.3], orig_size=256
+    )
     vertices = torch.zeros(1, 1, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(camera.transform, vertices)
 
 
-NASTY = [0.0, -0.0, 1.0, -1.0, 1e-45, 1e-30, 1e-7, 1e7, 1e16, 1e30, -1e30, 3.4e38, math.inf, -math.inf, math.nan]
+NASTY = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    1e-45,
+    1e-30,
+    1e-7,
+    1e7,
+    1e16,
+    1e30,
+    -1e30,
+    3.4e38,
+    math.inf,
+    -math.inf,
+    math.nan,
+]
 nasty = st.one_of(st.sampled_from(NASTY), st.floats(-2, 2, width=32), st.floats(width=32))
 
 
@@ -302,7 +352,9 @@ nasty = st.one_of(st.sampled_from(NASTY), st.floats(-2, 2, width=32), st.floats(
     hnp.arrays(np.float64, (12,), elements=nasty),
     hnp.arrays(np.float64, (9,), elements=nasty),
     hnp.arrays(np.float64, (5,), elements=nasty),
-    hnp.arrays(np.float32, (2, 5, 3), elements=st.sampled_from([0.0, 1.0, -3.0, 1e-30, 1e4, 1e20, 3e38])),
+    hnp.arrays(
+        np.float32, (2, 5, 3), elements=st.sampled_from([0.0, 1.0, -3.0, 1e-30, 1e4, 1e20, 3e38])
+    ),
 )
 def test_never_nan(dtype, vertices, pose, calibration, distortion, upstream):
     """Any vertices through any camera, with any finite upstream gradient."""
@@ -332,7 +384,11 @@ def test_never_nan(dtype, vertices, pose, calibration, distortion, upstream):
 def test_a_camera_of_ones_own_can_give_a_projection():
     class Affine(nmr.cameras.ProjectingCamera):
         def projection(self, dtype=torch.float64):
-            return Projection(torch.eye(3, 4, dtype=dtype)[None], torch.eye(2, 3, dtype=dtype)[None], perspective=False)
+            return Projection(
+                torch.eye(3, 4, dtype=dtype)[None],
+                torch.eye(2, 3, dtype=dtype)[None],
+                perspective=False,
+            )
 
     points = torch.rand(2, 3, 3)
     assert torch.equal(Affine().transform(points), points)
@@ -348,17 +404,26 @@ EYE, K = [0.0, 0.0, -2.0], torch.eye(3)
 def test_tensors_in_lists_keep_their_gradient():
     """torch.as_tensor([tensor, 0.0]) would cut them off without a word."""
     points = torch.rand(2, 3, 3, dtype=torch.float64)
-    x, z = torch.tensor(0.3, requires_grad=True), torch.tensor(-2.0, dtype=torch.float64, requires_grad=True)
-    eye = torch.tensor([[0.3, 0.0, -2.0], [0.0, 1.0, -2.0]], dtype=torch.float64, requires_grad=True)
+    x, z = (
+        torch.tensor(0.3, requires_grad=True),
+        torch.tensor(-2.0, dtype=torch.float64, requires_grad=True),
+    )
+    eye = torch.tensor(
+        [[0.3, 0.0, -2.0], [0.0, 1.0, -2.0]], dtype=torch.float64, requires_grad=True
+    )
     (expected,) = torch.autograd.grad(nmr.LookAt(eye).transform(points).sum(), eye)
     nested = nmr.LookAt([[x, 0.0, z], torch.tensor([0.0, 1.0, -2.0])])
     grad_x, grad_z = torch.autograd.grad(nested.transform(points).sum(), (x, z))
-    torch.testing.assert_close(torch.stack([grad_x.double(), grad_z]), expected[0, [0, 2]], atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(
+        torch.stack([grad_x.double(), grad_z]), expected[0, [0, 2]], atol=1e-6, rtol=1e-6
+    )
     distance = torch.tensor(2.0, requires_grad=True)
     points_from_angles([distance, 1.0], 0.0, 0.0).sum().backward()
     assert distance.grad == -1
     t = torch.tensor(2.0, requires_grad=True)
-    nmr.Pinhole(K, K, [0.0, 0.0, t], orig_size=2).transform(torch.rand(7, 3))[..., 2].sum().backward()
+    nmr.Pinhole(K, K, [0.0, 0.0, t], orig_size=2).transform(torch.rand(7, 3))[
+        ..., 2
+    ].sum().backward()
     assert t.grad == 7
 
 

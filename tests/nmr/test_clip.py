@@ -29,7 +29,15 @@ def floor(n, dtype=torch.float32, height=-1.0):
 
 def tilted(dtype=torch.float64):
     """Three faces with one, two and no corner behind the eye, seen from either side."""
-    points = [[-2, -1, -1], [2, -1.2, -1.5], [0.3, -0.4, 5], [-2, 0.9, 4], [2.5, 0.6, 3], [0.2, 0.5, -0.7], [0.1, 0, 3]]
+    points = [
+        [-2, -1, -1],
+        [2, -1.2, -1.5],
+        [0.3, -0.4, 5],
+        [-2, 0.9, 4],
+        [2.5, 0.6, 3],
+        [0.2, 0.5, -0.7],
+        [0.1, 0, 3],
+    ]
     return torch.tensor(points, dtype=dtype), torch.tensor([[0, 1, 2], [3, 5, 4], [2, 3, 6]])
 
 
@@ -42,7 +50,9 @@ def test_a_floor_under_the_eye_is_that_of_a_fine_mesh(camera, image_size):
     def draw(mesh):
         uv = (mesh[0][:, [0, 2]] + 10) / 20
         chequered = nmr.UVTexture(torch.eye(2).repeat(20, 20).unsqueeze(-1), uv)
-        images = nmr.render(*mesh, camera, outputs=("rgb", "alpha", "depth"), colors=chequered, **options)
+        images = nmr.render(
+            *mesh, camera, outputs=("rgb", "alpha", "depth"), colors=chequered, **options
+        )
         fragments = nmr.render_fragments(*mesh, camera, **options)
         return *images, fragments.interpolate(mesh[0]), fragments.normals()
 
@@ -55,7 +65,12 @@ def test_a_floor_under_the_eye_is_that_of_a_fine_mesh(camera, image_size):
     torch.testing.assert_close(normals, wanted[4])
     assert (rgb - wanted[0]).abs().mean() < 2e-3
     fragments = nmr.render_fragments(*coarse, camera, **options)
-    assert fragments.sided_face_index.unique().tolist() in ([-1, 1], [-1, 0, 1], [-1, 2, 3], [-1, 3])
+    assert fragments.sided_face_index.unique().tolist() in (
+        [-1, 1],
+        [-1, 0, 1],
+        [-1, 2, 3],
+        [-1, 3],
+    )
     torch.testing.assert_close(fragments.weights.sum(-1), alpha, rtol=0, atol=1e-5)
 
 
@@ -88,7 +103,10 @@ def test_a_room_from_inside():
 
 def test_one_face_is_drawn_as_its_part_in_front():
     # Cut by hand, with the same gradient by the chain rule.
-    vertices, faces = torch.tensor([[-1.0, -1.0, 4.0], [3.0, -0.5, -2.0], [0.5, 1.0, 3.0]]), torch.tensor([[0, 1, 2]])
+    vertices, faces = (
+        torch.tensor([[-1.0, -1.0, 4.0], [3.0, -0.5, -2.0], [0.5, 1.0, 3.0]]),
+        torch.tensor([[0, 1, 2]]),
+    )
     vertices, near = vertices.double().requires_grad_(), 0.5
     eye = nmr.LookAt([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=40.0)
     a, b, c = vertices
@@ -97,7 +115,9 @@ def test_one_face_is_drawn_as_its_part_in_front():
         return p + (near - p[2]) / (q[2] - p[2]) * (q - p)
 
     parts = torch.stack([at_near(a, b), b, c, a, at_near(b, c)])
-    target = torch.rand(1, SIZE, SIZE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    target = torch.rand(
+        1, SIZE, SIZE, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     grads = []
     for points, triangles in ((vertices, faces), (parts, torch.tensor([[4, 2, 3], [4, 3, 0]]))):
         alpha = nmr.render_silhouette(points, triangles, eye, image_size=SIZE, near=near)
@@ -115,14 +135,24 @@ def test_gradients_are_the_derivative(packed):
     camera = replace(CAMERA, eye=torch.tensor([[0.02, 0.03, -0.01]], dtype=torch.float64))
 
     def draw(vertices, eye):
-        meshes = ([vertices, vertices[:6] + 0.03], [faces, faces[:2]]) if packed else (vertices, faces)
+        meshes = (
+            ([vertices, vertices[:6] + 0.03], [faces, faces[:2]]) if packed else (vertices, faces)
+        )
         seen = nmr.render_fragments(*meshes, replace(camera, eye=eye), image_size=7)
         depth = nmr.render_depth(*meshes, replace(camera, eye=eye), image_size=7)
         attributes = [values, values[:6]] if packed else values
-        return seen.weights, seen.depth.clamp_max(50), depth, seen.interpolate(attributes), seen.normals()
+        return (
+            seen.weights,
+            seen.depth.clamp_max(50),
+            depth,
+            seen.interpolate(attributes),
+            seen.normals(),
+        )
 
     covered = nmr.render_fragments(vertices, faces, camera, image_size=7)
-    assert {0, 1, 2} <= {face_index % 3 for face_index in covered.sided_face_index[covered.covered].tolist()}
+    assert {0, 1, 2} <= {
+        face_index % 3 for face_index in covered.sided_face_index[covered.covered].tolist()
+    }
     vertices.requires_grad_(), camera.eye.requires_grad_()
     assert torch.autograd.gradcheck(draw, (vertices, camera.eye), eps=1e-7, atol=1e-4, rtol=1e-4)
 
@@ -135,8 +165,12 @@ def test_faces_keep_their_numbers_and_sides():
         seen, torch.where(face_index >= 3, face_index - 3, face_index)
     )
     flipped = nmr.render_fragments(vertices, faces.flip(1), CAMERA, image_size=SIZE)
-    assert torch.equal(flipped.is_back, (face_index >= 0) & (face_index < 3)) and torch.equal(flipped.face_index, seen)
-    front = nmr.render_fragments(vertices, faces, CAMERA, image_size=SIZE, fill_back=False).sided_face_index
+    assert torch.equal(flipped.is_back, (face_index >= 0) & (face_index < 3)) and torch.equal(
+        flipped.face_index, seen
+    )
+    front = nmr.render_fragments(
+        vertices, faces, CAMERA, image_size=SIZE, fill_back=False
+    ).sided_face_index
     assert 0 < (front >= 0).sum() < (face_index >= 0).sum() and front.max() < 3
 
 
@@ -148,7 +182,10 @@ def test_scenes_in_front_of_the_plane_keep_their_bits():
     for clip in (False, True):
         outputs = ("rgb", "alpha", "depth", "normals")
         images = nmr.render(vertices, faces, camera, outputs=outputs, image_size=SIZE, clip=clip)
-        loss = sum((image * torch.linspace(-1, 1, image.numel()).view(image.shape)).sum() for image in images)
+        loss = sum(
+            (image * torch.linspace(-1, 1, image.numel()).view(image.shape)).sum()
+            for image in images
+        )
         results.append([*images, *torch.autograd.grad(loss, vertices)])
     for a, b in zip(*results, strict=True):
         assert torch.equal(a, b)
@@ -160,36 +197,51 @@ def test_a_camera_of_ones_own():
             return CAMERA.transform(vertices)
 
     vertices, faces = tilted(torch.float32)
-    vertices = torch.stack([vertices, vertices + torch.tensor([0.0, 0.0, 4.0]), 0.8 * vertices]).requires_grad_()
+    vertices = torch.stack(
+        [vertices, vertices + torch.tensor([0.0, 0.0, 4.0]), 0.8 * vertices]
+    ).requires_grad_()
     results = []
     for camera in (CAMERA, Shift()):
-        alpha, depth = nmr.render(vertices, faces, camera, outputs=("alpha", "depth"), image_size=SIZE)
+        alpha, depth = nmr.render(
+            vertices, faces, camera, outputs=("alpha", "depth"), image_size=SIZE
+        )
         results.append((alpha, depth, *torch.autograd.grad((alpha * depth).sum(), vertices)))
     for a, b in zip(*results, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(b.detach().abs().max()))
 
 
 def test_a_corner_in_the_plane_of_the_eye():
-    vertices = torch.tensor([[-1.0, -0.5, 0.0], [1.0, -0.5, 0.0], [0.0, -0.2, 3.0]], dtype=torch.float64)
+    vertices = torch.tensor(
+        [[-1.0, -0.5, 0.0], [1.0, -0.5, 0.0], [0.0, -0.2, 3.0]], dtype=torch.float64
+    )
     camera = nmr.LookAt([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=45.0)
     faces = torch.tensor([[0, 1, 2]])
     assert nmr.render_silhouette(vertices, faces, camera, image_size=SIZE, clip=False).sum() == 0
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=SIZE)
     assert fragments.covered.sum() > 100
-    torch.testing.assert_close(fragments.interpolate(vertices)[..., 2], fragments.depth * fragments.covered % 100)
+    torch.testing.assert_close(
+        fragments.interpolate(vertices)[..., 2], fragments.depth * fragments.covered % 100
+    )
 
     def depth(vertices):
         return nmr.render_depth(vertices, faces, camera, image_size=7)
 
-    assert torch.autograd.gradcheck(depth, vertices.requires_grad_(), eps=1e-7, atol=1e-4, rtol=1e-4)
+    assert torch.autograd.gradcheck(
+        depth, vertices.requires_grad_(), eps=1e-7, atol=1e-4, rtol=1e-4
+    )
 
 
 def test_near_zero():
     vertices, faces = floor(1)
     alpha = nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=0.0)
     assert torch.equal(alpha, nmr.render_silhouette(*floor(150), CAMERA, image_size=SIZE, near=0.0))
-    tiny = [nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near) for near in (1e-6, 1e-7, 1e-12)]
-    assert torch.equal(tiny[0], tiny[1]) and torch.equal(tiny[0], tiny[2]) and (tiny[0] >= alpha).all()
+    tiny = [
+        nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near)
+        for near in (1e-6, 1e-7, 1e-12)
+    ]
+    assert (
+        torch.equal(tiny[0], tiny[1]) and torch.equal(tiny[0], tiny[2]) and (tiny[0] >= alpha).all()
+    )
 
 
 @pytest.mark.parametrize(
@@ -208,8 +260,12 @@ def test_a_near_too_small_for_float32_is_warned_of(near, dtype, warned):
 
 @pytest.mark.parametrize("camera", [CAMERA, nmr.Orthographic([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])])
 def test_what_is_nearer_than_near_is_never_drawn(camera):
-    corners = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    faces = torch.tensor([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]])
+    corners = torch.tensor(
+        [[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
+    )
+    faces = torch.tensor(
+        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]]
+    )
     far_away = torch.tensor([[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]])
     for seed in range(40):
         generator = torch.Generator().manual_seed(seed)
@@ -236,7 +292,11 @@ def test_near_zero_draws_the_same_whatever_other_faces_do():
     vertices, faces = floor(1)
     how = {"image_size": SIZE, "near": 0.0}
     assert not nmr.render_silhouette(small, torch.tensor([[0, 1, 2]]), CAMERA, **how).any()
-    joint = torch.cat([vertices, small]), torch.cat([faces, torch.tensor([[0, 1, 2]]) + len(vertices)])
+    joint = (
+        torch.cat([vertices, small]),
+        torch.cat([faces, torch.tensor([[0, 1, 2]]) + len(vertices)]),
+    )
     assert torch.equal(
-        nmr.render_silhouette(*joint, CAMERA, **how), nmr.render_silhouette(vertices, faces, CAMERA, **how)
+        nmr.render_silhouette(*joint, CAMERA, **how),
+        nmr.render_silhouette(vertices, faces, CAMERA, **how),
     )

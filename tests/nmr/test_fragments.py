@@ -25,7 +25,10 @@ def test_equals_the_slow_definition(seed, fill_back, raster_size):
     leaf = vertices.clone().requires_grad_()
     weights, depth = nmr.ops.fragments(leaf, faces, None, face_index, FAR, True)
     slow_leaf = vertices.clone().requires_grad_()
-    slow = [reference.fragments(slow_leaf[b], faces, face_index[b].flip(0).long(), FAR) for b in range(2)]
+    slow = [
+        reference.fragments(slow_leaf[b], faces, face_index[b].flip(0).long(), FAR)
+        for b in range(2)
+    ]
     slow_weights, slow_depth = (torch.stack([s[n].flip(0) for s in slow]) for n in range(2))
     torch.testing.assert_close(weights, slow_weights, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(depth, slow_depth, rtol=1e-9, atol=1e-9)
@@ -33,7 +36,9 @@ def test_equals_the_slow_definition(seed, fill_back, raster_size):
     upstream = [torch.randn(t.shape, generator=g, dtype=t.dtype) for t in (weights, depth)]
     torch.autograd.backward([weights, depth], upstream)
     torch.autograd.backward([slow_weights, slow_depth], upstream)
-    torch.testing.assert_close(leaf.grad, slow_leaf.grad, rtol=1e-7, atol=1e-7 * float(slow_leaf.grad.abs().max()))
+    torch.testing.assert_close(
+        leaf.grad, slow_leaf.grad, rtol=1e-7, atol=1e-7 * float(slow_leaf.grad.abs().max())
+    )
     assert leaf.grad.any(dim=1).all()
 
 
@@ -56,4 +61,6 @@ def test_depth_image_is_the_mean_of_the_depth_of_fragments(anti_aliasing, size):
 def test_an_anti_aliased_face_index_map_is_even():
     vertices, faces = random_soup(0)
     with pytest.raises(ValueError, match=r"even size, got \[2, 9, 9\]"):
-        nmr.ops.depth_image(vertices, faces, None, face_index_of(vertices, faces, 9), True, FAR, True)
+        nmr.ops.depth_image(
+            vertices, faces, None, face_index_of(vertices, faces, 9), True, FAR, True
+        )

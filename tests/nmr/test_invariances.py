@@ -26,7 +26,12 @@ def bumpy(subdivisions, seed, scale):
     return scale * (0.6 + 0.4 * noise(len(vertices), 1, seed=seed)) * vertices, faces
 
 
-MESHES = [bumpy(2, 0, 0.9), bumpy(1, 1, 0.6), (torch.zeros(0, 3), torch.zeros(0, 3).long()), bumpy(3, 2, 0.8)]
+MESHES = [
+    bumpy(2, 0, 0.9),
+    bumpy(1, 1, 0.6),
+    (torch.zeros(0, 3), torch.zeros(0, 3).long()),
+    bumpy(3, 2, 0.8),
+]
 EYES = torch.tensor([[0.0, 0.5, -2.5], [1.5, 0.0, -2.0], [0.0, 0.0, -3.0], [-1.0, 1.0, 2.0]])
 INSIDE = 0.1 * EYES
 HARMONICS = noise(9, 3, seed=2)
@@ -34,7 +39,9 @@ LIGHTS = dict(position=(0.5, 1.0, -2.0), specular=0.3, falloff=0.1)
 
 
 def of_render(name, **how):
-    return lambda v, f, eyes, size: (getattr(nmr, name)(v, f, nmr.LookAt(eyes), image_size=size, **how),)
+    return lambda v, f, eyes, size: (
+        getattr(nmr, name)(v, f, nmr.LookAt(eyes), image_size=size, **how),
+    )
 
 
 def of_fragments(v, f, eyes, size, **how):
@@ -44,21 +51,41 @@ def of_fragments(v, f, eyes, size, **how):
 
 def of_colors(make, smooth=False):
     def draw(v, f, eyes, size, *values):
-        how = dict(lights=nmr.Lights(smooth=smooth, **LIGHTS), smooth=smooth, interpolation_gradient=True)
+        how = dict(
+            lights=nmr.Lights(smooth=smooth, **LIGHTS), smooth=smooth, interpolation_gradient=True
+        )
         each = [f] * len(v) if isinstance(v, list) and not isinstance(f, list) else f
-        how |= dict(colors=make(*values, each) if make == seams else make(*values), background=0.3, image_size=size)
-        return tuple(nmr.render(v, f, nmr.LookAt(eyes), outputs=("rgb", "alpha", "depth", "normals"), **how))
+        how |= dict(
+            colors=make(*values, each) if make == seams else make(*values),
+            background=0.3,
+            image_size=size,
+        )
+        return tuple(
+            nmr.render(v, f, nmr.LookAt(eyes), outputs=("rgb", "alpha", "depth", "normals"), **how)
+        )
 
     return draw
 
 
 def of_soft_rgb(v, f, eyes, size, colors):
-    how = dict(colors=nmr.VertexColors(colors), sigma=1e-3, gamma=0.02, faces_per_pixel=5, near=0.1, image_size=size)
+    how = dict(
+        colors=nmr.VertexColors(colors),
+        sigma=1e-3,
+        gamma=0.02,
+        faces_per_pixel=5,
+        near=0.1,
+        image_size=size,
+    )
     return tuple(nmr.render_soft(v, f, nmr.LookAt(eyes), lights=nmr.Lights(**LIGHTS), **how))
 
 
 def of_transparent(v, f, eyes, size, colors, opacity):
-    how = dict(colors=nmr.VertexColors(colors), opacity=nmr.FaceColors(opacity), faces_per_pixel=3, image_size=size)
+    how = dict(
+        colors=nmr.VertexColors(colors),
+        opacity=nmr.FaceColors(opacity),
+        faces_per_pixel=3,
+        image_size=size,
+    )
     lights = nmr.Lights(harmonics=HARMONICS, normals=Outward(), **LIGHTS)
     return tuple(nmr.render_transparent(v, f, nmr.LookAt(eyes), lights=lights, **how))
 
@@ -67,7 +94,10 @@ class Outward:
     """Normals of pixels: the directions of their places."""
 
     def sample(self, fragments):
-        return torch.stack([fragments.weights[..., 0] - 0.5, fragments.weights[..., 1], 1 + 0 * fragments.depth], -1)
+        return torch.stack(
+            [fragments.weights[..., 0] - 0.5, fragments.weights[..., 1], 1 + 0 * fragments.depth],
+            -1,
+        )
 
 
 def seams(image, uv, faces):
@@ -89,7 +119,10 @@ FUNCTIONS = {
     "faces": (of_colors(nmr.FaceColors), lambda v, f: [noise(len(f), 3)]),
     "cubes": (of_colors(nmr.TextureCubes), lambda v, f: [noise(len(f), 3, 3, 3, 3)]),
     "uv": (of_colors(nmr.UVTexture), lambda v, f: [noise(8, 6 + len(v) % 5, 3), 1.5 * v[:, :2]]),
-    "mipmaps": (of_colors(seams, True), lambda v, f: [noise(18, 16 + len(v) % 5, 3), 1.5 * v[:, :2]]),
+    "mipmaps": (
+        of_colors(seams, True),
+        lambda v, f: [noise(18, 16 + len(v) % 5, 3), 1.5 * v[:, :2]],
+    ),
 }
 NAMES = pytest.mark.parametrize("name", FUNCTIONS)
 
@@ -113,7 +146,9 @@ def outcome(name, vertices, faces, values, eyes, size=20):
     outputs = FUNCTIONS[name][0](given[0], faces, eyes, size, *given[1:])
     real, g = [x for x in outputs if x.requires_grad], torch.Generator().manual_seed(0)
     upstream = [torch.randn(x.shape[1:], generator=g).to(x).expand_as(x) for x in real]
-    grads = torch.autograd.grad(real, flat(given), upstream, allow_unused=True, materialize_grads=True)
+    grads = torch.autograd.grad(
+        real, flat(given), upstream, allow_unused=True, materialize_grads=True
+    )
     return [x.detach() for x in outputs], grads
 
 
@@ -127,7 +162,9 @@ def test_a_list_has_the_bits_of_each_mesh(name, eyes):
     """One mesh is empty; from inside, faces cross the near plane."""
     vertices, faces = map(list, zip(*MESHES, strict=True))
     values = [values_of(name, *mesh) for mesh in MESHES]
-    images, grads = outcome(name, vertices, faces, [list(x) for x in zip(*values, strict=True)], eyes)
+    images, grads = outcome(
+        name, vertices, faces, [list(x) for x in zip(*values, strict=True)], eyes
+    )
     for b, mesh in enumerate(MESHES):
         alone, own = outcome(name, *mesh, values[b], eyes[b])
         assert same_bits([x[b] for x in images], [x[0] for x in alone])
@@ -140,8 +177,14 @@ def test_a_list_has_the_bits_of_each_mesh(name, eyes):
 @pytest.mark.parametrize("batch, size", [(4, 24), (2, (150, 90))])
 def test_a_batch_has_the_bits_of_each_mesh_with_any_number_of_threads(name, batch, size):
     """Few large images are cut into blocks. Faces may be shared, or those of each image."""
-    vertices, faces = torch.stack([s * MESHES[0][0] for s in (1.0, 0.8, 0.5, 0.7)[:batch]]), MESHES[0][1]
-    values = [torch.stack([x, *(0.5 * x for _ in range(batch - 1))]) for x in values_of(name, vertices[0], faces)]
+    vertices, faces = (
+        torch.stack([s * MESHES[0][0] for s in (1.0, 0.8, 0.5, 0.7)[:batch]]),
+        MESHES[0][1],
+    )
+    values = [
+        torch.stack([x, *(0.5 * x for _ in range(batch - 1))])
+        for x in values_of(name, vertices[0], faces)
+    ]
 
     def draw(faces=faces):
         return outcome(name, vertices, faces, values, EYES[:batch], size)
@@ -165,7 +208,11 @@ def test_values_of_a_list_of_equal_sizes_equal_those_of_a_batch(name):
     values = [torch.stack([x, 0.5 * x]) for x in values_of(name, vertices[0], faces)]
     images, _ = outcome(name, vertices, faces, values, EYES[:2])
     lists = [list(x) for x in values]
-    for v, f in ((list(vertices), [faces, faces]), (list(vertices), faces), (vertices, [faces, faces])):
+    for v, f in (
+        (list(vertices), [faces, faces]),
+        (list(vertices), faces),
+        (vertices, [faces, faces]),
+    ):
         assert same_bits(outcome(name, v, f, lists, EYES[:2])[0], images)
 
 
@@ -202,7 +249,9 @@ def test_float32_is_close_to_float64(name):
     for a, b in zip((*single[0], *single[1]), (*double[0], *double[1]), strict=True):
         assert b.dtype == torch.float64 or not b.is_floating_point()
         error = (a.double() - b).abs().flatten()
-        assert error.quantile(0.98) <= 1e-3 * b.abs().max()  # a pixel at an edge may belong to the other side
+        assert (
+            error.quantile(0.98) <= 1e-3 * b.abs().max()
+        )  # a pixel at an edge may belong to the other side
 
 
 @NAMES
@@ -210,10 +259,18 @@ def test_float32_is_close_to_float64(name):
 @pytest.mark.parametrize("eyes", [EYES, INSIDE], ids=["outside", "inside"])
 def test_faces_with_a_corner_that_is_not_finite_draw_nothing_and_spoil_nothing(name, bad, eyes):
     vertices, faces = MESHES[1]
-    more = torch.cat([vertices, torch.tensor([[bad, 0.0, 0.0], [0.3, bad, bad], [0.9, 0.9, 0.0], [-0.9, 0.9, 0.0]])])
+    more = torch.cat(
+        [
+            vertices,
+            torch.tensor([[bad, 0.0, 0.0], [0.3, bad, bad], [0.9, 0.9, 0.0], [-0.9, 0.9, 0.0]]),
+        ]
+    )
     extra = torch.cat([faces, torch.tensor([[42, 44, 45], [44, 43, 45], [42, 43, 44]])])
     values, longer = values_of(name, vertices, faces), values_of(name, more, extra)
-    longer = [torch.cat([x, y[len(x) :]]) if len(y) > len(x) else x for x, y in zip(values, longer, strict=True)]
+    longer = [
+        torch.cat([x, y[len(x) :]]) if len(y) > len(x) else x
+        for x, y in zip(values, longer, strict=True)
+    ]
     images, grads = outcome(name, vertices, faces, values, eyes[0])
     spoiled, spoiled_grads = outcome(name, more, extra, longer, eyes[0])
     assert same_bits(images, spoiled)
@@ -221,7 +278,24 @@ def test_faces_with_a_corner_that_is_not_finite_draw_nothing_and_spoil_nothing(n
         assert torch.equal(a, b[: len(a)]) and not b[len(a) :].any()
 
 
-ODD = [0.0, -0.0, 1.0, -1.0, 0.5, 1e-45, 1e-30, 1e-7, 1e11, 1e30, -1e30, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan]
+ODD = [
+    0.0,
+    -0.0,
+    1.0,
+    -1.0,
+    0.5,
+    1e-45,
+    1e-30,
+    1e-7,
+    1e11,
+    1e30,
+    -1e30,
+    3.4e38,
+    -3.4e38,
+    np.inf,
+    -np.inf,
+    np.nan,
+]
 numbers = st.one_of(st.sampled_from(ODD), st.floats(-2, 2, width=32), st.floats(width=32))
 
 
@@ -235,12 +309,20 @@ numbers = st.one_of(st.sampled_from(ODD), st.floats(-2, 2, width=32), st.floats(
     st.integers(1, 12),
 )
 def test_no_mesh_and_no_camera_gives_a_nan(name, coordinates, faces, eye, double, size):
-    vertices = torch.tensor(coordinates, dtype=torch.float64).view(7, 3).to(torch.float64 if double else torch.float32)
+    vertices = (
+        torch.tensor(coordinates, dtype=torch.float64)
+        .view(7, 3)
+        .to(torch.float64 if double else torch.float32)
+    )
     faces = torch.tensor(faces, dtype=torch.long).view(-1, 3)
     values = values_of(name, noise(7, 3).to(vertices), faces)
     images, grads = outcome(name, vertices, faces, values, torch.tensor(eye), size)
     assert all(x.isfinite().all() for x in images) and not any(x.isnan().any() for x in grads)
-    assert ((images[0] >= -1e-6) & (images[0] <= 1 + 1e-6)).all() or name not in ("silhouette", "local", "soft")
+    assert ((images[0] >= -1e-6) & (images[0] <= 1 + 1e-6)).all() or name not in (
+        "silhouette",
+        "local",
+        "soft",
+    )
     used = torch.zeros(7, dtype=torch.bool)
     used[faces.flatten()] = True
     assert not grads[0][~used].any()
@@ -258,7 +340,9 @@ def test_an_upstream_gradient_that_is_not_finite_stays_in_its_image(name, bad):
         image = FUNCTIONS[name][0](given[0], faces, EYES[:2], 24, *given[1:])[0]
         upstream = torch.ones_like(image)
         upstream[0, 8:13] *= bad if spoil else 1
-        return torch.autograd.grad(image, given, upstream, allow_unused=True, materialize_grads=True)
+        return torch.autograd.grad(
+            image, given, upstream, allow_unused=True, materialize_grads=True
+        )
 
     healthy, spoiled = grads(False), grads(True)
     assert not all(x[0].isfinite().all() for x in spoiled) and same_bits(
@@ -292,7 +376,9 @@ OUTSIDE = (
 )  # the others share their code
 
 
-@pytest.mark.parametrize("name, eyes", [*((name, EYES) for name in OUTSIDE), ("depth", INSIDE), ("faces", INSIDE)])
+@pytest.mark.parametrize(
+    "name, eyes", [*((name, EYES) for name in OUTSIDE), ("depth", INSIDE), ("faces", INSIDE)]
+)
 def test_compile_and_vmap_give_the_same(name, eyes):
     vertices, faces = MESHES[1]
     values = values_of(name, vertices, faces)
@@ -339,10 +425,15 @@ def call_everything(dtype, packed):
     angles = nmr.LookAt(vertices[:, 0] + 3, up=[0.1, 1.0, 0.0])
     pinhole = nmr.Pinhole(torch.eye(3), torch.eye(3), vertices[:, 0] + 5, [0.1] * 5, orig_size=1)
     images = noise(2, 9).to(dtype).requires_grad_(), noise(2, 9, seed=1).to(dtype).requires_grad_()
-    loss = nmr.losses.smoothness_loss(vertices, nmr.edge_table(faces)) + nmr.losses.soft_iou_loss(*images)
+    loss = nmr.losses.smoothness_loss(vertices, nmr.edge_table(faces)) + nmr.losses.soft_iou_loss(
+        *images
+    )
     (loss + pinhole.transform(vertices).sum() + angles.transform(vertices).sum()).backward()
     nmr.voxelize(vertices, faces, 4)
-    positions, triangles = torch.cat([vertices, vertices[..., :1] + 3], dim=-1), faces.int()  # in clip space
+    positions, triangles = (
+        torch.cat([vertices, vertices[..., :1] + 3], dim=-1),
+        faces.int(),
+    )  # in clip space
     rast, slopes = dr.rasterize(dr.RasterizeCudaContext(), positions, triangles, (6, 7))
     (dr.antialias(rast, rast, positions, triangles).sum() + slopes.sum()).backward()
 
@@ -367,13 +458,18 @@ def test_opcheck(dtype, packed, monkeypatch):
     with Recorder() as recorder:
         call_everything(dtype, packed)
     operators = [x for x in vars(nmr.ops).values() if hasattr(x, "op")]
-    wanted = {x.op for x in operators} | {x.backward.op for x in operators if hasattr(x, "backward")}
+    wanted = {x.op for x in operators} | {
+        x.backward.op for x in operators if hasattr(x, "backward")
+    }
     assert {op for op, _ in recorder.calls} == wanted
     for (op, _), args in recorder.calls.items():
         if op.name().endswith("_backward"):
             torch.library.opcheck(op, args)
             continue
-        leaves = [x.requires_grad_() if isinstance(x, torch.Tensor) and x.is_floating_point() else x for x in args]
+        leaves = [
+            x.requires_grad_() if isinstance(x, torch.Tensor) and x.is_floating_point() else x
+            for x in args
+        ]
         torch.library.opcheck(op, leaves)
 
 
@@ -388,7 +484,9 @@ def guarded(array):
     first = ctypes.addressof(ctypes.c_char.from_buffer(block))
     for address in (first, first + page + size):
         assert _LIBC.mprotect(ctypes.c_void_p(address), page, 0) == 0
-    copy = np.frombuffer(block, array.dtype, array.size, page + size - array.nbytes).reshape(array.shape)
+    copy = np.frombuffer(block, array.dtype, array.size, page + size - array.nbytes).reshape(
+        array.shape
+    )
     copy[...] = array
     return copy
 
@@ -414,13 +512,21 @@ def test_no_kernel_reads_or_writes_outside_an_array(monkeypatch):
 
     def record(name, kernel):
         def call(**args):
-            arrays = {key: x.detach().numpy().copy() for key, x in args.items() if isinstance(x, torch.Tensor)}
+            arrays = {
+                key: x.detach().numpy().copy()
+                for key, x in args.items()
+                if isinstance(x, torch.Tensor)
+            }
             calls[name, tuple((key, x.ndim) for key, x in arrays.items())] = args | arrays
             return kernel(**args)
 
         return call
 
-    kernels = {name: getattr(_C, name) for name in dir(_C) if callable(getattr(_C, name)) and name != "free_scratch"}
+    kernels = {
+        name: getattr(_C, name)
+        for name in dir(_C)
+        if callable(getattr(_C, name)) and name != "free_scratch"
+    }
     with monkeypatch.context() as patch:
         for name, kernel in kernels.items():
             patch.setattr(_C, name, record(name, kernel))
@@ -447,4 +553,6 @@ def mostly_refused(kernels, calls):
                     accepted += 1
                 except ValueError:
                     refused += 1
-    return refused > 2000 and accepted < 0.1 * refused  # such as fewer faces, or old values of an output
+    return (
+        refused > 2000 and accepted < 0.1 * refused
+    )  # such as fewer faces, or old values of an output

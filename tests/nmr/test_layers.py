@@ -28,9 +28,14 @@ def slow_layers(vertices, faces, size, layers, fill_back):
 @pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, fill_back):
     vertices, faces = random_soup(seed, 1)
-    fragments = nmr.render_fragments(vertices, faces, image_size=20, fill_back=fill_back, faces_per_pixel=5, clip=False)
+    fragments = nmr.render_fragments(
+        vertices, faces, image_size=20, fill_back=fill_back, faces_per_pixel=5, clip=False
+    )
     face_index, depth = slow_layers(vertices[0], faces, 20, 5, fill_back)
-    assert torch.equal(fragments.sided_face_index[0].long(), face_index) and (face_index[..., 1] >= 0).any()
+    assert (
+        torch.equal(fragments.sided_face_index[0].long(), face_index)
+        and (face_index[..., 1] >= 0).any()
+    )
     torch.testing.assert_close(fragments.depth[0], depth, rtol=1e-9, atol=0)
 
 
@@ -54,7 +59,9 @@ def test_the_first_layer_is_what_is_seen(dtype, image_size):
 def test_of_equally_near_faces_the_first_comes_first():
     vertices = torch.tensor([[-0.9, -0.9, 2.0], [0.9, -0.9, 2.0], [0.0, 0.9, 2.0]])
     faces = torch.tensor([[0, 1, 2], [1, 2, 0], [2, 1, 0], [0, 1, 2]])
-    face_index = nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=6).sided_face_index
+    face_index = nmr.render_fragments(
+        vertices, faces, image_size=8, faces_per_pixel=6
+    ).sided_face_index
     # Faces 0, 1, 3 from their fronts, then 2 (4 + 2) from its back, where the depths have the same bits.
     middle = face_index[0, 5, 4].tolist()
     assert middle == [0, 1, 3, 6, -1, -1]
@@ -69,7 +76,10 @@ def test_a_sphere_has_two_surfaces():
     thickness = (layers.depth[..., 1] - layers.depth[..., 0])[both]
     points = layers.interpolate(vertices)
     torch.testing.assert_close(
-        points.norm(dim=-1)[layers.covered], torch.ones(int(layers.covered.sum())), atol=3e-3, rtol=0
+        points.norm(dim=-1)[layers.covered],
+        torch.ones(int(layers.covered.sum())),
+        atol=3e-3,
+        rtol=0,
     )
     assert 1.9 < thickness.max() <= 2 and thickness.min() >= 0
     normals = layers.normals(smooth=True)
@@ -82,10 +92,14 @@ def test_a_sphere_has_two_surfaces():
 def test_gradients_are_the_derivative():
     vertices, faces = random_soup(1, 1)
     faces = faces[:8]
-    values = torch.rand(vertices.shape[1], 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    values = torch.rand(
+        vertices.shape[1], 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
 
     def draw(vertices):
         layers = nmr.render_fragments(vertices, faces, image_size=6, faces_per_pixel=3)
         return layers.weights, layers.depth, layers.interpolate(values)
 
-    assert torch.autograd.gradcheck(draw, vertices.clone().requires_grad_(), eps=1e-7, atol=1e-5, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        draw, vertices.clone().requires_grad_(), eps=1e-7, atol=1e-5, rtol=1e-5
+    )

@@ -13,7 +13,9 @@ SIZE = dict(image_size=20, anti_aliasing=False)
 
 def bumpy_sphere(subdivisions=2):
     vertices, faces = nmr.icosphere(subdivisions)
-    noise = torch.rand(len(vertices), 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noise = torch.rand(
+        len(vertices), 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     return (0.7 + 0.3 * noise) * vertices, faces
 
 
@@ -25,15 +27,24 @@ def outward_normals(vertices, faces):
 def test_flat_light_is_that_of_the_face():
     vertices, faces = bumpy_sphere()
     direction = torch.tensor([0.5, 0.7, -0.4], dtype=torch.float64)
-    ambient_color, color = torch.tensor([0.9, 0.5, 0.1]).double(), torch.tensor([0.2, 0.6, 1.0]).double()
+    ambient_color, color = (
+        torch.tensor([0.9, 0.5, 0.1]).double(),
+        torch.tensor([0.2, 0.6, 1.0]).double(),
+    )
     lights = nmr.Lights(0.3, 0.8, direction, ambient_color, color)
-    colors = torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    rgb = nmr.render_rgb(vertices, faces, CAMERA, colors=nmr.FaceColors(colors), lights=lights, **SIZE)
+    colors = torch.rand(
+        len(faces), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    rgb = nmr.render_rgb(
+        vertices, faces, CAMERA, colors=nmr.FaceColors(colors), lights=lights, **SIZE
+    )
     index = nmr.render_face_index(vertices, faces, CAMERA, image_size=20).long()
     cosine = (outward_normals(vertices, faces) * direction).sum(-1, keepdim=True)
     expected = colors * (0.3 * ambient_color + 0.8 * color * cosine.clamp_min(0))
     assert (cosine < 0).any() and (index >= 0).sum() > 200
-    torch.testing.assert_close(rgb, torch.where((index >= 0)[..., None], expected[index.clamp_min(0)], 0.0))
+    torch.testing.assert_close(
+        rgb, torch.where((index >= 0)[..., None], expected[index.clamp_min(0)], 0.0)
+    )
 
 
 def slow_light(normal, point, eye, lamps, specular, shininess):
@@ -47,7 +58,9 @@ def slow_light(normal, point, eye, lamps, specular, shininess):
         strength = 1 / (1 + falloff * length**2) if kind == "point" else length
         cosine = (normal * ray).sum(-1, keepdim=True)
         shine = ((2 * cosine * normal - ray) * view).sum(-1, keepdim=True).relu() ** shininess
-        light = light + strength * color * (cosine.relu() + specular * torch.where(cosine > 0, shine, 0.0))
+        light = light + strength * color * (
+            cosine.relu() + specular * torch.where(cosine > 0, shine, 0.0)
+        )
     return light
 
 
@@ -69,7 +82,10 @@ def test_point_lights_and_highlights_equal_the_formula(smooth, specular):
         shininess=7.5,
     )
     lamps = [("directional", 0.6 * color, direction, 0.0)]
-    lamps += [("point", i * c, p, f) for i, c, p, f in zip((0.7, 1.5), point_color, position, (0.0, 0.4), strict=True)]
+    lamps += [
+        ("point", i * c, p, f)
+        for i, c, p, f in zip((0.7, 1.5), point_color, position, (0.0, 0.4), strict=True)
+    ]
     seen = fragments.interpolate(vertices), fragments.normals(smooth), CAMERA.eye.view(2, 1, 1, 3)
     expected = slow_light(seen[1], seen[0], seen[2], lamps, specular, 7.5)
     expected = expected + 0.2 * torch.tensor([1.0, 0.9, 0.8], dtype=torch.float64)
@@ -85,7 +101,9 @@ def test_point_lights_and_highlights_equal_the_formula(smooth, specular):
 def test_highlights_without_a_camera_and_with_one_of_your_own():
     vertices = torch.tensor([[-3.0, -3.0, 2.0], [3.0, -3.0, 2.0], [0.0, 5.0, 2.0]])
     faces, lights = torch.tensor([[0, 1, 2]]), nmr.Lights(0.0, 1.0, (0.0, 0.0, -1.0), specular=0.5)
-    assert torch.equal(nmr.render_rgb(vertices, faces, lights=lights, **SIZE), torch.full((1, 20, 20, 3), 1.5))
+    assert torch.equal(
+        nmr.render_rgb(vertices, faces, lights=lights, **SIZE), torch.full((1, 20, 20, 3), 1.5)
+    )
 
     class Mine:
         def transform(self, vertices, starts=None):
@@ -104,7 +122,9 @@ def test_highlights_without_a_camera_and_with_one_of_your_own():
 @pytest.mark.parametrize("specular", [0.0, 0.6])
 def test_every_parameter_has_its_true_derivative(smooth, specular):
     """Of a pyramid larger than the screen, with its top in sight and the light oblique to all its sides."""
-    vertices = torch.tensor([[-4.0, -4, 3], [4, -4, 3], [4.2, 4, 3], [-4, 4.5, 3], [0.1, 0.2, 2]], dtype=torch.float64)
+    vertices = torch.tensor(
+        [[-4.0, -4, 3], [4, -4, 3], [4.2, 4, 3], [-4, 4.5, 3], [0.1, 0.2, 2]], dtype=torch.float64
+    )
     faces = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     named = dict(
         ambient=torch.tensor(0.3),
@@ -124,7 +144,9 @@ def test_every_parameter_has_its_true_derivative(smooth, specular):
 
     def lit(v, colors, *values):
         fragments = nmr.render_fragments(v, faces, image_size=4)
-        return nmr.Lights(smooth=smooth, **dict(zip(named, values, strict=True))).shade(fragments, colors)
+        return nmr.Lights(smooth=smooth, **dict(zip(named, values, strict=True))).shade(
+            fragments, colors
+        )
 
     assert torch.autograd.gradcheck(lit, leaves, atol=1e-6)
 
@@ -157,14 +179,17 @@ def room_cameras(kind, count, g, right_handed):
         return nmr.LookAt(eye, eye + forward, half_fov_deg=75.0, right_handed=right_handed), eye
     R = torch.linalg.qr(torch.randn(count, 3, 3, generator=g)).Q
     R = R * torch.linalg.det(R).view(-1, 1, 1)  # some other sign of the axes
-    R = torch.where(torch.rand(count, 1, 1, generator=g) < 0.5, R, -R)  # half of the cameras mirror the world
+    R = torch.where(
+        torch.rand(count, 1, 1, generator=g) < 0.5, R, -R
+    )  # half of the cameras mirror the world
     t = -(R @ eye.unsqueeze(-1)).squeeze(-1)
     K = [[60.0, 0.0, 50.0], [0.0, 60.0, 50.0], [0.0, 0.0, 1.0]]
     return nmr.Pinhole(K, R, t, orig_size=100), eye
 
 
 @pytest.mark.parametrize(
-    "kind, foreign", [("look", False), ("wide", False), ("look", True), ("wide", True), ("pinhole", False)]
+    "kind, foreign",
+    [("look", False), ("wide", False), ("look", True), ("wide", True), ("pinhole", False)],
 )
 @pytest.mark.parametrize("right_handed", [False, True])
 @pytest.mark.parametrize("packed", [False, True])
@@ -196,7 +221,9 @@ def test_small_and_large_meshes_have_unit_normals():
                 torch.testing.assert_close(normals.double(), expected, rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("camera", [CAMERA, nmr.LookAt([0.0, 1.0, 2.5], right_handed=True)], ids=["left", "right"])
+@pytest.mark.parametrize(
+    "camera", [CAMERA, nmr.LookAt([0.0, 1.0, 2.5], right_handed=True)], ids=["left", "right"]
+)
 def test_own_normals_are_lit_as_those_of_the_mesh(camera):
     """Given at vertices or in pixels, from both sides of a surface with a hole."""
     vertices, faces = bumpy_sphere()
@@ -205,16 +232,23 @@ def test_own_normals_are_lit_as_those_of_the_mesh(camera):
     flat = torch.tensor([0.0, 0.0, 1.0]).expand(4, 4, 3)
     wanted = nmr.render_rgb(vertices, faces, camera, lights=nmr.Lights(smooth=True, **lamp), **SIZE)
     for normals in (outward, nmr.VertexColors(outward), nmr.NormalMap(flat, vertices[:, :2])):
-        own = nmr.render_rgb(vertices, faces, camera, lights=nmr.Lights(normals=normals, **lamp), **SIZE)
+        own = nmr.render_rgb(
+            vertices, faces, camera, lights=nmr.Lights(normals=normals, **lamp), **SIZE
+        )
         torch.testing.assert_close(own, wanted, rtol=1e-6, atol=1e-9)
-    tilted = nmr.render_rgb(vertices, faces, camera, lights=nmr.Lights(normals=outward.roll(1, 0), **lamp), **SIZE)
+    tilted = nmr.render_rgb(
+        vertices, faces, camera, lights=nmr.Lights(normals=outward.roll(1, 0), **lamp), **SIZE
+    )
     assert (tilted - wanted).abs().max() > 0.1
 
 
 def test_normal_maps_tilt_along_u_and_v():
     """A square in the plane z = 0 of a right-handed world; mirrored coordinates mirror the tilt."""
     vertices = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
-    faces, camera = torch.tensor([[0, 1, 2], [0, 2, 3]]), nmr.Orthographic([0.0, 0.0, 3.0], right_handed=True)
+    faces, camera = (
+        torch.tensor([[0, 1, 2], [0, 2, 3]]),
+        nmr.Orthographic([0.0, 0.0, 3.0], right_handed=True),
+    )
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=4)
     texel = torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 1.0], dtype=torch.float64), dim=0)
     for flip in (torch.tensor([1.0, 1.0]), torch.tensor([-1.0, 1.0]), torch.tensor([1.0, -1.0])):
@@ -222,12 +256,17 @@ def test_normal_maps_tilt_along_u_and_v():
         normals = nmr.NormalMap(texel.expand(2, 2, 3), uv).sample(fragments)
         wanted = texel * torch.cat([flip, torch.ones(1)])
         torch.testing.assert_close(normals, wanted.expand_as(normals).to(normals))
-    leaves = [x.clone().requires_grad_() for x in (vertices + 0.1 * torch.rand(4, 3), torch.rand(3, 3, 3).double())]
+    leaves = [
+        x.clone().requires_grad_()
+        for x in (vertices + 0.1 * torch.rand(4, 3), torch.rand(3, 3, 3).double())
+    ]
 
     def lit(v, image):
         fragments = nmr.render_fragments(v, faces, camera, image_size=4)
         normals = nmr.NormalMap(image + 0.5, vertices[:, :2])
-        return nmr.Lights(normals=normals, position=[0.5, 0.3, 2.0], specular=0.5, shininess=3.0).shade(fragments)
+        return nmr.Lights(
+            normals=normals, position=[0.5, 0.3, 2.0], specular=0.5, shininess=3.0
+        ).shade(fragments)
 
     assert torch.autograd.gradcheck(lit, leaves, eps=1e-7, atol=1e-5)
 
@@ -238,7 +277,9 @@ def test_spherical_harmonics_are_orthonormal_and_in_their_order():
     z = (2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1
     angle, radius = torch.arange(count) * 2.399963229728653, (1 - z * z).sqrt()
     n = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
-    vertices = torch.tensor([[-3.0, -3.0, 2.0], [3.0, -3.0, 2.0], [0.0, 5.0, 2.0]], dtype=torch.float64)
+    vertices = torch.tensor(
+        [[-3.0, -3.0, 2.0], [3.0, -3.0, 2.0], [0.0, 5.0, 2.0]], dtype=torch.float64
+    )
     fragments = nmr.render_fragments(vertices, torch.tensor([[0, 2, 1]]), image_size=(100, 200))
 
     class Given:
@@ -256,7 +297,9 @@ def test_spherical_harmonics_are_orthonormal_and_in_their_order():
     products = basis @ basis.T * (4 * torch.pi / count)
     torch.testing.assert_close(products, torch.eye(9, dtype=torch.float64), rtol=0, atol=1e-3)
     x, y, z = n.unbind(-1)
-    for row, polynomial in zip(basis[1:], (y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y), strict=True):
+    for row, polynomial in zip(
+        basis[1:], (y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y), strict=True
+    ):
         assert torch.corrcoef(torch.stack([row, polynomial]))[0, 1] > 0.9999
     # A lamp far away: relu(n . z), bands 0 to 2 of which are 1/4, 1/2 z and 5/32 (3 z^2 - 1).
     lamp = z.relu()
@@ -275,7 +318,12 @@ CAMERAS = {
         torch.diag(torch.tensor([-1.0, 1.0, -1.0])), [0, 0, 3.0], orthographic=True
     ),
     "opengl": nmr.cameras.from_opengl(
-        torch.cat([torch.cat([torch.tensor(ANGLED), torch.tensor([[0.0], [0], [-3]])], 1), torch.eye(4)[3:]]),
+        torch.cat(
+            [
+                torch.cat([torch.tensor(ANGLED), torch.tensor([[0.0], [0], [-3]])], 1),
+                torch.eye(4)[3:],
+            ]
+        ),
         torch.diag(torch.tensor([1.0, 1.0, -0.1, 1.0])),
     ),
 }
@@ -286,12 +334,25 @@ def test_normals_in_camera_space_are_those_of_the_depth(camera):
     """Where depth is f(x, y), the normal towards the viewer is (df/dx, df/dy, -1), normalised."""
     vertices, faces = bumpy_sphere(1)
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=64)
-    normals, depth, index = fragments.normals(space="camera")[0], fragments.depth[0], fragments.face_index[0]
-    same = (index[1:-1, 1:-1] >= 0) & (index[1:-1, 2:] == index[1:-1, :-2]) & (index[2:, 1:-1] == index[:-2, 1:-1])
+    normals, depth, index = (
+        fragments.normals(space="camera")[0],
+        fragments.depth[0],
+        fragments.face_index[0],
+    )
+    same = (
+        (index[1:-1, 1:-1] >= 0)
+        & (index[1:-1, 2:] == index[1:-1, :-2])
+        & (index[2:, 1:-1] == index[:-2, 1:-1])
+    )
     same &= index[1:-1, 2:] == index[1:-1, 1:-1]
     same &= index[2:, 1:-1] == index[1:-1, 1:-1]
-    slope_x, slope_y = 16 * (depth[1:-1, 2:] - depth[1:-1, :-2]), 16 * (depth[:-2, 1:-1] - depth[2:, 1:-1])
-    wanted = torch.nn.functional.normalize(torch.stack([slope_x, slope_y, -torch.ones_like(slope_x)], -1), dim=-1)
+    slope_x, slope_y = (
+        16 * (depth[1:-1, 2:] - depth[1:-1, :-2]),
+        16 * (depth[:-2, 1:-1] - depth[2:, 1:-1]),
+    )
+    wanted = torch.nn.functional.normalize(
+        torch.stack([slope_x, slope_y, -torch.ones_like(slope_x)], -1), dim=-1
+    )
     assert same.sum() > 300
     torch.testing.assert_close(normals[1:-1, 1:-1][same], wanted[same], rtol=0, atol=1e-5)
 
@@ -301,6 +362,8 @@ def test_a_camera_that_turns_with_the_mesh_sees_the_same_normals():
     images = []
     for eye in ([0.0, 0.0, -3.0], [0.0, 0.0, 3.0]):
         turned = vertices * torch.tensor([1.0, 1.0, 1.0] if eye[2] < 0 else [-1.0, 1.0, -1.0])
-        images.append(nmr.render_normals(turned, faces, nmr.LookAt(eye), smooth=True, space="camera", **SIZE))
+        images.append(
+            nmr.render_normals(turned, faces, nmr.LookAt(eye), smooth=True, space="camera", **SIZE)
+        )
     torch.testing.assert_close(*images)
     assert (images[0][..., 2] <= 1e-2).all() and images[0][..., 2].min() < -0.9

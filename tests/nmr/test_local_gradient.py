@@ -15,7 +15,9 @@ def square(left, bottom, right, top, dtype=torch.float64):
 
 def gradient_of(vertices, faces, upstream, **kwargs):
     leaf = vertices.clone().requires_grad_()
-    alpha = nmr.render_silhouette(leaf, faces, image_size=tuple(upstream.shape[-2:]), **{"gradient": "local", **kwargs})
+    alpha = nmr.render_silhouette(
+        leaf, faces, image_size=tuple(upstream.shape[-2:]), **{"gradient": "local", **kwargs}
+    )
     alpha.backward(upstream.expand(alpha.shape))
     return leaf.grad
 
@@ -24,21 +26,31 @@ RECTANGLES = [(7, 16), (15, 6), (1, 9), (9, 1)]
 
 
 def noise(*shape, seed=0, dtype=torch.float64):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    return torch.randn(
+        *shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    ).to(dtype)
 
 
-@pytest.mark.parametrize("seed, size", [*((seed, (15, 15)) for seed in range(4)), *((2, size) for size in RECTANGLES)])
+@pytest.mark.parametrize(
+    "seed, size", [*((seed, (15, 15)) for seed in range(4)), *((2, size) for size in RECTANGLES)]
+)
 @pytest.mark.parametrize("anti_aliasing", [False, True])
 @pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, size, anti_aliasing, fill_back):
     vertices, faces = random_soup(seed)
     upstream = noise(2, *size, seed=seed)
     eps = (1e-4, 2.0)[seed % 2]  # 2: many ties
-    grad = gradient_of(vertices, faces, upstream, anti_aliasing=anti_aliasing, fill_back=fill_back, eps=eps)
+    grad = gradient_of(
+        vertices, faces, upstream, anti_aliasing=anti_aliasing, fill_back=fill_back, eps=eps
+    )
     for b in range(2):
-        index = reference.face_index(vertices[b], faces, tuple(n * (1 + anti_aliasing) for n in size), fill_back)
+        index = reference.face_index(
+            vertices[b], faces, tuple(n * (1 + anti_aliasing) for n in size), fill_back
+        )
         assert fill_back == bool((index >= len(faces)).any())  # reversed copies own pixels, too
-        expected = reference.local_gradient(vertices[b], faces, index, upstream[b], anti_aliasing, eps)
+        expected = reference.local_gradient(
+            vertices[b], faces, index, upstream[b], anti_aliasing, eps
+        )
         torch.testing.assert_close(grad[b], expected, rtol=1e-9, atol=1e-9)
     assert grad[..., :2].any() and not grad[..., 2].any()
 
@@ -79,7 +91,9 @@ def test_by_hand(values, expected):
     vertices, faces = square(*BLOCK)
     grad = gradient_of(vertices, faces, one_pixel(values), anti_aliasing=False)
     assert nmr.render_silhouette(vertices, faces, image_size=8, anti_aliasing=False).sum() == 16
-    torch.testing.assert_close(grad[0].sum(0), torch.tensor([*expected, 0.0], dtype=torch.float64), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        grad[0].sum(0), torch.tensor([*expected, 0.0], dtype=torch.float64), rtol=0, atol=1e-9
+    )
 
 
 def test_corners_share_by_their_weights_at_the_pixels_centre():
@@ -123,13 +137,19 @@ def test_reversed_faces_and_their_order_change_nothing():
     grad = gradient_of(vertices, faces, upstream)
     order = torch.randperm(len(faces), generator=torch.Generator().manual_seed(0))
     for other in (faces.flip(1), faces[order], faces.roll(1, 1)):
-        torch.testing.assert_close(gradient_of(vertices, other, upstream), grad, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(
+            gradient_of(vertices, other, upstream), grad, rtol=1e-9, atol=1e-9
+        )
     assert grad.any()
 
 
 def test_a_gradient_that_is_not_a_number_is_passed_on():
     vertices, faces = square(*BLOCK)
-    assert gradient_of(vertices, faces, one_pixel({(2, 5): float("nan")}), anti_aliasing=False)[..., 0].isnan().any()
+    assert (
+        gradient_of(vertices, faces, one_pixel({(2, 5): float("nan")}), anti_aliasing=False)[..., 0]
+        .isnan()
+        .any()
+    )
 
 
 def test_together_with_other_images():
@@ -139,7 +159,9 @@ def test_together_with_other_images():
     alone = nmr.render_silhouette(vertices, faces, image_size=16, gradient="local")
     (wanted,) = torch.autograd.grad((alone * ramp).sum(), vertices)
     for name in ("alpha", "rgb"):
-        outputs = nmr.render(vertices, faces, outputs=(name, "depth"), image_size=16, gradient="local")
+        outputs = nmr.render(
+            vertices, faces, outputs=(name, "depth"), image_size=16, gradient="local"
+        )
         image = outputs.alpha if name == "alpha" else outputs.rgb.mean(-1)
         (got,) = torch.autograd.grad((image * ramp).sum(), vertices)
         torch.testing.assert_close(got, wanted)
@@ -149,14 +171,20 @@ def test_together_with_other_images():
 def scene_of(name):
     """Vertices in renderer space [B, V, 3] (of a pair of meshes if packed), faces, and whether depth is perspective."""
     vertices, faces = random_soup(3)
-    if name == "spheres":  # one behind the other, without perspective, with faces smaller than a pixel
+    if (
+        name == "spheres"
+    ):  # one behind the other, without perspective, with faces smaller than a pixel
         ball, faces = nmr.icosphere(5)
-        pair = [0.6 * ball.double() + torch.tensor(at) for at in ([-0.2, 0.1, 2.0], [0.3, -0.1, 3.5])]
+        pair = [
+            0.6 * ball.double() + torch.tensor(at) for at in ([-0.2, 0.1, 2.0], [0.3, -0.1, 3.5])
+        ]
         vertices, faces = torch.cat(pair)[None], torch.cat([faces, faces + len(ball)])
     return vertices, faces, name != "spheres"
 
 
-def colors_gradient(vertices, faces, index, image, upstream, anti_aliasing=False, perspective=True, background=None):
+def colors_gradient(
+    vertices, faces, index, image, upstream, anti_aliasing=False, perspective=True, background=None
+):
     leaf = vertices.clone().requires_grad_()
     settings = anti_aliasing, 1e-4, True, perspective
     nmr.ops.resolve(image, background, leaf, faces, None, index, *settings).backward(upstream)
@@ -168,7 +196,10 @@ def colors_gradient(vertices, faces, index, image, upstream, anti_aliasing=False
 @pytest.mark.parametrize("own_background", [False, True])
 def test_colors_equal_the_slow_definition(name, anti_aliasing, own_background):
     vertices, faces, perspective = scene_of(name)
-    size, batch = (10, 14) if perspective else (100, 140), len(vertices)  # in one block of rows, and in several
+    size, batch = (
+        (10, 14) if perspective else (100, 140),
+        len(vertices),
+    )  # in one block of rows, and in several
     raster = tuple(n * (1 + anti_aliasing) for n in size)
     index = nmr.ops.rasterize(vertices, faces, None, *raster, True, 0.1, 100.0, perspective)
     image, upstream = noise(batch, *raster, 3), noise(batch, *size, 3, seed=1)
@@ -178,7 +209,14 @@ def test_colors_equal_the_slow_definition(name, anti_aliasing, own_background):
     if own_background:
         image = torch.where(index[..., None] >= 0, image, background[:, None, None])
     for b in range(batch):
-        from_below = index[b].long().flip(0), upstream[b], anti_aliasing, 1e-4, image[b].flip(0), perspective
+        from_below = (
+            index[b].long().flip(0),
+            upstream[b],
+            anti_aliasing,
+            1e-4,
+            image[b].flip(0),
+            perspective,
+        )
         expected = reference.local_gradient(vertices[b], faces, *from_below)
         torch.testing.assert_close(grad[b], expected, rtol=1e-9, atol=1e-9)
     assert grad[..., :2].any() and not grad[..., 2].any()
@@ -203,7 +241,12 @@ def test_only_the_surface_in_front_moves(distance, moves):
     colors = torch.tensor([1.0] * 4 + [0.25] * 4, dtype=torch.float64)[:, None]
     leaf = vertices.requires_grad_()
     image = nmr.render_rgb(
-        leaf, faces, colors=nmr.VertexColors(colors), image_size=8, anti_aliasing=False, gradient="local"
+        leaf,
+        faces,
+        colors=nmr.VertexColors(colors),
+        image_size=8,
+        anti_aliasing=False,
+        gradient="local",
     )
     assert image[0, 2, 4] == 1 and image[0, 2, 5] == 0.25
     (image[..., 0] * one_pixel({(2, 5): -1.0})).sum().backward()
@@ -221,7 +264,9 @@ def test_a_surface_has_no_end_within(subdivisions, doubled):
         vertices, faces = vertices[faces].flatten(0, 1), torch.arange(3 * len(faces)).view(-1, 3)
     leaf = (0.9 * vertices + torch.tensor([0.0, 0.0, 2.0]))[None].requires_grad_()
     colors = nmr.VertexColors(noise(len(vertices), 3, dtype=torch.float32))
-    images = nmr.render(leaf, faces, outputs=("rgb", "alpha"), colors=colors, image_size=48, gradient="local")
+    images = nmr.render(
+        leaf, faces, outputs=("rgb", "alpha"), colors=colors, image_size=48, gradient="local"
+    )
     inside = torch.nn.functional.avg_pool2d(images.alpha[None].detach(), 3, 1, 1)[0] == 1
     assert inside.any()
     (images.rgb * inside[..., None] * noise(48, 48, 3, dtype=torch.float32)).sum().backward()
@@ -237,7 +282,12 @@ def test_gradients_of_all_outputs(anti_aliasing):
 
     def grads(gradient):
         leaf, result = vertices.clone().requires_grad_(), {}
-        settings = {"colors": colors, "image_size": 16, "anti_aliasing": anti_aliasing, "gradient": gradient}
+        settings = {
+            "colors": colors,
+            "image_size": 16,
+            "anti_aliasing": anti_aliasing,
+            "gradient": gradient,
+        }
         images = nmr.render(leaf, faces, outputs=("rgb", "depth", "normals"), far=3.0, **settings)
         for name in ("rgb", "depth", "normals"):
             image = getattr(images, name)
@@ -267,11 +317,21 @@ def test_gradients_of_all_outputs(anti_aliasing):
 def test_packed_meshes_are_drawn_as_if_alone():
     meshes = [nmr.icosphere(1), nmr.icosphere(2)]
     places = [torch.tensor([-0.1, 0.0, 2.0]), torch.tensor([0.2, 0.1, 3.0])]
-    leaves = [(0.6 * v + place).double().requires_grad_() for (v, _), place in zip(meshes, places, strict=True)]
+    leaves = [
+        (0.6 * v + place).double().requires_grad_()
+        for (v, _), place in zip(meshes, places, strict=True)
+    ]
     faces, colors = [f for _, f in meshes], [noise(len(v), 3) for v, _ in meshes]
     upstream = noise(2, 16, 16, 3)
-    together = nmr.render_rgb(leaves, faces, colors=nmr.VertexColors(colors), image_size=16, gradient="local")
+    together = nmr.render_rgb(
+        leaves, faces, colors=nmr.VertexColors(colors), image_size=16, gradient="local"
+    )
     got = torch.autograd.grad(together, leaves, upstream)
     for b, leaf in enumerate(leaves):
-        alone = nmr.render_rgb(leaf, faces[b], colors=nmr.VertexColors(colors[b]), image_size=16, gradient="local")
-        assert torch.equal(got[b], torch.autograd.grad(alone, leaf, upstream[b : b + 1])[0]) and got[b].any()
+        alone = nmr.render_rgb(
+            leaf, faces[b], colors=nmr.VertexColors(colors[b]), image_size=16, gradient="local"
+        )
+        assert (
+            torch.equal(got[b], torch.autograd.grad(alone, leaf, upstream[b : b + 1])[0])
+            and got[b].any()
+        )

@@ -56,24 +56,36 @@ def plain_smoothness(vertices, edges, e=1e-6):
 def test_smoothness_equals_the_formula_and_its_derivative():
     vertices, faces = nmr.icosphere(2)
     g = torch.Generator().manual_seed(0)
-    vertices = (vertices + 0.1 * torch.randn(3, len(vertices), 3, generator=g)).double().requires_grad_()
+    vertices = (
+        (vertices + 0.1 * torch.randn(3, len(vertices), 3, generator=g)).double().requires_grad_()
+    )
     edges = nmr.edge_table(faces)
     ours, plain = smoothness_loss(vertices, edges), plain_smoothness(vertices, edges)
     torch.testing.assert_close(ours, plain, rtol=1e-12, atol=0)
     torch.testing.assert_close(
-        torch.autograd.grad(ours, vertices)[0], torch.autograd.grad(plain, vertices)[0], rtol=1e-9, atol=1e-9
+        torch.autograd.grad(ours, vertices)[0],
+        torch.autograd.grad(plain, vertices)[0],
+        rtol=1e-9,
+        atol=1e-9,
     )
 
 
 def test_same_bits_for_any_number_of_threads():
     vertices, faces = nmr.icosphere(2)
     g = torch.Generator().manual_seed(0)
-    vertices, edges = vertices + 0.1 * torch.randn(37, len(vertices), 3, generator=g), nmr.edge_table(faces)
+    vertices, edges = (
+        vertices + 0.1 * torch.randn(37, len(vertices), 3, generator=g),
+        nmr.edge_table(faces),
+    )
     images = [torch.rand(7, 5001, generator=g) for _ in range(2)]
 
     def gradients():
         leaves = [x.clone().requires_grad_() for x in (vertices, *images)]
-        losses = smoothness_loss(leaves[0], edges), soft_iou_loss(*leaves[1:]), nmr.ops.soft_iou_loss(*images)[1]
+        losses = (
+            smoothness_loss(leaves[0], edges),
+            soft_iou_loss(*leaves[1:]),
+            nmr.ops.soft_iou_loss(*images)[1],
+        )
         return losses[2], *torch.autograd.grad(losses[0] + losses[1], leaves)
 
     results = for_threads((1, 2, 5), gradients)
@@ -119,7 +131,9 @@ def test_soft_iou_of_empty_images():
     assert soft_iou_loss(torch.zeros(2, 4, 4), torch.zeros(2, 4, 4)) == 0
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.bool, torch.uint8, torch.int64, torch.float64])
+@pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.bfloat16, torch.bool, torch.uint8, torch.int64, torch.float64]
+)
 def test_soft_iou_sums_in_float32(dtype):
     """A float16 cannot hold the sum of 90,000 ones."""
     ones = torch.ones(2, 300, 300)
@@ -150,7 +164,9 @@ def test_soft_iou_is_the_formula_and_its_derivative(count, dtype):
     ours, plain = soft_iou_loss(*given), plain_iou(*exact)
     tolerance = {"rtol": 0, "atol": 1e-6 if dtype == torch.float32 else 1e-13}
     torch.testing.assert_close(ours.double(), plain, **tolerance)
-    for a, b in zip(torch.autograd.grad(ours, given), torch.autograd.grad(plain, exact), strict=True):
+    for a, b in zip(
+        torch.autograd.grad(ours, given), torch.autograd.grad(plain, exact), strict=True
+    ):
         torch.testing.assert_close(a.double() / b.abs().max(), b / b.abs().max(), **tolerance)
     (alone,) = torch.autograd.grad(soft_iou_loss(given[0], images[1].to(dtype)), given[0])
     assert torch.equal(alone, torch.autograd.grad(soft_iou_loss(*given), given)[0])
@@ -159,7 +175,9 @@ def test_soft_iou_is_the_formula_and_its_derivative(count, dtype):
 def test_soft_iou_derivatives_of_any_kind():
     """First and second ones, in forward mode, in torch.func, compiled; and opcheck."""
     g = torch.Generator().manual_seed(0)
-    prediction, target, tangent = (torch.rand(3, 20, generator=g, dtype=torch.float64) for _ in range(3))
+    prediction, target, tangent = (
+        torch.rand(3, 20, generator=g, dtype=torch.float64) for _ in range(3)
+    )
     leaves = prediction.requires_grad_(), target.requires_grad_()
     assert torch.autograd.gradcheck(soft_iou_loss, leaves, check_forward_ad=True)
     assert torch.autograd.gradgradcheck(soft_iou_loss, leaves)
@@ -169,7 +187,9 @@ def test_soft_iou_derivatives_of_any_kind():
     _, slope = torch.func.jvp(lambda p: soft_iou_loss(p, target), (prediction,), (tangent,))
     torch.testing.assert_close(slope, (gradient * tangent).sum())
     hessian = torch.func.jacrev(torch.func.grad(soft_iou_loss))(prediction, target)
-    torch.testing.assert_close(hessian, torch.func.jacrev(torch.func.grad(plain_iou))(prediction, target))
+    torch.testing.assert_close(
+        hessian, torch.func.jacrev(torch.func.grad(plain_iou))(prediction, target)
+    )
     compiled = torch.compile(soft_iou_loss, fullgraph=True, backend="aot_eager")
     leaf = prediction.detach().clone().requires_grad_()
     compiled(leaf, target).backward()
@@ -177,14 +197,21 @@ def test_soft_iou_derivatives_of_any_kind():
     for dtype in (torch.float32, torch.float64):
         images = [x.to(dtype).detach().requires_grad_() for x in (prediction, target)]
         torch.library.opcheck(nmr.ops.soft_iou_loss.op, images)
-        areas, upstream = nmr.ops.soft_iou_loss(*images)[1], torch.rand((), dtype=dtype, generator=g)
-        torch.library.opcheck(nmr.ops.soft_iou_loss.backward.op, (*images, areas, upstream, [True, False]))
+        areas, upstream = (
+            nmr.ops.soft_iou_loss(*images)[1],
+            torch.rand((), dtype=dtype, generator=g),
+        )
+        torch.library.opcheck(
+            nmr.ops.soft_iou_loss.backward.op, (*images, areas, upstream, [True, False])
+        )
 
 
 def octahedron():
     """Vertices at distance 1 on the axes; every vertex is the middle of its neighbours but for its own axis."""
     vertices = torch.cat([torch.eye(3), -torch.eye(3)]).double()
-    faces = torch.tensor([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
+    faces = torch.tensor(
+        [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    )
     return vertices, faces
 
 
@@ -192,11 +219,16 @@ def octahedron():
 @pytest.mark.parametrize("key", ["laplacian", "edge", "inflation"])
 def test_published_losses(key, dtype):
     v = load_vector("loss_extra")
-    vertices, faces = torch.from_numpy(v["vertices"]).to(dtype).requires_grad_(), torch.from_numpy(v["faces"])
+    vertices, faces = (
+        torch.from_numpy(v["vertices"]).to(dtype).requires_grad_(),
+        torch.from_numpy(v["faces"]),
+    )
     if key == "laplacian":
         loss = laplacian_loss(vertices, nmr.unique_edges(faces))
     elif key == "edge":
-        loss = 2 * edge_length_loss(vertices, nmr.unique_edges(faces))  # published: once for each face of an edge
+        loss = 2 * edge_length_loss(
+            vertices, nmr.unique_edges(faces)
+        )  # published: once for each face of an edge
     else:
         loss = inflation_loss(vertices, faces)  # published: sqrt(|n|^2 + 1e-5), which is 5e-6 more
     loss.backward()
@@ -213,7 +245,9 @@ def test_closed_forms_on_an_octahedron():
         assert laplacian_loss(x, edges).item() == pytest.approx(6 * scale**2)
         # All edges are sqrt(2) long.
         assert edge_length_loss(x, edges).item() == pytest.approx(0, abs=1e-20)
-        assert edge_length_loss(x, edges, target=scale).item() == pytest.approx(12 * (2**0.5 - 1) ** 2 * scale**2)
+        assert edge_length_loss(x, edges, target=scale).item() == pytest.approx(
+            12 * (2**0.5 - 1) ** 2 * scale**2
+        )
         assert edge_length_loss(x, edges, target=0).item() == pytest.approx(24 * scale**2)
         # Normals (+-1, +-1, +-1) / sqrt(3): those of neighbours differ in one sign.
         assert normal_consistency_loss(x, edges).item() == pytest.approx(2 / 3)
@@ -248,7 +282,11 @@ def test_normal_consistency_does_not_depend_on_the_winding():
 @pytest.mark.parametrize("loss", [laplacian_loss, edge_length_loss, normal_consistency_loss])
 def test_losses_gradcheck(loss):
     vertices, faces = nmr.icosphere(0)
-    vertices = (vertices[None] * torch.tensor([[[1.0, 0.7, 0.5]], [[0.4, 1.0, 0.9]]])).double().requires_grad_()
+    vertices = (
+        (vertices[None] * torch.tensor([[[1.0, 0.7, 0.5]], [[0.4, 1.0, 0.9]]]))
+        .double()
+        .requires_grad_()
+    )
     edges = nmr.edge_table(faces)
     torch.autograd.gradcheck(lambda x: loss(x, edges), vertices)
     torch.autograd.gradcheck(lambda x: edge_length_loss(x, edges, 0.5), vertices)

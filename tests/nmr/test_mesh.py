@@ -22,7 +22,10 @@ def test_icosphere_is_a_closed_unit_sphere(n):
 @pytest.mark.parametrize("name", ["loss_smooth_42", "loss_smooth_642"])
 def test_edge_table_finds_the_published_edges(name):
     v = load_vector(name)
-    ours = {(frozenset(e[:2]), frozenset(e[2:])) for e in nmr.edge_table(torch.from_numpy(v["faces"])).tolist()}
+    ours = {
+        (frozenset(e[:2]), frozenset(e[2:]))
+        for e in nmr.edge_table(torch.from_numpy(v["faces"])).tolist()
+    }
     assert ours == {(frozenset(e[:2]), frozenset(e[2:])) for e in v["params"].T.tolist()}
 
 
@@ -42,17 +45,23 @@ def test_edge_table_of_an_open_mesh_holds_the_inner_edges():
     assert nmr.edge_table(square, open_mesh=True).tolist() == [[0, 2, 1, 3]]
     _, faces = nmr.icosphere(1)
     assert torch.equal(nmr.edge_table(faces, open_mesh=True), nmr.edge_table(faces))
-    part, whole = (set(map(tuple, nmr.edge_table(f, open_mesh=True).tolist())) for f in (faces[1:], faces))
+    part, whole = (
+        set(map(tuple, nmr.edge_table(f, open_mesh=True).tolist())) for f in (faces[1:], faces)
+    )
     assert len(whole - part) == 3 and part < whole
     for fin in ([[0, 2, 4]], [[0, 0, 1]]):
-        with pytest.raises(ValueError, match=r"at most two faces, but [12] of .* edge .* has .*extra faces"):
+        with pytest.raises(
+            ValueError, match=r"at most two faces, but [12] of .* edge .* has .*extra faces"
+        ):
             nmr.edge_table(torch.cat([square, torch.tensor(fin)]), open_mesh=True)
 
 
 def test_unique_edges():
     _, faces = nmr.icosphere(2)
     assert torch.equal(nmr.unique_edges(faces), nmr.edge_table(faces)[:, :2])
-    fan = torch.tensor([[1, 0, 2], [1, 0, 3], [0, 1, 4], [5, 5, 0]])  # three faces at one edge; no face at all
+    fan = torch.tensor(
+        [[1, 0, 2], [1, 0, 3], [0, 1, 4], [5, 5, 0]]
+    )  # three faces at one edge; no face at all
     expected = [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [1, 2], [1, 3], [1, 4]]
     assert nmr.unique_edges(fan.int()).tolist() == expected
 
@@ -97,7 +106,9 @@ def test_normals_gradcheck(function):
 def test_normals_of_degenerate_and_of_tiny_and_huge_faces_are_finite(function, size):
     vertices = size * torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [7, 7, 7]])
     vertices.requires_grad_()
-    faces = torch.tensor([[0, 1, 2], [0, 1, 3], [0, 0, 3]])  # right-angled, collinear, two corners equal
+    faces = torch.tensor(
+        [[0, 1, 2], [0, 1, 3], [0, 0, 3]]
+    )  # right-angled, collinear, two corners equal
     normals = function(vertices, faces)
     normals.sum().backward()
     expected = torch.tensor([0.0, 0, 1 if size > 1e-18 else 0])  # the area of 1e-60 is 0 in float32
@@ -125,23 +136,41 @@ def uniform(*shape, seed=0):
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_lights_per_image(smooth):
-    parameters = [uniform(3), uniform(3, 2), uniform(3, 2, 3) - 0.5, uniform(3, 3), uniform(3, 2, 3)]
+    parameters = [
+        uniform(3),
+        uniform(3, 2),
+        uniform(3, 2, 3) - 0.5,
+        uniform(3, 3),
+        uniform(3, 2, 3),
+    ]
     parameters = [x.requires_grad_() for x in parameters]
-    together = nmr.render_rgb(VERTICES, FACES, nmr.LookAt(EYES), lights=nmr.Lights(*parameters, smooth), **SIZE)
+    together = nmr.render_rgb(
+        VERTICES, FACES, nmr.LookAt(EYES), lights=nmr.Lights(*parameters, smooth), **SIZE
+    )
     grads = torch.autograd.grad(together.square().sum(), parameters)
     for b in range(3):
         own = [x[b].detach().requires_grad_() for x in parameters]
-        alone = nmr.render_rgb(VERTICES[b], FACES[b], nmr.LookAt(EYES[b]), lights=nmr.Lights(*own, smooth), **SIZE)
+        alone = nmr.render_rgb(
+            VERTICES[b], FACES[b], nmr.LookAt(EYES[b]), lights=nmr.Lights(*own, smooth), **SIZE
+        )
         assert torch.equal(alone[0], together[b])
-        for grad, own_grad in zip(grads, torch.autograd.grad(alone.square().sum(), own), strict=True):
+        for grad, own_grad in zip(
+            grads, torch.autograd.grad(alone.square().sum(), own), strict=True
+        ):
             torch.testing.assert_close(grad[b], own_grad, rtol=1e-4, atol=1e-4)
 
 
 def test_values_of_a_batch_may_be_lists():
     vertices = torch.stack([VERTICES[0], 0.7 * VERTICES[0]])
-    image, uv, uv_faces = uniform(2, 4, 4, 3), uniform(2, 50, 2), torch.stack([FACES[0] % 50, FACES[0] % 49])
+    image, uv, uv_faces = (
+        uniform(2, 4, 4, 3),
+        uniform(2, 50, 2),
+        torch.stack([FACES[0] % 50, FACES[0] % 49]),
+    )
     stacked, lists = (
-        nmr.render_rgb(vertices, FACES[0], nmr.LookAt(EYES[:2]), colors=nmr.UVTexture(*values), **SIZE)
+        nmr.render_rgb(
+            vertices, FACES[0], nmr.LookAt(EYES[:2]), colors=nmr.UVTexture(*values), **SIZE
+        )
         for values in ((image, uv, uv_faces), (list(image), list(uv), list(uv_faces)))
     )
     assert torch.equal(stacked, lists) and stacked.any()

@@ -28,23 +28,33 @@ def test_points_lie_on_their_faces_and_carry_their_normals():
     vertices, faces = nmr.icosphere(1)
     batch = torch.stack([vertices, vertices * torch.tensor([1.0, 2, 3])])
     sample = sample_surface(batch, faces, 500, torch.Generator().manual_seed(0))
-    assert sample.points.shape == sample.normals.shape == (2, 500, 3) and sample.face_index.shape == (2, 500)
+    assert sample.points.shape == sample.normals.shape == (
+        2,
+        500,
+        3,
+    ) and sample.face_index.shape == (2, 500)
     for b in range(2):
         corners = batch[b][faces[sample.face_index[b]]]
         weights = torch.linalg.solve(corners.mT, sample.points[b])
         assert (weights > -1e-5).all()
         torch.testing.assert_close(weights.sum(1), torch.ones(500))
-        torch.testing.assert_close(sample.normals[b], nmr.face_normals(batch[b], faces)[sample.face_index[b]])
+        torch.testing.assert_close(
+            sample.normals[b], nmr.face_normals(batch[b], faces)[sample.face_index[b]]
+        )
 
 
 def test_points_are_uniform_over_the_area():
     """Two triangles of areas 1 and 3: their shares; within each, the centroid and the mean square distance to it."""
-    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 5], [3, 0, 5], [0, 2, 5]], dtype=torch.float64)
+    vertices = torch.tensor(
+        [[0.0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 5], [3, 0, 5], [0, 2, 5]], dtype=torch.float64
+    )
     faces = torch.tensor([[0, 1, 2], [3, 4, 5], [0, 0, 4]])  # the last one has no area
     count = 100_000
     points, _, face_index = sample_surface(vertices, faces, count, torch.Generator().manual_seed(0))
     assert face_index.bincount(minlength=3)[2] == 0
-    assert (face_index == 1).double().mean().item() == pytest.approx(3 / 4, abs=4 * math.sqrt(3 / 16 / count))
+    assert (face_index == 1).double().mean().item() == pytest.approx(
+        3 / 4, abs=4 * math.sqrt(3 / 16 / count)
+    )
     for f in (0, 1):
         corners, mine = vertices[faces[f]], points[face_index == f]
         assert (mine.mean(0) - corners.mean(0)).norm() < 0.02
@@ -73,7 +83,9 @@ def test_distances_equal_brute_force(search):
     torch.testing.assert_close(chamfer_distance(a, b, "l1"), (ab.mean(1) + ba.mean(1)) / 2)
     p, r = (ab < 0.08).double().mean(1), (ba < 0.08).double().mean(1)
     torch.testing.assert_close(f_score(a, b, 0.08), 2 * p * r / (p + r))
-    torch.testing.assert_close(chamfer_distance(a.float(), b.float()), chamfer_distance(a, b).float())
+    torch.testing.assert_close(
+        chamfer_distance(a.float(), b.float()), chamfer_distance(a, b).float()
+    )
     torch.testing.assert_close(chamfer_distance(a[1], b[1]), chamfer_distance(a, b)[1])
     assert f_score(a[1], b[1], 0.08).shape == ()
 

@@ -27,7 +27,12 @@ def sphere(size=0.9):
     """A sphere with shared vertices, in perspective: pos [1, V, 4], tri."""
     vertices, tri = nmr.icosphere(1)
     vertices = size * vertices.double() + torch.tensor([0.04, -0.03, -3.0])
-    columns = [2.5 * vertices[:, 0], 2.5 * vertices[:, 1], -1.2 * vertices[:, 2] - 2.2, -vertices[:, 2]]
+    columns = [
+        2.5 * vertices[:, 0],
+        2.5 * vertices[:, 1],
+        -1.2 * vertices[:, 2] - 2.2,
+        -vertices[:, 2],
+    ]
     return torch.stack(columns, dim=1).unsqueeze(0), tri
 
 
@@ -35,7 +40,9 @@ def weights_at(pos, tri, x, y):
     """Weights of all faces [F, 3] at a point of the screen, z / w [F], and whether they cover it [F]."""
     corners = pos[tri]  # [F, 3, 4]
     matrix = corners[..., [0, 1, 3]].transpose(1, 2)
-    part = torch.linalg.solve(matrix, torch.tensor([x, y, 1.0], dtype=pos.dtype).expand(len(tri), 3))
+    part = torch.linalg.solve(
+        matrix, torch.tensor([x, y, 1.0], dtype=pos.dtype).expand(len(tri), 3)
+    )
     weights = part / part.sum(1, keepdim=True)
     z, w = ((weights * corners[..., k]).sum(1) for k in (2, 3))
     # part sums to 1 / w of the point, so a positive part lies in front of the eye
@@ -57,7 +64,10 @@ def slow_rast(pos, tri, size=SIZE, layer=0):
             face = int(order[layer])
             rast[row, column] = torch.tensor([*weights[face, :2], depth[face], face + 1])
             for k, (dx, dy) in enumerate([(1e-5, 0), (0, 1e-5)]):
-                ahead, back = (weights_at(pos, tri, *centre(row + s * dy, column + s * dx, size))[0] for s in (1, -1))
+                ahead, back = (
+                    weights_at(pos, tri, *centre(row + s * dy, column + s * dx, size))[0]
+                    for s in (1, -1)
+                )
                 slopes[row, column, k::2] = ((ahead - back)[face, :2]) / 2e-5
     return rast, slopes
 
@@ -80,7 +90,11 @@ def test_range_mode_and_layers():
     ranges = torch.tensor([[4, 8], [0, 3], [2, 0]], dtype=torch.int32)
     rast, _ = dr.rasterize(CONTEXT, pos[0], tri, SIZE, ranges=ranges)
     for image, (first, count) in zip(rast, ranges.tolist(), strict=True):
-        wanted, _ = slow_rast(pos[0], tri[first : first + count]) if count else (torch.zeros_like(rast[0]), None)
+        wanted, _ = (
+            slow_rast(pos[0], tri[first : first + count])
+            if count
+            else (torch.zeros_like(rast[0]), None)
+        )
         wanted[..., 3] += first * (wanted[..., 3] > 0)
         torch.testing.assert_close(image, wanted)
     with dr.DepthPeeler(CONTEXT, pos, tri, SIZE) as peeler:
@@ -116,7 +130,9 @@ def test_gradients_of_rasterize_and_interpolate():
     corners = attr[0][tri[face]]  # of any face on background
     weights = torch.stack([rast[..., 0], rast[..., 1], 1 - rast[..., 0] - rast[..., 1]], dim=-1)
     covered = (face >= 0).unsqueeze(-1)
-    torch.testing.assert_close(out, torch.where(covered, (weights.unsqueeze(-1) * corners).sum(-2), 0))
+    torch.testing.assert_close(
+        out, torch.where(covered, (weights.unsqueeze(-1) * corners).sum(-2), 0)
+    )
     by_x = (corners[..., 0, :] - corners[..., 2, :]) * rast_db[..., :1]
     by_x = by_x + (corners[..., 1, :] - corners[..., 2, :]) * rast_db[..., 2:3]
     torch.testing.assert_close(slopes[..., ::2], torch.where(covered, by_x, 0))
@@ -130,7 +146,9 @@ def slow_texture(tex, u, v, mode):
     for row in (int(y // 1), int(y // 1) + 1):
         for column in (int(x // 1), int(x // 1) + 1):
             inside = 0 <= row < height and 0 <= column < width
-            weight = (1 - abs(x - column)) * (1 - abs(y - row)) * (1 if inside or mode != "zero" else 0)
+            weight = (
+                (1 - abs(x - column)) * (1 - abs(y - row)) * (1 if inside or mode != "zero" else 0)
+            )
             if mode == "wrap":
                 texel = tex[row % height, column % width]
             else:
@@ -160,7 +178,9 @@ def test_texture(mode):
         kernel = [min(2, side) for side in image.shape[2:]]
         levels.append(torch.nn.functional.avg_pool2d(image, kernel).permute(0, 2, 3, 1))
     smooth = dr.texture(tex, uv, uv_da, bias, boundary_mode=mode)
-    stepped = dr.texture(tex, uv, uv_da, bias, filter_mode="linear-mipmap-nearest", boundary_mode=mode)
+    stepped = dr.texture(
+        tex, uv, uv_da, bias, filter_mode="linear-mipmap-nearest", boundary_mode=mode
+    )
     nearest = dr.texture(tex, uv, filter_mode="nearest", boundary_mode=mode)
     for place in torch.cartesian_prod(*map(torch.arange, uv.shape[:3])).tolist():
         b, at = place[0], tuple(place)
@@ -171,12 +191,16 @@ def test_texture(mode):
         level = torch.linalg.matrix_norm(jacobian, 2).log2() + bias[at]
         level = min(max(float(level), 0.0), 3.0)
         low = min(int(level), 2)
-        torch.testing.assert_close(smooth[at], samples[low] + (level - low) * (samples[low + 1] - samples[low]))
+        torch.testing.assert_close(
+            smooth[at], samples[low] + (level - low) * (samples[low + 1] - samples[low])
+        )
         torch.testing.assert_close(stepped[at], samples[round(level)])
         snapped = [(x * n // 1 + 0.5) / n for x, n in zip((u, v), (4, 8), strict=True)]
         torch.testing.assert_close(nearest[at], slow_texture(tex[b], *snapped, mode))
     for mip in (dr.texture_construct_mip(tex), levels[1:]):
-        torch.testing.assert_close(dr.texture(tex, uv, uv_da, bias, mip=mip, boundary_mode=mode), smooth)
+        torch.testing.assert_close(
+            dr.texture(tex, uv, uv_da, bias, mip=mip, boundary_mode=mode), smooth
+        )
     torch.testing.assert_close(
         dr.texture(tex, uv, uv_da, bias, max_mip_level=1, boundary_mode=mode),
         dr.texture(tex, uv, uv_da, bias, mip=levels[1:2], boundary_mode=mode),
@@ -197,9 +221,15 @@ def test_cube_map():
     t, s = torch.meshgrid(*2 * [(2 * torch.arange(size) + 1) / size - 1], indexing="ij")
     one = torch.ones_like(s)
     faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
-    texels = torch.stack([torch.nn.functional.normalize(torch.stack(face, -1), dim=-1) for face in faces])[None]
-    toward = torch.nn.functional.normalize(torch.randn(1, 40, 50, 3, generator=torch.manual_seed(0)), dim=-1)
-    edges = torch.tensor([[1.0, 1.0, 0.3], [-1.0, 0.2, 1.0], [0.4, -1.0, -1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]])
+    texels = torch.stack(
+        [torch.nn.functional.normalize(torch.stack(face, -1), dim=-1) for face in faces]
+    )[None]
+    toward = torch.nn.functional.normalize(
+        torch.randn(1, 40, 50, 3, generator=torch.manual_seed(0)), dim=-1
+    )
+    edges = torch.tensor(
+        [[1.0, 1.0, 0.3], [-1.0, 0.2, 1.0], [0.4, -1.0, -1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]]
+    )
     toward[0, 0, :5] = torch.nn.functional.normalize(edges, dim=-1)
     seen = dr.texture(texels, 3 * toward, boundary_mode="cube")
     assert (seen - toward).abs().max() < 0.03
@@ -207,7 +237,9 @@ def test_cube_map():
     assert (nearest - toward).abs().max() < 0.07
     steps = 1e-5 * torch.randn(1, 40, 50, 3, generator=torch.manual_seed(1))
     assert (dr.texture(texels, toward + steps, boundary_mode="cube") - seen).abs().max() < 1e-3
-    invalid = torch.tensor([[0.0, 0.0, 0.0], [float("nan"), 1.0, 0.0]]).view(1, 1, 2, 3).requires_grad_()
+    invalid = (
+        torch.tensor([[0.0, 0.0, 0.0], [float("nan"), 1.0, 0.0]]).view(1, 1, 2, 3).requires_grad_()
+    )
     colors = dr.texture(texels, invalid, boundary_mode="cube")
     assert torch.autograd.grad(colors.sum(), invalid)[0].eq(0).all()
     assert colors.eq(0).all()
@@ -227,7 +259,9 @@ def test_sample_texture():
     uv_da[..., [1, 2]] = 0  # the axes of the ellipse are those of the pixel
     smooth = nmr.sample_texture(tex.flip(1), uv, uv_da)
     torch.testing.assert_close(smooth, dr.texture(tex, uv, uv_da))
-    with pytest.raises(ValueError, match=r"derivatives must have shape \[B, H, W, 4\], got float64 \[2, 3, 4, 2\]"):
+    with pytest.raises(
+        ValueError, match=r"derivatives must have shape \[B, H, W, 4\], got float64 \[2, 3, 4, 2\]"
+    ):
         nmr.sample_texture(tex, uv, uv)
     with pytest.raises(TypeError, match=r"uv must be a float tensor \[B, H, W, 2\], got list"):
         nmr.sample_texture(tex, [0.5, 0.5])
@@ -247,7 +281,11 @@ def slow_antialias(color, rast, pos, tri):
                 p, q = (row, column), (row + axis, column + 1 - axis)
                 if q[0] >= height or q[1] >= width or rast[p][3] == rast[q][3]:
                     continue
-                near, far = (p, q) if rast[q][3] == 0 or (rast[p][3] > 0 and rast[p][2] < rast[q][2]) else (q, p)
+                near, far = (
+                    (p, q)
+                    if rast[q][3] == 0 or (rast[p][3] > 0 and rast[p][2] < rast[q][2])
+                    else (q, p)
+                )
                 face = tri[int(rast[near][3]) - 1].tolist()
                 for k in range(3):
                     ends = {face[k - 1], face[k - 2]}
@@ -257,7 +295,9 @@ def slow_antialias(color, rast, pos, tri):
                         if ends < set(other):
                             (apex,) = set(other) - ends
                             c = screen[apex]
-                            sides.append(bool((b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])))
+                            sides.append(
+                                bool((b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0]))
+                            )
                     place = near[1] if axis == 0 else near[0]
                     line = near[0] if axis == 0 else near[1]
                     across = 1 - axis
@@ -266,7 +306,9 @@ def slow_antialias(color, rast, pos, tri):
                         continue
                     share = (line - a[across]) / (b[across] - a[across])
                     distance = abs(a[axis] + share * (b[axis] - a[axis]) - place)
-                    toward = (a[axis] + share * (b[axis] - a[axis]) - place) * (1 if near == p else -1)
+                    toward = (a[axis] + share * (b[axis] - a[axis]) - place) * (
+                        1 if near == p else -1
+                    )
                     if not 0 <= toward <= 1:
                         continue
                     to, other = (far, near) if distance > 0.5 else (near, far)
@@ -274,7 +316,9 @@ def slow_antialias(color, rast, pos, tri):
     return out
 
 
-@pytest.mark.parametrize("scene", [sphere, lambda: (triangles(9, behind=False)[0][:1], triangles(9)[1])])
+@pytest.mark.parametrize(
+    "scene", [sphere, lambda: (triangles(9, behind=False)[0][:1], triangles(9)[1])]
+)
 def test_antialias(scene):
     pos, tri = scene()
     rast, _ = dr.rasterize(CONTEXT, pos, tri, SIZE)
@@ -287,7 +331,9 @@ def test_antialias(scene):
     topology = dr.antialias_construct_topology_hash(tri)
     leaf = pos.clone().requires_grad_()
     once, twice = (
-        torch.autograd.grad(dr.antialias(color, rast, leaf, tri, topology, n)[..., 0].square().sum(), leaf)[0]
+        torch.autograd.grad(
+            dr.antialias(color, rast, leaf, tri, topology, n)[..., 0].square().sum(), leaf
+        )[0]
         for n in (1.0, 2.0)
     )
     torch.testing.assert_close(twice, 2 * once)
@@ -310,10 +356,14 @@ def test_threads_and_second_derivatives():
         image = pipeline(*inputs, tri)
         results.append([image, *torch.autograd.grad(image.square().sum(), inputs[:2])])
     torch.set_num_threads(1)
-    assert all(torch.equal(*pair) for other in results[1:] for pair in zip(results[0], other, strict=True))
+    assert all(
+        torch.equal(*pair) for other in results[1:] for pair in zip(results[0], other, strict=True)
+    )
     assert all(x.abs().sum() > 0 for x in results[0])
     with pytest.raises(RuntimeError, match="has no second derivative"):
-        torch.autograd.grad(pipeline(*inputs, tri).sum(), pos, create_graph=True)[0].sum().backward()
+        torch.autograd.grad(pipeline(*inputs, tri).sum(), pos, create_graph=True)[
+            0
+        ].sum().backward()
 
 
 def test_install_as(monkeypatch, tmp_path):
@@ -347,30 +397,65 @@ RAST = torch.zeros(1, 2, 2, 4)
 @pytest.mark.parametrize(
     "call, words",
     [
-        (lambda: dr.rasterize(None, POS, TRI, (4, 4)), "first argument must be a RasterizeCudaContext, got NoneType"),
-        (lambda: dr.rasterize(CONTEXT, POS.half(), TRI, (4, 4)), "pos must be a float32 or float64 tensor"),
-        (lambda: dr.rasterize(CONTEXT, POS[..., :3], TRI, (4, 4)), "pos must have four coordinates"),
-        (lambda: dr.rasterize(CONTEXT, POS[0], TRI, (4, 4)), r"needs ranges, an integer tensor \[B, 2\], got NoneType"),
-        (lambda: dr.rasterize(CONTEXT, POS[0], TRI, (4, 4), torch.tensor([[0, 2]])), "must lie within the 1 faces"),
+        (
+            lambda: dr.rasterize(None, POS, TRI, (4, 4)),
+            "first argument must be a RasterizeCudaContext, got NoneType",
+        ),
+        (
+            lambda: dr.rasterize(CONTEXT, POS.half(), TRI, (4, 4)),
+            "pos must be a float32 or float64 tensor",
+        ),
+        (
+            lambda: dr.rasterize(CONTEXT, POS[..., :3], TRI, (4, 4)),
+            "pos must have four coordinates",
+        ),
+        (
+            lambda: dr.rasterize(CONTEXT, POS[0], TRI, (4, 4)),
+            r"needs ranges, an integer tensor \[B, 2\], got NoneType",
+        ),
+        (
+            lambda: dr.rasterize(CONTEXT, POS[0], TRI, (4, 4), torch.tensor([[0, 2]])),
+            "must lie within the 1 faces",
+        ),
         (lambda: dr.rasterize(CONTEXT, POS, TRI[None], (4, 4)), r"tri must have shape \[F, 3\]"),
-        (lambda: dr.rasterize(CONTEXT, POS, TRI + 3, (4, 4)), "refer to vertex 3, but a mesh has 3 vertices"),
-        (lambda: dr.DepthPeeler(CONTEXT, POS, TRI, (4, 4)).rasterize_next_layer(), "inside of `with DepthPeeler"),
+        (
+            lambda: dr.rasterize(CONTEXT, POS, TRI + 3, (4, 4)),
+            "refer to vertex 3, but a mesh has 3 vertices",
+        ),
+        (
+            lambda: dr.DepthPeeler(CONTEXT, POS, TRI, (4, 4)).rasterize_next_layer(),
+            "inside of `with DepthPeeler",
+        ),
         (lambda: dr.interpolate(POS, RAST + 5, TRI), "does not belong to these faces"),
         (lambda: dr.interpolate(POS, RAST, TRI, diff_attrs=[0]), "diff_attrs needs rast_db"),
         (lambda: dr.texture(TEX, UV, filter_mode="cubic"), "filter_mode must be 'auto' or"),
-        (lambda: dr.texture(TEX, UV, filter_mode="linear-mipmap-linear"), "needs uv_da or mip_level_bias"),
-        (lambda: dr.texture(TEX, UV, boundary_mode="cube"), r"tex must have shape \[B, 6, h, h, C\]"),
+        (
+            lambda: dr.texture(TEX, UV, filter_mode="linear-mipmap-linear"),
+            "needs uv_da or mip_level_bias",
+        ),
+        (
+            lambda: dr.texture(TEX, UV, boundary_mode="cube"),
+            r"tex must have shape \[B, 6, h, h, C\]",
+        ),
         (lambda: dr.texture(TEX.expand(3, 4, 4, 1), UV), "tex must have batch size 1 or 1"),
-        (lambda: dr.texture(TEX, UV, RAST, mip=[TEX]), r"half the sides of the one before, \[1, 2, 2, 1\]"),
+        (
+            lambda: dr.texture(TEX, UV, RAST, mip=[TEX]),
+            r"half the sides of the one before, \[1, 2, 2, 1\]",
+        ),
         (lambda: dr.texture(TEX, UV, RAST, mip=3), "mip must be made by texture_construct_mip"),
         (
             lambda: dr.texture(TEX, UV, RAST, mip=dr.texture_construct_mip(TEX[:, :2])),
             r"mip belongs to a texture \[1, 2, 4, 1\]",
         ),
-        (lambda: dr.texture_construct_mip(TEX, -1), "max_mip_level must be an integer of at least 0"),
+        (
+            lambda: dr.texture_construct_mip(TEX, -1),
+            "max_mip_level must be an integer of at least 0",
+        ),
         (lambda: dr.antialias(UV, RAST, POS, TRI, 3), "topology_hash must be made by"),
         (
-            lambda: dr.antialias(UV, RAST, POS, TRI, dr.antialias_construct_topology_hash(TRI.expand(2, 3))),
+            lambda: dr.antialias(
+                UV, RAST, POS, TRI, dr.antialias_construct_topology_hash(TRI.expand(2, 3))
+            ),
             r"topology_hash belongs to faces \[2, 3\]",
         ),
     ],

@@ -28,7 +28,9 @@ SAME_SQUARES = {
     "continued lines": SQUARE.replace("f 1 ", "f 1 \\\n ").replace("v 1 1", "v \\\r\n1 1"),
     "byte order mark": "\xef\xbb\xbf" + SQUARE,
     "Latin-1": "# Gr\xf6\xdfe\no St\xfchle\n" + SQUARE,
-    "groups, points, lines": "o a\ng b\ns off\n" + SQUARE + "p 1\nl 1 2\nvp 1\ncurv 1 2\nf 1\nf 1 2\n",
+    "groups, points, lines": "o a\ng b\ns off\n"
+    + SQUARE
+    + "p 1\nl 1 2\nvp 1\ncurv 1 2\nf 1\nf 1 2\n",
     "colours and w": SQUARE.replace("0\nv", "0 0.1 0.2 0.3\nv", 1).replace("0\nv", "0 1\nv", 1),
     "normals that are missing": SQUARE.replace("f 1 2 3", "f 1//1 2//1 3//1"),
     "texture coordinates that are missing": SQUARE.replace("f 1 2 3", "f 1/1 2/2/7 3/"),
@@ -50,7 +52,9 @@ def triangles(text: str, **options: bool) -> list:
 @pytest.mark.parametrize("with_uv", [True, False])
 @pytest.mark.parametrize("chunk", [2**19, 7])
 @pytest.mark.parametrize("name", SAME_SQUARES)
-def test_the_same_square(monkeypatch: pytest.MonkeyPatch, name: str, chunk: int, with_uv: bool) -> None:
+def test_the_same_square(
+    monkeypatch: pytest.MonkeyPatch, name: str, chunk: int, with_uv: bool
+) -> None:
     monkeypatch.setattr("nmr.obj._CHUNK", chunk)
     assert triangles(SAME_SQUARES[name], with_uv=with_uv) == triangles(SQUARE)
 
@@ -118,7 +122,11 @@ def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -
     outline = np.array(OUTLINES[name])[:: -1 if turned else 1]
     for start in range(len(outline)):
         flat = np.roll(outline, start, axis=0)
-        vertices = np.column_stack([flat, flat[:, 0]]) + [4.5e6, 5e5, 100]  # in a slanted plane, at UTM coordinates
+        vertices = np.column_stack([flat, flat[:, 0]]) + [
+            4.5e6,
+            5e5,
+            100,
+        ]  # in a slanted plane, at UTM coordinates
         faces = triangulate(vertices, np.arange(len(flat)), np.array([len(flat)]))
         whole = np.cross(vertices - vertices[0], np.roll(vertices - vertices[0], -1, axis=0)).sum(0)
         parts = area(vertices, faces)
@@ -130,7 +138,10 @@ def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -
 def test_polygons_stay_in_order_and_convex_ones_are_fans() -> None:
     vertices = np.random.default_rng(0).normal(size=(9, 3))
     vertices[:5] = [[0, 0, 0], [2, 0, 0], [3, 1, 0], [2, 2, 0], [0, 2, 0]]
-    corners, sizes = np.array([5, 6, 7, 0, 1, 2, 3, 4, 8, 7, 0, 8, 0, 1, 2, 3]), np.array([3, 5, 2, 1, 1, 4])
+    corners, sizes = (
+        np.array([5, 6, 7, 0, 1, 2, 3, 4, 8, 7, 0, 8, 0, 1, 2, 3]),
+        np.array([3, 5, 2, 1, 1, 4]),
+    )
     faces = corners[triangulate(vertices, corners, sizes)]
     assert faces[:4].tolist() == [[5, 6, 7], [0, 1, 2], [0, 2, 3], [0, 3, 4]] and len(faces) == 6
     with pytest.raises(ValueError, match="missing vertex; there are 9"):
@@ -163,7 +174,9 @@ def test_images_of_materials_are_found(tmp_path: Path, case: str) -> None:
     line, image = FOUND[case]
     (tmp_path / "maps").mkdir()
     image_module.new("RGB", (4, 4), (255, 51, 0)).save(tmp_path / image)
-    (tmp_path / "A b.mtl").write_bytes(b"\xef\xbb\xbfNEWMTL red\nkd 1 0 0.5\n" + line.encode() + b"\n")
+    (tmp_path / "A b.mtl").write_bytes(
+        b"\xef\xbb\xbfNEWMTL red\nkd 1 0 0.5\n" + line.encode() + b"\n"
+    )
     path = tmp_path / "a.obj"
     path.write_text(TEXTURED.format(library="a b.MTL", used="usemtl red"))
     with warnings.catch_warnings():
@@ -171,15 +184,23 @@ def test_images_of_materials_are_found(tmp_path: Path, case: str) -> None:
         textures = nr.load_obj(path, load_texture=True)[2]
         (material,) = nmr.load_obj(path).materials
     torch.testing.assert_close(textures[0, 1, 1, 1], torch.tensor([1, 0.2, 0]))
-    assert material.name == "red" and material.color == (1, 0, 0.5) and Path(material.image).samefile(tmp_path / image)
+    assert (
+        material.name == "red"
+        and material.color == (1, 0, 0.5)
+        and Path(material.image).samefile(tmp_path / image)
+    )
 
 
-@pytest.mark.parametrize(("used", "said"), [("", "no line `usemtl`"), ("usemtl rod", r"\('rod'\) are in no library")])
+@pytest.mark.parametrize(
+    ("used", "said"), [("", "no line `usemtl`"), ("usemtl rod", r"\('rod'\) are in no library")]
+)
 def test_faces_without_a_known_material_are_said(tmp_path: Path, used: str, said: str) -> None:
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
     (tmp_path / "a.obj").write_text(TEXTURED.format(library="a.mtl", used=used))
     for read in (nmr.load_obj, lambda path: nr.load_obj(path, load_texture=True)):
-        with pytest.warns(UserWarning, match=f"1 of 1 faces stay grey.*{said}.*the libraries have 'red'"):
+        with pytest.warns(
+            UserWarning, match=f"1 of 1 faces stay grey.*{said}.*the libraries have 'red'"
+        ):
             read(tmp_path / "a.obj")
     (tmp_path / "a.mtl").unlink()
     with pytest.warns(UserWarning, match=r"a\.mtl, which is missing"):
@@ -195,10 +216,18 @@ def test_tensors_of_an_obj_file(tmp_path: Path) -> None:
     mesh = nmr.load_obj(path, dtype=torch.float64)
     moved = (mesh.vertices - mesh.vertices[0]).tolist()
     assert moved == [[0, 0, 0], [1, 0, 0], [0, 1, 0.5]] and mesh.faces.dtype == torch.int64
-    torch.testing.assert_close(mesh.colors[:2], torch.tensor([[1, 0, 0.2], [0.5] * 3], dtype=torch.float64))
-    assert mesh.uv.tolist() == [[0.5, 1]] and mesh.uv_faces.tolist() == [[0, 0, 0]] and mesh.materials == ()
+    torch.testing.assert_close(
+        mesh.colors[:2], torch.tensor([[1, 0, 0.2], [0.5] * 3], dtype=torch.float64)
+    )
+    assert (
+        mesh.uv.tolist() == [[0.5, 1]]
+        and mesh.uv_faces.tolist() == [[0, 0, 0]]
+        and mesh.materials == ()
+    )
     vertices, _ = nr.load_obj(path)
-    torch.testing.assert_close(vertices, torch.tensor([[-1, -1, -0.5], [1, -1, -0.5], [-1, 1, 0.5]]))
+    torch.testing.assert_close(
+        vertices, torch.tensor([[-1, -1, -0.5], [1, -1, -0.5], [-1, 1, 0.5]])
+    )
     with pytest.raises(ValueError, match=r"a\.obj has no faces"):
         path.write_text(CORNERS)
         nmr.load_obj(path)

@@ -28,7 +28,9 @@ def rgb(vertices, gradient="nmr"):
 # Functions of vertices [V, 3] with scalar values.
 FUNCTIONS = {
     "silhouette": lambda v: (nmr.render_silhouette(v, FACES, CAMERA, **SIZE) * RAMP).sum(),
-    "local": lambda v: (nmr.render_silhouette(v, FACES, CAMERA, gradient="local", **SIZE) * RAMP).sum(),
+    "local": lambda v: (
+        nmr.render_silhouette(v, FACES, CAMERA, gradient="local", **SIZE) * RAMP
+    ).sum(),
     "depth": lambda v: (nmr.render_depth(v, FACES, CAMERA, **SIZE) * RAMP).sum(),
     "rgb": rgb,
     "local rgb": lambda v: rgb(v, "local"),
@@ -51,9 +53,13 @@ def test_torch_func(function):
     value, pull = torch.func.vjp(function, MESHES[0])
     assert torch.equal(pull(torch.ones(()))[0], wanted[0])
     assert torch.equal(value, function(MESHES[0]))
-    assert torch.equal(torch.func.vmap(function)(MESHES), torch.stack([function(mesh) for mesh in MESHES]))
+    assert torch.equal(
+        torch.func.vmap(function)(MESHES), torch.stack([function(mesh) for mesh in MESHES])
+    )
     assert torch.equal(torch.func.vmap(torch.func.grad(function))(MESHES), wanted)
-    last = torch.func.vmap(torch.func.grad(function), in_dims=2, out_dims=2)(MESHES.permute(1, 2, 0))
+    last = torch.func.vmap(torch.func.grad(function), in_dims=2, out_dims=2)(
+        MESHES.permute(1, 2, 0)
+    )
     assert torch.equal(last.permute(2, 0, 1), wanted)
 
 
@@ -79,13 +85,18 @@ def test_forward_mode_is_an_error(function):
     with pytest.raises(RuntimeError, match=r"no forward-mode derivative.*use reverse mode"):
         torch.func.jvp(function, (SPHERE,), (SPHERE,))
     for leaf in (SPHERE, SPHERE.clone().requires_grad_()):
-        with forward_ad.dual_level(), pytest.raises(RuntimeError, match="no forward-mode derivative"):
+        with (
+            forward_ad.dual_level(),
+            pytest.raises(RuntimeError, match="no forward-mode derivative"),
+        ):
             function(forward_ad.make_dual(leaf, SPHERE))
 
 
 def test_forward_mode_of_something_else():
     """A tangent that does not pass through a renderer is right."""
-    value, tangent = torch.func.jvp(lambda s: s * FUNCTIONS["depth"](SPHERE), (torch.ones(()),), (torch.ones(()),))
+    value, tangent = torch.func.jvp(
+        lambda s: s * FUNCTIONS["depth"](SPHERE), (torch.ones(()),), (torch.ones(()),)
+    )
     assert tangent == value
 
 
@@ -133,12 +144,16 @@ image.sum().backward()
 assert vertices.grad.any()
 print("torch._dynamo" in sys.modules)
 """
-    run = subprocess.run([sys.executable, "-I", "-c", program], capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-I", "-c", program], capture_output=True, text=True, check=True
+    )
     assert run.stdout.strip() == "False"
 
 
 @pytest.mark.parametrize("kernel", ["silhouette", "silhouette_backward"])
-@pytest.mark.parametrize("differentiate", [gradient, lambda f, v: torch.func.grad(f)(v)], ids=["autograd", "func"])
+@pytest.mark.parametrize(
+    "differentiate", [gradient, lambda f, v: torch.func.grad(f)(v)], ids=["autograd", "func"]
+)
 def test_an_allocation_that_fails_in_a_kernel_is_reported_once(kernel, differentiate, monkeypatch):
     calls = []
 

@@ -15,14 +15,20 @@ from nmr.cameras import from_opengl, from_pytorch3d
 SIZE = 24
 
 
-def soup(seed: int, faces: int = 12, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
+def soup(
+    seed: int, faces: int = 12, dtype: torch.dtype = torch.float64
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Triangles around the origin, each with its own corners."""
     rng = np.random.default_rng(seed)
     centres, spread = rng.uniform(-0.7, 0.7, (faces, 1, 3)), rng.uniform(-0.7, 0.7, (faces, 3, 3))
-    return torch.tensor((centres + spread).reshape(-1, 3), dtype=dtype), torch.arange(3 * faces).reshape(-1, 3)
+    return torch.tensor((centres + spread).reshape(-1, 3), dtype=dtype), torch.arange(
+        3 * faces
+    ).reshape(-1, 3)
 
 
-def cast_rays(points: torch.Tensor, faces: torch.Tensor, size: int, near: float, far: float) -> list[list[tuple]]:
+def cast_rays(
+    points: torch.Tensor, faces: torch.Tensor, size: int, near: float, far: float
+) -> list[list[tuple]]:
     """What rays along z through the pixel centres hit: for each pixel (depth, face, weights), nearest first."""
     found = []
     for row in range(size):
@@ -47,7 +53,14 @@ def test_it_shows_what_parallel_rays_hit(seed) -> None:
     camera = nmr.Orthographic([0.3, 0.5, -3.0], scale=0.8)
     points, layers = camera.transform(vertices)[0], 3
     fragments = nmr.render_fragments(
-        vertices, faces, camera, image_size=SIZE, anti_aliasing=False, faces_per_pixel=layers, near=1.0, far=9.0
+        vertices,
+        faces,
+        camera,
+        image_size=SIZE,
+        anti_aliasing=False,
+        faces_per_pixel=layers,
+        near=1.0,
+        far=9.0,
     )
     colors = torch.rand(len(vertices), 4, dtype=vertices.dtype)
     values = fragments.interpolate(colors)[0].reshape(-1, layers, 4)
@@ -55,14 +68,23 @@ def test_it_shows_what_parallel_rays_hit(seed) -> None:
         x[0].reshape(SIZE * SIZE, layers, *x.shape[4:]).numpy()
         for x in (fragments.face_index, fragments.depth, fragments.weights)
     )
-    single = nmr.render_fragments(vertices, faces, camera, image_size=SIZE, anti_aliasing=False, near=1.0, far=9.0)
-    assert np.array_equal(single.face_index[0].reshape(-1), index[:, 0]), "the first layer is what is seen"
-    drawn = nmr.render_depth(vertices, faces, camera, image_size=SIZE, anti_aliasing=False, near=1.0, far=9.0)
+    single = nmr.render_fragments(
+        vertices, faces, camera, image_size=SIZE, anti_aliasing=False, near=1.0, far=9.0
+    )
+    assert np.array_equal(single.face_index[0].reshape(-1), index[:, 0]), (
+        "the first layer is what is seen"
+    )
+    drawn = nmr.render_depth(
+        vertices, faces, camera, image_size=SIZE, anti_aliasing=False, near=1.0, far=9.0
+    )
     assert np.array_equal(drawn[0].reshape(-1), depth[:, 0])
     hits = cast_rays(points, faces, SIZE, 1.0, 9.0)
     assert sum(len(hit) > 1 for hit in hits) > 10
     for pixel, found in enumerate(hits):
-        assert index[pixel].tolist() == [*(hit[1] for hit in found[:layers]), *[-1] * (layers - len(found))]
+        assert index[pixel].tolist() == [
+            *(hit[1] for hit in found[:layers]),
+            *[-1] * (layers - len(found)),
+        ]
         for k, (z, face, own) in enumerate(found[:layers]):
             assert depth[pixel, k] == pytest.approx(z, abs=1e-12)
             assert np.allclose(weights[pixel, k], own, atol=1e-12)
@@ -94,9 +116,14 @@ def test_gradients_are_those_of_the_definition_and_of_finite_differences(seed) -
 
     def loss(x, anti_aliased, slow=False):
         if slow:
-            weights, depth = (y.flip(0) for y in reference.fragments(x, faces, index[0].flip(0).long(), 9.0, False))
+            weights, depth = (
+                y.flip(0)
+                for y in reference.fragments(x, faces, index[0].flip(0).long(), 9.0, False)
+            )
         else:
-            weights, depth = (y[0] for y in nmr.ops.fragments(x[None], faces, None, index, 9.0, False))
+            weights, depth = (
+                y[0] for y in nmr.ops.fragments(x[None], faces, None, index, 9.0, False)
+            )
         if anti_aliased:
             image = nmr.ops.depth_image(x[None], faces, None, index, True, 9.0, False)[0]
             return (image * upstream[: SIZE // 2, : SIZE // 2, 0]).sum()
@@ -128,11 +155,16 @@ def test_faces_cut_at_the_near_plane_keep_depth_and_weights() -> None:
 
 def test_all_cameras_without_perspective_show_the_same() -> None:
     vertices, faces = soup(7, 40)
-    image_of = lambda camera: nmr.render_depth(vertices, faces, camera, image_size=SIZE, anti_aliasing=False)  # noqa: E731
+
+    def image_of(camera: object) -> torch.Tensor:
+        return nmr.render_depth(vertices, faces, camera, image_size=SIZE, anti_aliasing=False)
+
     ours = image_of(nmr.Orthographic([0.0, 0.0, 3.0], scale=0.7, right_handed=True))
     view, clip = torch.eye(4), torch.diag(torch.tensor([0.7, 0.7, -0.1, 1.0]))
     view[2, 3] = -3.0
-    theirs = from_pytorch3d(torch.diag(torch.tensor([-1.0, 1.0, -1.0])), [0.0, 0.0, 3.0], 0.7, orthographic=True)
+    theirs = from_pytorch3d(
+        torch.diag(torch.tensor([-1.0, 1.0, -1.0])), [0.0, 0.0, 3.0], 0.7, orthographic=True
+    )
     moving = _Parallel(3.0, 0.7)
     for camera in (from_opengl(view, clip), theirs, moving):
         torch.testing.assert_close(image_of(camera), ours, rtol=0, atol=1e-6)
@@ -152,8 +184,13 @@ class _Parallel:
 
 
 def test_mipmaps_of_a_tilted_square_have_one_level() -> None:
-    vertices = torch.tensor([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 3.0], [-1.0, 1.0, 3.0]])
-    faces, uv = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    vertices = torch.tensor(
+        [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 3.0], [-1.0, 1.0, 3.0]]
+    )
+    faces, uv = (
+        torch.tensor([[0, 1, 2], [0, 2, 3]]),
+        torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
+    )
     camera = nmr.Orthographic([0.0, 0.0, -2.0])
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=32, anti_aliasing=False)
     texture = nmr.UVTexture(torch.rand(256, 256, 1), uv, filter="mipmap")

@@ -55,7 +55,13 @@ def test_example(example, tmp_path, monkeypatch):
             nr.save_obj("chair.obj", vertices, faces, textures[0])
         camera = dict(K=torch.eye(3), R=torch.eye(3), t=torch.tensor([0.0, 0.0, 3.0]))
         renderer = nr.Renderer(camera_mode="look_at")
-        example.globs.update(vertices=vertices[None], faces=faces[None], textures=textures, renderer=renderer, **camera)
+        example.globs.update(
+            vertices=vertices[None],
+            faces=faces[None],
+            textures=textures,
+            renderer=renderer,
+            **camera,
+        )
     report = []
     runner = doctest.DocTestRunner(checker=_Checker())
     runner.run(example, out=report.append)
@@ -64,7 +70,14 @@ def test_example(example, tmp_path, monkeypatch):
 
 def test_every_public_function_has_an_example():
     modules = (nmr, nmr.losses, nmr.metrics)
-    public = {name for module in modules for name in module.__all__ if callable(getattr(module, name))}
+    public = {
+        name for module in modules for name in module.__all__ if callable(getattr(module, name))
+    }
     results = {"Fragments", "Images", "SurfacePoints"}  # and protocols: made by others
-    missing = public - {test.name.rpartition(".")[2] for test in EXAMPLES} - results - {"Camera", "Colors"}
+    missing = (
+        public
+        - {test.name.rpartition(".")[2] for test in EXAMPLES}
+        - results
+        - {"Camera", "Colors"}
+    )
     assert not missing

@@ -70,8 +70,16 @@ def test_the_middle_is_the_square_image(camera, size, anti_aliasing):
     assert (outside_of(wide.depth, size) == 100).all() and not outside_of(wide.alpha, size).any()
     scale = 2 if anti_aliasing else 1
     assert wide.fragments.weights.shape[1:3] == (scale * size[0], scale * size[1])
-    cut = wide.fragments.sided_face_index.unflatten(2, (-1, scale)).unflatten(1, (-1, scale)).transpose(2, 3)
-    uncut = square.fragments.sided_face_index.unflatten(2, (-1, scale)).unflatten(1, (-1, scale)).transpose(2, 3)
+    cut = (
+        wide.fragments.sided_face_index.unflatten(2, (-1, scale))
+        .unflatten(1, (-1, scale))
+        .transpose(2, 3)
+    )
+    uncut = (
+        square.fragments.sided_face_index.unflatten(2, (-1, scale))
+        .unflatten(1, (-1, scale))
+        .transpose(2, 3)
+    )
     assert torch.equal(middle_of(cut, size), uncut)
 
 
@@ -85,18 +93,28 @@ def across(vertices):
 def test_swapped_scenes_are_transposes(size, anti_aliasing):
     """In renderer space, so that nothing but the raster is at work; all outputs, with gradients, in odd sizes."""
     vertices, faces, numbers = mesh()
-    vertices = vertices * vertices.new_tensor([0.8, 0.7, 0.3]) + vertices.new_tensor([0.15, -0.1, 2.0])
+    vertices = vertices * vertices.new_tensor([0.8, 0.7, 0.3]) + vertices.new_tensor(
+        [0.15, -0.1, 2.0]
+    )
     values, background = numbers(len(vertices), 3), numbers(3)
     outputs, results = ("rgb", "alpha", "depth"), []
     weights = [numbers(1, *size, 3), numbers(1, *size) - 0.5, numbers(1, *size) - 0.5]
     for shape in (size, size[::-1]):
         leaf = (vertices.clone() if shape == size else across(vertices)).requires_grad_()
         tint = values.clone().requires_grad_()
-        winding = faces if shape == size else faces.flip(-1)  # the transposed picture is a mirror image
-        settings = dict(colors=nmr.VertexColors(tint), background=background, anti_aliasing=anti_aliasing)
-        images = nmr.render(leaf, winding, outputs=outputs, image_size=shape, eps=1e-12, fill_back=False, **settings)
+        winding = (
+            faces if shape == size else faces.flip(-1)
+        )  # the transposed picture is a mirror image
+        settings = dict(
+            colors=nmr.VertexColors(tint), background=background, anti_aliasing=anti_aliasing
+        )
+        images = nmr.render(
+            leaf, winding, outputs=outputs, image_size=shape, eps=1e-12, fill_back=False, **settings
+        )
         images = [image if shape == size else image.transpose(1, 2) for image in images]
-        sum((image * weight).sum() for image, weight in zip(images, weights, strict=True)).backward()
+        sum(
+            (image * weight).sum() for image, weight in zip(images, weights, strict=True)
+        ).backward()
         results.append((*(image.detach() for image in images), leaf.grad, tint.grad))
     assert 0.1 < results[0][1].mean() < 0.9
     *images, grad, tint = results[1]
@@ -113,7 +131,9 @@ def test_pixels_are_square(camera, size):
     camera = {
         "look_at": nmr.LookAt([0.0, 0.0, -3.0], half_fov_deg=30.0),
         "look": nmr.Look([0.0, 0.0, -3.0], half_fov_deg=30.0),
-        "orthographic": nmr.Orthographic([0.0, 0.0, -3.0], scale=math.tan(math.asin(1 / 3)) / math.tan(math.pi / 6)),
+        "orthographic": nmr.Orthographic(
+            [0.0, 0.0, -3.0], scale=math.tan(math.asin(1 / 3)) / math.tan(math.pi / 6)
+        ),
     }[camera]
     alpha = nmr.render_silhouette(vertices, faces, camera, image_size=size)[0]
     width = min(size) * math.tan(math.asin(1 / 3)) / math.tan(math.pi / 6)
@@ -128,7 +148,9 @@ def test_pixels_are_square(camera, size):
 @pytest.mark.parametrize("size", [(1, 64), (64, 1), (1, 1), (3, 8192), (8192, 3)])
 def test_extreme_shapes(size):
     """Everything is drawn and has gradients; the object covers the same part of the image."""
-    vertices = torch.tensor([[-0.8, -0.9, 2.0], [0.9, -0.8, 2.0], [0.0, 0.9, 3.0]]) * torch.tensor([1.2, 1.2, 1])
+    vertices = torch.tensor([[-0.8, -0.9, 2.0], [0.9, -0.8, 2.0], [0.0, 0.9, 3.0]]) * torch.tensor(
+        [1.2, 1.2, 1]
+    )
     vertices, faces = vertices.requires_grad_(), torch.tensor([[0, 1, 2]])
     images = nmr.render(vertices, faces, outputs=("rgb", "alpha", "depth"), image_size=size)
     assert images.alpha.shape == (1, *size) and 0.2 < images.alpha.mean() < 0.9
@@ -150,11 +172,17 @@ def sphere(batch=2):
 @pytest.mark.parametrize("perspective", [True, False])
 def test_wide_images_show_more_at_the_sides(size, mode, perspective):
     vertices, faces = sphere()
-    vertices, textures = vertices * 0.7 + torch.tensor([0.3, -0.2, 0]), torch.rand(2, 80, 2, 2, 2, 3)
+    vertices, textures = (
+        vertices * 0.7 + torch.tensor([0.3, -0.2, 0]),
+        torch.rand(2, 80, 2, 2, 2, 3),
+    )
     renderer = nr.Renderer(camera_mode=mode, image_size=16, perspective=perspective)
     square = renderer(vertices, faces, textures)
     renderer.image_size = size
     for image, wide in zip(square, renderer(vertices, faces, textures), strict=True):
         assert wide.shape[-2:] == (16, 32)
         torch.testing.assert_close(wide[..., 8:24], image, atol=1e-5, rtol=1e-5)
-    assert renderer.render_silhouettes(vertices, faces).shape == renderer.render_depth(vertices, faces).shape
+    assert (
+        renderer.render_silhouettes(vertices, faces).shape
+        == renderer.render_depth(vertices, faces).shape
+    )

@@ -27,7 +27,9 @@ def pixel_centres(size):
 
 def bumpy_sphere(seed=0, dtype=torch.float64, subdivisions=2):
     vertices, faces = nmr.icosphere(subdivisions)
-    noise = torch.rand(len(vertices), 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    noise = torch.rand(
+        len(vertices), 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     return ((0.7 + 0.3 * noise) * vertices).to(dtype), faces
 
 
@@ -44,12 +46,16 @@ def test_depth_and_weights_of_a_tilted_plane_in_perspective():
     x, y = pixel_centres(40)
     inside = fragments.covered[0]
     assert inside.sum() > 100
-    torch.testing.assert_close(fragments.depth[0][inside], (3 / (1 - x))[inside], rtol=1e-10, atol=0)
+    torch.testing.assert_close(
+        fragments.depth[0][inside], (3 / (1 - x))[inside], rtol=1e-10, atol=0
+    )
     # Perspective-correct weights interpolate what is linear in space: the points themselves.
     at_pixels = fragments.interpolate(points)[0]
     expected = torch.stack([x, y], dim=-1) * fragments.depth[0].unsqueeze(-1)
     torch.testing.assert_close(at_pixels[inside], expected[inside], rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(fragments.weights.sum(-1)[0][inside], torch.ones(int(inside.sum()), dtype=torch.float64))
+    torch.testing.assert_close(
+        fragments.weights.sum(-1)[0][inside], torch.ones(int(inside.sum()), dtype=torch.float64)
+    )
     assert not fragments.weights[0][~inside].any() and not at_pixels[~inside].any()
 
 
@@ -67,11 +73,21 @@ def test_fragments_know_front_from_back():
 
 def published_camera(v, setting):
     """The camera of a renderer_* file, its parameters as leaves, and 1, or -1 where it mirrors the world."""
-    names = [key.removeprefix("param_") for key in v if key.startswith("param_") and v[key].dtype == np.float32]
-    leaves = {name: torch.from_numpy(np.atleast_1d(v[f"param_{name}"])).requires_grad_() for name in names}
+    names = [
+        key.removeprefix("param_")
+        for key in v
+        if key.startswith("param_") and v[key].dtype == np.float32
+    ]
+    leaves = {
+        name: torch.from_numpy(np.atleast_1d(v[f"param_{name}"])).requires_grad_() for name in names
+    }
     if str(v["camera_mode"]) == "projection":
         size = leaves.pop("orig_size").item()
-        return nmr.Pinhole(*(leaves[name] for name in ("K", "R", "t", "dist_coeffs")), orig_size=size), leaves, -1
+        return (
+            nmr.Pinhole(*(leaves[name] for name in ("K", "R", "t", "dist_coeffs")), orig_size=size),
+            leaves,
+            -1,
+        )
     angle = float(setting["viewing_angle"])
     if str(v["camera_mode"]) == "look":
         return nmr.Look(leaves["eye"], leaves["camera_direction"], half_fov_deg=angle), leaves, 1
@@ -82,8 +98,14 @@ def published_camera(v, setting):
 def test_published_renderer(name):
     """The whole of it: camera, lights, texture cubes, background, depth and alpha, and every gradient."""
     v = load_vector(name)
-    setting = {key.removeprefix("renderer_"): torch.from_numpy(v[key]) for key in v if key.startswith("renderer_")}
-    vertices, textures = (torch.from_numpy(v[key]).requires_grad_() for key in ("vertices", "textures"))
+    setting = {
+        key.removeprefix("renderer_"): torch.from_numpy(v[key])
+        for key in v
+        if key.startswith("renderer_")
+    }
+    vertices, textures = (
+        torch.from_numpy(v[key]).requires_grad_() for key in ("vertices", "textures")
+    )
     camera, leaves, side = published_camera(v, setting)
     outputs = tuple(key.removeprefix("out_") for key in v if key.startswith("out_"))
     own = "rgb" in outputs  # the published render_silhouettes and render_depth use other constants
@@ -112,15 +134,24 @@ def test_published_renderer(name):
     loss = 0
     for output, image in zip(outputs, images, strict=True):
         image = image.permute(0, 3, 1, 2) if output == "rgb" else image
-        torch.testing.assert_close(image.detach(), torch.from_numpy(v[f"out_{output}"]), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(
+            image.detach(), torch.from_numpy(v[f"out_{output}"]), rtol=1e-5, atol=1e-5
+        )
         loss = loss + (image * torch.from_numpy(v[f"upstream_{output}"])).sum()
     loss.backward()
-    least = 1e-4 if side > 0 else 2e-3  # our projection rounds otherwise, and 1 / distance amplifies
+    least = (
+        1e-4 if side > 0 else 2e-3
+    )  # our projection rounds otherwise, and 1 / distance amplifies
     for name, leaf in {"vertices": vertices, "textures": textures, **leaves}.items():
         key = f"grad_{name}"
         if key in v and (own or leaf is not textures):
-            expected, contracted = torch.from_numpy(v[key]), torch.from_numpy(v.get(f"{key}_fma", v[key]))
-            assert relative(leaf.grad, expected) < max(5 * relative(contracted, expected), least), key
+            expected, contracted = (
+                torch.from_numpy(v[key]),
+                torch.from_numpy(v.get(f"{key}_fma", v[key])),
+            )
+            assert relative(leaf.grad, expected) < max(5 * relative(contracted, expected), least), (
+                key
+            )
 
 
 def test_background():
@@ -128,7 +159,10 @@ def test_background():
     for background, expected in [
         (0.25, torch.full((2, 3), 0.25)),
         ([0.1, 0.2, 0.3], torch.tensor([[0.1, 0.2, 0.3]]).expand(2, 3)),
-        (torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]), torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])),
+        (
+            torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]),
+            torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]),
+        ),
     ]:
         rgb = nmr.render_rgb(0.3 * vertices, faces, CAMERA, background=background, image_size=16)
         torch.testing.assert_close(rgb[:, 0, 0], expected.double())
@@ -154,21 +188,33 @@ def all_outputs(leaf, faces, wanted, anti_aliasing):
 def test_outputs_together_equal_outputs_alone(output, anti_aliasing):
     vertices, faces = bumpy_sphere(dtype=torch.float32)
     results = []
-    for wanted in (output,), ("alpha", "depth", output), ("fragments", "normals", "depth", "rgb", "alpha"):
+    for wanted in (
+        (output,),
+        ("alpha", "depth", output),
+        ("fragments", "normals", "depth", "rgb", "alpha"),
+    ):
         leaf = vertices.clone().requires_grad_()
-        image = getattr(all_outputs(leaf, faces, tuple(dict.fromkeys(wanted)), anti_aliasing), output)
+        image = getattr(
+            all_outputs(leaf, faces, tuple(dict.fromkeys(wanted)), anti_aliasing), output
+        )
         image.backward(torch.randn(image.shape, generator=torch.Generator().manual_seed(0)))
         results.append((image.detach(), leaf.grad))
     for image, grad in results[1:]:
         assert torch.equal(image, results[0][0]) and image.any()
-        torch.testing.assert_close(grad, results[0][1], rtol=1e-5, atol=1e-5 * float(grad.abs().max()))
+        torch.testing.assert_close(
+            grad, results[0][1], rtol=1e-5, atol=1e-5 * float(grad.abs().max())
+        )
 
 
 def test_each_output_has_a_function_of_its_own():
     vertices, faces = bumpy_sphere()
     size = dict(image_size=16)
-    images = nmr.render(vertices, faces, CAMERA, outputs=("rgb", "alpha", "depth", "normals", "fragments"), **size)
-    assert torch.equal(nmr.render(vertices, faces, CAMERA, outputs="depth", **size).depth, images.depth)
+    images = nmr.render(
+        vertices, faces, CAMERA, outputs=("rgb", "alpha", "depth", "normals", "fragments"), **size
+    )
+    assert torch.equal(
+        nmr.render(vertices, faces, CAMERA, outputs="depth", **size).depth, images.depth
+    )
     assert torch.equal(images.rgb, nmr.render_rgb(vertices, faces, CAMERA, **size))
     assert torch.equal(images.alpha, nmr.render_silhouette(vertices, faces, CAMERA, **size))
     assert torch.equal(images.depth, nmr.render_depth(vertices, faces, CAMERA, **size))
@@ -189,8 +235,12 @@ def test_rgb_and_alpha_decide_together():
     constant = dataclasses.replace(fragments, weights=fragments.weights.detach())
     shaded = nmr.VertexColors((vertices + 1) / 2).sample(constant) * nmr.Lights().shade(constant)
     covered = fragments.covered.unsqueeze(-1)
-    stacked = fragments.resolve(torch.cat([torch.where(covered, shaded, 0.3), covered.double()], dim=-1))
-    upstream = torch.randn(stacked.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    stacked = fragments.resolve(
+        torch.cat([torch.where(covered, shaded, 0.3), covered.double()], dim=-1)
+    )
+    upstream = torch.randn(
+        stacked.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     torch.autograd.backward([images.rgb, images.alpha], [upstream[..., :3], upstream[..., 3]])
     stacked.backward(upstream)
     assert torch.equal(images.rgb, stacked[..., :3]) and torch.equal(images.alpha, stacked[..., 3])
@@ -204,7 +254,9 @@ def test_images_say_what_was_not_asked_for():
     assert depth is images.depth and alpha is images.alpha and not hasattr(images, "rgb")
     assert repr(images) == "Images(depth: float64 [1, 4, 4], alpha: float64 [1, 4, 4])"
     assert len(images) == 2 and images[0] is images.depth and images[-1] is images.alpha
-    with pytest.raises(AttributeError, match=r"normals was not rendered.*outputs=\('depth', 'alpha', 'normals'\)"):
+    with pytest.raises(
+        AttributeError, match=r"normals was not rendered.*outputs=\('depth', 'alpha', 'normals'\)"
+    ):
         images.normals  # noqa: B018
     with pytest.raises(AttributeError, match="cannot be changed, so depth"):
         images.depth = depth
@@ -226,13 +278,19 @@ def test_flat_normals_point_at_the_viewer_and_are_those_of_the_faces():
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_normals_point_at_the_viewer_in_a_right_handed_world_too(smooth):
-    K, t, sides = [[1.5, 0.0, 0.5], [0.0, 1.5, 0.5], [0.0, 0.0, 1.0]], [0.0, 0.0, 3.0], torch.tensor([-1.0, 1.0, 1.0])
+    K, t, sides = (
+        [[1.5, 0.0, 0.5], [0.0, 1.5, 0.5], [0.0, 0.0, 1.0]],
+        [0.0, 0.0, 3.0],
+        torch.tensor([-1.0, 1.0, 1.0]),
+    )
     # y of a calibrated camera points down: a rotation by 180 degrees about z sees y up, and x to the left.
     right_handed = nmr.Pinhole(K, torch.diag(torch.tensor([-1.0, -1.0, 1.0])), t, orig_size=1)
     left_handed = nmr.Pinhole(K, torch.diag(torch.tensor([1.0, -1.0, 1.0])), t, orig_size=1)
     vertices, faces = bumpy_sphere()
     plain = nmr.render_normals(vertices, faces, left_handed, image_size=16, smooth=smooth)
-    mirrored = nmr.render_normals(vertices * sides, faces, right_handed, image_size=16, smooth=smooth)
+    mirrored = nmr.render_normals(
+        vertices * sides, faces, right_handed, image_size=16, smooth=smooth
+    )
     assert (plain[..., 2] < 0).sum() > 50 and not (plain[..., 2] > 0.1).any()
     torch.testing.assert_close(mirrored * sides, plain)
 
@@ -257,7 +315,9 @@ def test_depth_and_normals_have_true_derivatives(anti_aliasing):
     tilted = torch.cat([vertices, vertices[:1] * torch.tensor([1.5, 1.0, 1.2])])
     faces = torch.tensor([[0, 1, 2], [0, 1, 3]])
     for smooth in (False, True):
-        assert gradcheck(lambda v, s=smooth: nmr.render_normals(v, faces, smooth=s, **setting), tilted)
+        assert gradcheck(
+            lambda v, s=smooth: nmr.render_normals(v, faces, smooth=s, **setting), tilted
+        )
 
 
 def test_colours_move_through_weights_only_on_request():
@@ -265,7 +325,9 @@ def test_colours_move_through_weights_only_on_request():
     colors = torch.rand(3, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def rgb(v, c, gradient=True):
-        return nmr.render_rgb(v, faces, colors=nmr.VertexColors(c), image_size=3, interpolation_gradient=gradient)
+        return nmr.render_rgb(
+            v, faces, colors=nmr.VertexColors(c), image_size=3, interpolation_gradient=gradient
+        )
 
     assert gradcheck(rgb, vertices, colors)
     leaf = vertices.clone().requires_grad_()
@@ -273,7 +335,9 @@ def test_colours_move_through_weights_only_on_request():
     assert leaf.grad is None or not leaf.grad.any()
     rgb(leaf, colors, True).square().sum().backward()
     assert leaf.grad.any()
-    cubes = nmr.TextureCubes(torch.rand(1, 2, 2, 2, 3, dtype=torch.float64))  # as published, not even on request
+    cubes = nmr.TextureCubes(
+        torch.rand(1, 2, 2, 2, 3, dtype=torch.float64)
+    )  # as published, not even on request
     image = nmr.render_rgb(leaf, faces, colors=cubes, image_size=3, interpolation_gradient=True)
     assert not torch.autograd.grad(image.square().sum(), leaf)[0].any()
 

@@ -11,7 +11,9 @@ EPS = 1e-3
 
 
 def fragments_of(vertices, faces, raster_size, starts=None):
-    face_index = nmr.ops.rasterize(vertices, faces, starts, raster_size, raster_size, True, 0.1, 50.0, True)
+    face_index = nmr.ops.rasterize(
+        vertices, faces, starts, raster_size, raster_size, True, 0.1, 50.0, True
+    )
     return face_index, nmr.ops.fragments(vertices, faces, starts, face_index, 50.0, True)[0]
 
 
@@ -23,7 +25,9 @@ def with_gradients(op, *leaves, seed=1):
     """The output and the gradients of a random sum of it; every image of the batch has the same upstream gradient."""
     leaves = [t.clone().requires_grad_() for t in leaves]
     output = op(*leaves)
-    upstream = torch.randn(output.shape[1:], dtype=output.dtype, generator=torch.Generator().manual_seed(seed))
+    upstream = torch.randn(
+        output.shape[1:], dtype=output.dtype, generator=torch.Generator().manual_seed(seed)
+    )
     output.backward(upstream.expand_as(output))
     return [output.detach(), *(t.grad for t in leaves)]
 
@@ -35,7 +39,9 @@ def test_texture_cubes_equal_the_slow_definition(size, channels, texture_batch):
     face_index, weights = fragments_of(vertices, faces, 10)
     assert (face_index >= len(faces)).any() and (face_index < 0).any()
     textures = random_like((texture_batch, len(faces), size, size, size, channels))
-    colors, grad = with_gradients(lambda t: nmr.ops.texture_cubes(t, face_index, weights, None, EPS), textures)
+    colors, grad = with_gradients(
+        lambda t: nmr.ops.texture_cubes(t, face_index, weights, None, EPS), textures
+    )
 
     def slow(textures):
         out = torch.zeros(*face_index.shape, channels, dtype=torch.float64)
@@ -76,17 +82,26 @@ def test_interpolate_equals_the_formula(attribute_batch, corners_per_image, chan
     face_index, weights = fragments_of(vertices, faces, 14)
     attributes = random_like((attribute_batch, 9, channels))
     g = torch.Generator().manual_seed(0)
-    corners = torch.randint(0, 9, (2, len(faces), 3) if corners_per_image else (len(faces), 3), generator=g)
+    corners = torch.randint(
+        0, 9, (2, len(faces), 3) if corners_per_image else (len(faces), 3), generator=g
+    )
 
     def formula(attributes, weights):
         face = face_index.clamp_min(0).long() % len(faces)
         picked = torch.stack(
-            [attributes[b % attribute_batch][(corners[b] if corners_per_image else corners)[face[b]]] for b in range(2)]
+            [
+                attributes[b % attribute_batch][
+                    (corners[b] if corners_per_image else corners)[face[b]]
+                ]
+                for b in range(2)
+            ]
         )
         values = (weights[..., None] * picked).sum(-2)
         return torch.where((face_index >= 0)[..., None], values, torch.zeros_like(values))
 
-    ours = with_gradients(lambda a, w: nmr.ops.interpolate(a, corners, face_index, w, None), attributes, weights)
+    ours = with_gradients(
+        lambda a, w: nmr.ops.interpolate(a, corners, face_index, w, None), attributes, weights
+    )
     slow = with_gradients(formula, attributes, weights)
     for a, b in zip(ours, slow, strict=True):
         torch.testing.assert_close(a, b)
@@ -97,11 +112,17 @@ def test_interpolate_computes_only_the_gradients_asked_for(of_attributes, of_wei
     vertices, faces = random_soup(2)
     face_index, weights = fragments_of(vertices, faces, 12)
     attributes = random_like((1, 36, 3))
-    both = with_gradients(lambda a, w: nmr.ops.interpolate(a, faces, face_index, w, None), attributes, weights)[1:]
+    both = with_gradients(
+        lambda a, w: nmr.ops.interpolate(a, faces, face_index, w, None), attributes, weights
+    )[1:]
     attributes.requires_grad_(of_attributes)
     weights.requires_grad_(of_weights)
     output = nmr.ops.interpolate(attributes, faces, face_index, weights, None)
-    upstream = torch.randn(output.shape[1:], dtype=output.dtype, generator=torch.Generator().manual_seed(1))
+    upstream = torch.randn(
+        output.shape[1:], dtype=output.dtype, generator=torch.Generator().manual_seed(1)
+    )
     output.backward(upstream.expand_as(output))
-    for leaf, asked, expected in zip((attributes, weights), (of_attributes, of_weights), both, strict=True):
+    for leaf, asked, expected in zip(
+        (attributes, weights), (of_attributes, of_weights), both, strict=True
+    ):
         assert torch.equal(leaf.grad, expected) if asked else leaf.grad is None

@@ -22,26 +22,40 @@ def render_with_gradient(vertices, faces, upstream_seed=0, **kwargs):
     return alpha.detach(), vertices.grad
 
 
-@pytest.mark.parametrize("seed, size", [(seed, (15, 15)) for seed in range(6)] + [(5, size) for size in RECTANGLES])
+@pytest.mark.parametrize(
+    "seed, size", [(seed, (15, 15)) for seed in range(6)] + [(5, size) for size in RECTANGLES]
+)
 @pytest.mark.parametrize("anti_aliasing", [False, True])
 @pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, size, anti_aliasing, fill_back):
     vertices, faces = random_soup(seed)
-    upstream = torch.randn(2, *size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    upstream = torch.randn(
+        2, *size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
     leaf = vertices.clone().requires_grad_()
-    alpha = nmr.render_silhouette(leaf, faces, image_size=size, anti_aliasing=anti_aliasing, fill_back=fill_back)
+    alpha = nmr.render_silhouette(
+        leaf, faces, image_size=size, anti_aliasing=anti_aliasing, fill_back=fill_back
+    )
     alpha.backward(upstream)
     for b in range(2):
-        index = reference.face_index(vertices[b], faces, tuple(n * (1 + anti_aliasing) for n in size), fill_back)
+        index = reference.face_index(
+            vertices[b], faces, tuple(n * (1 + anti_aliasing) for n in size), fill_back
+        )
         assert torch.equal(alpha[b], reference.silhouette(index, anti_aliasing, torch.float64))
-        grad = reference.silhouette_gradient(vertices[b], faces, index, upstream[b], anti_aliasing, fill_back)
-        torch.testing.assert_close(leaf.grad[b], grad, rtol=1e-9, atol=1e-9 * float(grad.abs().max()))
+        grad = reference.silhouette_gradient(
+            vertices[b], faces, index, upstream[b], anti_aliasing, fill_back
+        )
+        torch.testing.assert_close(
+            leaf.grad[b], grad, rtol=1e-9, atol=1e-9 * float(grad.abs().max())
+        )
     assert leaf.grad[..., :2].any() and not leaf.grad[..., 2].any()
 
 
 def test_row_zero_is_the_top_and_winding_matters_without_fill_back():
     top_right = torch.tensor([[[0.2, 0.2, 1.0], [0.8, 0.2, 1.0], [0.8, 0.8, 1.0]]])
-    alpha = nmr.render_silhouette(top_right, torch.tensor([[0, 1, 2]]), image_size=10, fill_back=False)
+    alpha = nmr.render_silhouette(
+        top_right, torch.tensor([[0, 1, 2]]), image_size=10, fill_back=False
+    )
     assert alpha[0, :5, 5:].any() and not alpha[0, 5:].any() and not alpha[0, :, :5].any()
     clockwise = torch.tensor([[0, 2, 1]])
     assert not nmr.render_silhouette(top_right, clockwise, image_size=10, fill_back=False).any()
@@ -114,7 +128,9 @@ def test_memory_of_large_images_is_given_back():
         "step(700); _C.free_scratch(); step(64)\n"
         "print(large - before, held() - before)"
     )
-    done = subprocess.run([sys.executable, "-I", "-c", code], check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", code], check=True, capture_output=True, text=True
+    )
     grown, after = map(float, done.stdout.split())
     assert grown < 100 and after < 100, done.stdout  # MiB; the buffers of the large image take 500
 
@@ -144,5 +160,7 @@ def test_running_out_of_memory_is_an_exception():
 def test_behind_the_camera_and_off_screen_draw_nothing():
     vertices, faces = nmr.icosphere(1)
     for shift in ([0, 0, -5.0], [5.0, 0, 3.0], [0, -7.0, 3.0], [0, 0, 500.0]):
-        alpha, grad = render_with_gradient(vertices[None] + torch.tensor(shift), faces, image_size=16)
+        alpha, grad = render_with_gradient(
+            vertices[None] + torch.tensor(shift), faces, image_size=16
+        )
         assert not alpha.any() and not grad.any()

@@ -12,7 +12,9 @@ import nmr
 def screen(depth=(1.0, 1.0, 1.0, 1.0), half=1.0):
     """Two float64 triangles that fill the screen, corners: bottom left, bottom right, top right, top left."""
     xy = [(-half, -half), (half, -half), (half, half), (-half, half)]
-    vertices = torch.tensor([[x, y, z] for (x, y), z in zip(xy, depth, strict=True)], dtype=torch.float64)
+    vertices = torch.tensor(
+        [[x, y, z] for (x, y), z in zip(xy, depth, strict=True)], dtype=torch.float64
+    )
     return vertices, torch.tensor([[0, 1, 2], [0, 2, 3]])
 
 
@@ -24,7 +26,9 @@ def uniform(*shape, seed=0, dtype=torch.float64):
 
 
 def draw(colors, mesh=None, size=8, **kwargs):
-    return nmr.render_rgb(*(mesh or screen()), colors=colors, image_size=size, anti_aliasing=False, **kwargs)
+    return nmr.render_rgb(
+        *(mesh or screen()), colors=colors, image_size=size, anti_aliasing=False, **kwargs
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
@@ -57,7 +61,10 @@ def slow_bilinear(image, uv, wrap):
     for dy, share_y in ((0, 1 - down), (1, down)):
         line = slow_wrapped(row.long() + dy, height, wrap)
         for dx, share_x in ((0, 1 - right), (1, right)):
-            colors = colors + share_y * share_x * image[line, slow_wrapped(column.long() + dx, width, wrap)]
+            colors = (
+                colors
+                + share_y * share_x * image[line, slow_wrapped(column.long() + dx, width, wrap)]
+            )
     return colors
 
 
@@ -69,7 +76,9 @@ def slow_half(image):
         edges = torch.arange(m + 1, dtype=torch.float64) * n / m
         texel = torch.arange(n, dtype=torch.float64)
         overlap = torch.minimum(edges[1:, None], texel + 1) - torch.maximum(edges[:-1, None], texel)
-        image = torch.tensordot(overlap.clamp_min(0).to(image) * m / n, image, ([1], [axis])).movedim(0, axis)
+        image = torch.tensordot(
+            overlap.clamp_min(0).to(image) * m / n, image, ([1], [axis])
+        ).movedim(0, axis)
     return image
 
 
@@ -84,7 +93,9 @@ def slow_uv(image, uv, level, wrap):
         color, n = 0, 0
         while n == 0 or max(mip.shape[:2]) > 1 or n <= level.max():
             mip = slow_half(mip) if n else mip
-            color = color + (1 - (level[b] - n).abs()).clamp_min(0).unsqueeze(-1) * slow_bilinear(mip, uv[b], wrap)
+            color = color + (1 - (level[b] - n).abs()).clamp_min(0).unsqueeze(-1) * slow_bilinear(
+                mip, uv[b], wrap
+            )
             n += 1
         colors.append(color)
     return torch.stack(colors)
@@ -98,7 +109,10 @@ def textured_fragments(dtype=torch.float64, image_size=24, per_image=False, grad
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=image_size)
     fragments = replace(fragments, weights=fragments.weights.clone().requires_grad_(grad))
     batch = (2,) if per_image else ()
-    image, noise = uniform(*batch, 7, 12, 3, seed=2, dtype=dtype), uniform(*batch, 42, 2, seed=3, dtype=dtype)
+    image, noise = (
+        uniform(*batch, 7, 12, 3, seed=2, dtype=dtype),
+        uniform(*batch, 42, 2, seed=3, dtype=dtype),
+    )
     uv = 0.8 * vertices[:, :2] + 0.3 * noise
     return fragments, image.requires_grad_(grad), uv.requires_grad_(grad)
 
@@ -134,11 +148,17 @@ def slow_level(fragments, uv, size, most):
         row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
 
         def uv_at(x, y, at=at, corners=corners, b=b):
-            point = torch.stack([2 * (x + 0.5) / width - 1, 1 - 2 * (y + 0.5) / height, torch.ones_like(x)], -1)
-            columns = torch.stack([at[..., 0] * at[..., 2], at[..., 1] * at[..., 2], at[..., 2]], dim=-2)
+            point = torch.stack(
+                [2 * (x + 0.5) / width - 1, 1 - 2 * (y + 0.5) / height, torch.ones_like(x)], -1
+            )
+            columns = torch.stack(
+                [at[..., 0] * at[..., 2], at[..., 1] * at[..., 2], at[..., 2]], dim=-2
+            )
             weights = torch.linalg.solve(columns, point)
             weights = weights / weights.sum(-1, keepdim=True)
-            return (weights.unsqueeze(-1) * uv[b][corners]).sum(-2) * torch.tensor([size[1], size[0]])
+            return (weights.unsqueeze(-1) * uv[b][corners]).sum(-2) * torch.tensor(
+                [size[1], size[0]]
+            )
 
         x, y = column.double(), row.double()
         lengths = [
@@ -171,7 +191,10 @@ def test_mipmaps_keep_the_mean_whatever_the_size():
 def test_seams():
     """Both faces show the whole width of the image: the shared vertices 0 and 2 have two uv each."""
     image = torch.arange(8.0, dtype=torch.float64).view(1, 8, 1)
-    uv = torch.tensor([[0.0, 0.5], [1.0, 0.5], [1.0, 0.5], [1.0, 0.5], [1.0, 0.5], [0.0, 0.5]], dtype=torch.float64)
+    uv = torch.tensor(
+        [[0.0, 0.5], [1.0, 0.5], [1.0, 0.5], [1.0, 0.5], [1.0, 0.5], [0.0, 0.5]],
+        dtype=torch.float64,
+    )
     colors = nmr.UVTexture(image, uv, torch.tensor([[0, 1, 2], [3, 4, 5]]), wrap="clamp")
     fragments = nmr.render_fragments(*screen(), image_size=9)
     rgb, b = draw(colors, size=9)[0, ..., 0], fragments.weights[0]
@@ -189,9 +212,18 @@ def test_uv_that_are_not_numbers_spoil_nothing():
     vertices, faces = screen((1.0, 2.0, 4.0, 3.0))
     leaf = vertices.clone().requires_grad_()
     for filter in ("bilinear", "mipmap"):
-        rgb = draw(nmr.UVTexture(image, uv.requires_grad_(), filter=filter), (leaf, faces), interpolation_gradient=True)
+        rgb = draw(
+            nmr.UVTexture(image, uv.requires_grad_(), filter=filter),
+            (leaf, faces),
+            interpolation_gradient=True,
+        )
         rgb.square().sum().backward()
-        assert rgb.isfinite().all() and leaf.grad.isfinite().all() and uv.grad.isfinite().all() and leaf.grad.any()
+        assert (
+            rgb.isfinite().all()
+            and leaf.grad.isfinite().all()
+            and uv.grad.isfinite().all()
+            and leaf.grad.any()
+        )
 
 
 def test_vertex_colours_in_perspective():
@@ -202,12 +234,17 @@ def test_vertex_colours_in_perspective():
     centre = (2 * torch.arange(8, dtype=torch.float64) + 1 - 8) / 8
     torch.testing.assert_close(rgb[..., 0], centre.expand(8, 8) * rgb[..., 2])
     torch.testing.assert_close(rgb[..., 1], -centre.view(-1, 1) * rgb[..., 2])
-    torch.testing.assert_close(rgb[..., 2], nmr.render_depth(*mesh, image_size=8, anti_aliasing=False)[0])
+    torch.testing.assert_close(
+        rgb[..., 2], nmr.render_depth(*mesh, image_size=8, anti_aliasing=False)[0]
+    )
 
 
 def test_face_colours_are_exact():
     vertices, faces = nmr.icosphere(1)
-    camera, colors = nmr.LookAt.from_angles(3.0, 10.0, [0.0, 90.0]), uniform(80, 4, dtype=torch.float32)
+    camera, colors = (
+        nmr.LookAt.from_angles(3.0, 10.0, [0.0, 90.0]),
+        uniform(80, 4, dtype=torch.float32),
+    )
     for values in (colors, torch.stack([colors, colors.flip(0)])):
         rgb = draw(nmr.FaceColors(values), (vertices, faces), 16, camera=camera)
         index = nmr.render_face_index(vertices, faces, camera, image_size=16).long()
@@ -234,7 +271,9 @@ def test_colours_have_true_derivatives(kind):
     vertices = vertices.expand(2, -1, -1)
     values = uniform(*shape).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda x: nmr.render_rgb(vertices, faces, colors=make(x), background=0.2, image_size=3), values, atol=1e-6
+        lambda x: nmr.render_rgb(vertices, faces, colors=make(x), background=0.2, image_size=3),
+        values,
+        atol=1e-6,
     )
 
 
@@ -243,7 +282,9 @@ def test_colours_have_true_derivatives(kind):
 def test_an_image_that_was_expanded_over_the_batch_counts_once(kind, filter):
     """The picture and the gradient are those of copies; only plain expansions are not copied."""
     image = uniform(*((2,) if kind == "slice" else ()), 6, 6, 3).requires_grad_()
-    expanded = {"turned": lambda: image.transpose(0, 1), "slice": lambda: image[1]}.get(kind, lambda: image)()
+    expanded = {"turned": lambda: image.transpose(0, 1), "slice": lambda: image[1]}.get(
+        kind, lambda: image
+    )()
     expanded = expanded.expand(4, -1, -1, -1)
     if kind == "retained":
         expanded.retain_grad()

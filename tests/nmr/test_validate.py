@@ -20,7 +20,9 @@ PINHOLE = nmr.Pinhole(INTRINSICS, torch.eye(3), [0.0, 0.0, 2.0], orig_size=(480,
 
 
 def rgb(vertices, colors=COLORS, lights=None):
-    return nmr.render_rgb(vertices, FACES, CAMERA, colors=nmr.VertexColors(colors), lights=lights, **SIZE)
+    return nmr.render_rgb(
+        vertices, FACES, CAMERA, colors=nmr.VertexColors(colors), lights=lights, **SIZE
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -49,7 +51,9 @@ def test_points_and_the_drop_in_under_autocast():
     half = SPHERE.half()
     with torch.autocast("cpu", torch.bfloat16):
         assert nmr.metrics.chamfer_distance(half, half) == 0
-        drawn = nmr.neural_renderer.Renderer(16, camera_mode="look_at").render_silhouettes(half[None], FACES[None])
+        drawn = nmr.neural_renderer.Renderer(16, camera_mode="look_at").render_silhouettes(
+            half[None], FACES[None]
+        )
     assert drawn.any()
 
 
@@ -73,10 +77,15 @@ def test_one_set_of_faces_may_have_a_batch_axis():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_parameters_of_cameras_are_copies_of_arrays(dtype):
     eye, matrix = np.array([0.0, 0.0, -3.0], dtype), np.array(INTRINSICS, dtype)
-    camera, pinhole = nmr.LookAt(eye), nmr.Pinhole(matrix, np.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640))
+    camera, pinhole = (
+        nmr.LookAt(eye),
+        nmr.Pinhole(matrix, np.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640)),
+    )
     before = [x.transform(SPHERE) for x in (camera, pinhole)]
     eye[2], matrix[0, 0] = -9.0, 1.0
-    assert torch.equal(camera.transform(SPHERE), before[0]) and torch.equal(pinhole.transform(SPHERE), before[1])
+    assert torch.equal(camera.transform(SPHERE), before[0]) and torch.equal(
+        pinhole.transform(SPHERE), before[1]
+    )
 
 
 class Own:
@@ -89,12 +98,16 @@ class Own:
 DRAWN = {
     "silhouette": lambda: nmr.render_silhouette(SPHERE, FACES, CAMERA, **SIZE),
     "cut": lambda: nmr.render_silhouette(SPHERE, FACES, nmr.LookAt([0.0, 0.0, -0.5]), **SIZE),
-    "list": lambda: nmr.render_silhouette([SPHERE, SPHERE[:12]], [FACES, FACES[:0]], CAMERA, **SIZE),
+    "list": lambda: nmr.render_silhouette(
+        [SPHERE, SPHERE[:12]], [FACES, FACES[:0]], CAMERA, **SIZE
+    ),
     "local": lambda: nmr.render_silhouette(SPHERE, FACES, CAMERA, gradient="local", **SIZE),
     "wide": lambda: CAMERA.for_image(8, 16).transform(SPHERE),
     "depth": lambda: nmr.render_depth(SPHERE, FACES, CAMERA, **SIZE),
     "normals": lambda: nmr.render_normals(SPHERE, FACES, CAMERA, smooth=True, **SIZE),
-    "normals of a list": lambda: nmr.render_normals([SPHERE, SPHERE], [FACES, FACES[1:]], CAMERA, **SIZE),
+    "normals of a list": lambda: nmr.render_normals(
+        [SPHERE, SPHERE], [FACES, FACES[1:]], CAMERA, **SIZE
+    ),
     "face index": lambda: nmr.render_face_index(SPHERE, FACES, CAMERA, **SIZE),
     "rgb": lambda: rgb(SPHERE),
     "normals by a camera of one's own": lambda: nmr.render_normals(SPHERE, FACES, Own(), **SIZE),
@@ -113,9 +126,13 @@ DRAWN = {
     "volume": lambda: nmr.losses.volume_loss(SPHERE, FACES),
     "area": lambda: nmr.losses.area_loss(SPHERE, FACES),
     "look_at": lambda: nmr.LookAt.from_angles(2.0, 30.0, [0.0, 90.0]).transform(SPHERE),
-    "look": lambda: nmr.Look([0.0, 0.0, -3.0], half_fov_deg=torch.tensor(20.0, device="cpu")).transform(SPHERE),
+    "look": lambda: nmr.Look(
+        [0.0, 0.0, -3.0], half_fov_deg=torch.tensor(20.0, device="cpu")
+    ).transform(SPHERE),
     "orthographic": lambda: nmr.Orthographic([0.0, 0.0, -2.0], scale=0.5).transform(SPHERE),
-    "pinhole": lambda: nmr.Pinhole(INTRINSICS, np.eye(3), [0.0, 0.0, 2.0], orig_size=480).transform(SPHERE),
+    "pinhole": lambda: nmr.Pinhole(INTRINSICS, np.eye(3), [0.0, 0.0, 2.0], orig_size=480).transform(
+        SPHERE
+    ),
     "from_opencv": lambda: cameras.from_opencv(
         INTRINSICS, np.eye(3), [0.0, 0.0, 2.0], [0.1, 0.0, 0.0, 0.0], height=480, width=640
     ).transform(SPHERE),
@@ -123,7 +140,9 @@ DRAWN = {
     "from_opengl": lambda: cameras.from_opengl(*MATRICES).transform(SPHERE),
     "to_opengl": lambda: torch.stack(cameras.to_opengl(PINHOLE, near=0.1, far=10.0)),
     "from_pytorch3d": lambda: cameras.from_pytorch3d(np.eye(3), [0.0, 0.0, 2.0]).transform(SPHERE),
-    "from_pytorch3d_fov": lambda: cameras.from_pytorch3d_fov(np.eye(3), [0.0, 0.0, 2.0], 40.0).transform(SPHERE),
+    "from_pytorch3d_fov": lambda: cameras.from_pytorch3d_fov(
+        np.eye(3), [0.0, 0.0, 2.0], 40.0
+    ).transform(SPHERE),
     "to_pytorch3d": lambda: cameras.to_pytorch3d(CAMERA, image_size=(64, 64))["focal_length"],
 }
 

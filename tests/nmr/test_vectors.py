@@ -18,7 +18,10 @@ SMALL = [
 
 
 def settings_of(v):
-    settings = {name: v[name].item() for name in ("image_size", "anti_aliasing", "fill_back", "near", "far", "eps")}
+    settings = {
+        name: v[name].item()
+        for name in ("image_size", "anti_aliasing", "fill_back", "near", "far", "eps")
+    }
     return settings | {"clip": False}  # the published renderer does not clip
 
 
@@ -35,7 +38,9 @@ def test_the_vectors_are_there():
 
 
 def relative_difference(value, expected):
-    return np.linalg.norm(value.astype(np.float64) - expected) / max(np.linalg.norm(expected.astype(np.float64)), 1e-30)
+    return np.linalg.norm(value.astype(np.float64) - expected) / max(
+        np.linalg.norm(expected.astype(np.float64)), 1e-30
+    )
 
 
 @pytest.mark.parametrize("name", SILHOUETTES)
@@ -52,12 +57,17 @@ def test_silhouette_bit_for_bit_and_gradient(name):
 def test_index_map(name):
     v = load_vector(name)
     num_faces, expected = len(v["faces"]), v["face_index_map"][:, ::-1]
-    mesh, size = (torch.from_numpy(v["vertices"]), torch.from_numpy(v["faces"]).long()), expected.shape[1]
+    mesh, size = (
+        (torch.from_numpy(v["vertices"]), torch.from_numpy(v["faces"]).long()),
+        expected.shape[1],
+    )
     how = {"fill_back": bool(v["fill_back"]), "near": float(v["near"]), "far": float(v["far"])}
     fragments = nmr.render_fragments(*mesh, image_size=size, clip=False, **how)
     assert np.array_equal(fragments.sided_face_index.numpy(), expected)
     public = nmr.render_face_index(*mesh, image_size=size, clip=False, **how)
-    assert np.array_equal(public.numpy(), np.where(expected >= num_faces, expected - num_faces, expected))
+    assert np.array_equal(
+        public.numpy(), np.where(expected >= num_faces, expected - num_faces, expected)
+    )
 
 
 @pytest.mark.parametrize("name", QUIRKS)
@@ -71,12 +81,19 @@ def test_no_stray_pixels_of_collinear_faces(name):
 def test_reference_agrees_with_vectors(name):
     """The slow pure-torch definition, so that other tests may lean on it."""
     v = load_vector(name)
-    aa, back, near, far, eps = (settings_of(v)[name] for name in ("anti_aliasing", "fill_back", "near", "far", "eps"))
+    aa, back, near, far, eps = (
+        settings_of(v)[name] for name in ("anti_aliasing", "fill_back", "near", "far", "eps")
+    )
     faces, size = torch.from_numpy(v["faces"]).long(), v["image_size"].item() * (2 if aa else 1)
     for b in range(len(v["vertices"])):
-        vertices, grad_alpha = torch.from_numpy(v["vertices"][b]), torch.from_numpy(v["grad_alpha"][b])
+        vertices, grad_alpha = (
+            torch.from_numpy(v["vertices"][b]),
+            torch.from_numpy(v["grad_alpha"][b]),
+        )
         index = reference.face_index(vertices, faces, size, back, near, far)
         assert np.array_equal(reference.silhouette(index, aa).numpy(), v["alpha"][b])
         grad = reference.silhouette_gradient(vertices, faces, index, grad_alpha, aa, back, eps)
         scale = np.abs(v["grad_vertices"][b]).max()
-        np.testing.assert_allclose(grad.numpy(), v["grad_vertices"][b], rtol=1e-4, atol=1e-5 * scale)
+        np.testing.assert_allclose(
+            grad.numpy(), v["grad_vertices"][b], rtol=1e-4, atol=1e-5 * scale
+        )

@@ -25,17 +25,25 @@ def test_the_vectors_are_there():
 def test_published_voxels(name):
     v = load_vector(name)
     voxels = nmr.voxelize(
-        torch.from_numpy(v["vertices"]), torch.from_numpy(v["faces"]), int(v["size"]), bool(v["normalize"])
+        torch.from_numpy(v["vertices"]),
+        torch.from_numpy(v["faces"]),
+        int(v["size"]),
+        bool(v["normalize"]),
     )
     assert np.array_equal(voxels.numpy(), v["voxels"].astype(bool))
 
 
 def test_a_box_fills_its_cells_and_axes_keep_their_order():
-    corners = torch.tensor([[x, y, z] for x in (0.12, 0.88) for y in (0.32, 0.68) for z in (0.46, 0.56)])
+    corners = torch.tensor(
+        [[x, y, z] for x in (0.12, 0.88) for y in (0.32, 0.68) for z in (0.46, 0.56)]
+    )
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = torch.tensor([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     voxels = nmr.voxelize(corners, faces, 20)[0]
-    extent = [voxels.any(dim).any(0 if other else -1).sum().item() for dim, other in ((1, 0), (0, 0), (0, 1))]
+    extent = [
+        voxels.any(dim).any(0 if other else -1).sum().item()
+        for dim, other in ((1, 0), (0, 0), (0, 1))
+    ]
     assert extent == [16, 8, 3]
     inside = voxels[voxels.any(1).any(1)][:, voxels.any(0).any(1)][:, :, voxels.any(0).any(0)]
     assert inside.all()
@@ -45,7 +53,9 @@ def test_a_box_fills_its_cells_and_axes_keep_their_order():
 def test_a_shape_that_leaves_the_grid_is_hollow(definition):
     vertices, faces = nmr.icosphere(3)
     closed = nmr.voxelize(0.4 * vertices + 0.5, faces, definition=definition)[0]
-    opened = nmr.voxelize(0.4 * vertices + torch.tensor([0.2, 0.5, 0.5]), faces, definition=definition)[0]
+    opened = nmr.voxelize(
+        0.4 * vertices + torch.tensor([0.2, 0.5, 0.5]), faces, definition=definition
+    )[0]
     assert closed[16, 16, 16] and not opened[6, 16, 16]
 
 
@@ -95,7 +105,9 @@ def fill(surface):
     outside[border & ~surface] = True
     while True:
         grown = np.pad(outside, 1)
-        reached = np.any([np.roll(grown, step, axis) for axis in range(3) for step in (1, -1)], 0)[1:-1, 1:-1, 1:-1]
+        reached = np.any([np.roll(grown, step, axis) for axis in range(3) for step in (1, -1)], 0)[
+            1:-1, 1:-1, 1:-1
+        ]
         more = reached & ~surface & ~outside
         if not more.any():
             return ~outside
@@ -103,7 +115,9 @@ def fill(surface):
 
 
 def kato19(vertices, faces, size):
-    return nmr.voxelize(torch.as_tensor(vertices), torch.as_tensor(faces), size, definition="kato19")[0].numpy()
+    return nmr.voxelize(
+        torch.as_tensor(vertices), torch.as_tensor(faces), size, definition="kato19"
+    )[0].numpy()
 
 
 # Coordinates in 1/64 of a cell, on whole cells more often than not, some outside of the grid.
@@ -126,7 +140,9 @@ def test_kato19_is_its_slow_definition_elsewhere(seed):
     size, faces = 7, np.arange(3).reshape(1, 3)
     for scale in (0.05, 0.3, 2.0):
         vertices = (rng.random((1, 3)) + scale * rng.standard_normal((3, 3))).astype(np.float32)
-        surface, margin = touched_cells((vertices * np.float32(size)).astype(np.float64)[faces], size)
+        surface, margin = touched_cells(
+            (vertices * np.float32(size)).astype(np.float64)[faces], size
+        )
         assert margin.min() > 1e-9  # no cell is a matter of rounding
         assert np.array_equal(kato19(vertices, faces, size), fill(surface))
 
@@ -160,7 +176,9 @@ def test_kato19_of_a_face_far_larger_than_the_grid():
     vertices = torch.tensor([[-900.0, -900.0, 0.3], [900.0, -900.0, 0.3], [0.0, 900.0, 0.3]])
     grid = nmr.voxelize(vertices, torch.tensor([[0, 1, 2]]), 256, definition="kato19")[0]
     assert grid[:, :, 76].all() and grid.sum() == 256 * 256
-    tilted = vertices + torch.tensor([0.0, 0.0, 0.2]) + torch.tensor([0.0, 0.0, 1.0]) * vertices[:, :1]
+    tilted = (
+        vertices + torch.tensor([0.0, 0.0, 0.2]) + torch.tensor([0.0, 0.0, 1.0]) * vertices[:, :1]
+    )
     grid = nmr.voxelize(tilted, torch.tensor([[0, 1, 2]]), 256, definition="kato19")[0]
     assert 256 * 250 > grid.sum(0).bool().sum() > 128 * 250
 
@@ -170,7 +188,8 @@ def test_kato19_of_a_face_far_larger_than_the_grid():
     hnp.arrays(
         np.float32,
         st.tuples(st.integers(1, 2), st.just(6), st.just(3)),
-        elements=st.floats(allow_nan=True, allow_infinity=True, width=32) | st.floats(-1, 2, width=32),
+        elements=st.floats(allow_nan=True, allow_infinity=True, width=32)
+        | st.floats(-1, 2, width=32),
     ),
     hnp.arrays(np.int64, st.tuples(st.integers(0, 5), st.just(3)), elements=st.integers(0, 5)),
     st.integers(1, 9),
@@ -178,7 +197,9 @@ def test_kato19_of_a_face_far_larger_than_the_grid():
     st.sampled_from(DEFINITIONS),
 )
 def test_any_mesh_is_voxelized(vertices, faces, size, normalize, definition):
-    voxels = nmr.voxelize(torch.from_numpy(vertices), torch.from_numpy(faces), size, normalize, definition)
+    voxels = nmr.voxelize(
+        torch.from_numpy(vertices), torch.from_numpy(faces), size, normalize, definition
+    )
     assert voxels.dtype == torch.bool and voxels.shape == (len(vertices), size, size, size)
     if len(faces) == 0:
         assert not voxels.any()

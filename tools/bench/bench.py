@@ -43,7 +43,9 @@ WORKLOADS = {
     "w4": {"subdivisions": 3, "size": 64, "output": "depth"},
 }
 COLORS = ("white", "vertex", "uv", "uv-lights")
-WORKLOADS |= {kind: {"subdivisions": 3, "size": 64, "output": "rgb", "colors": kind} for kind in COLORS}
+WORKLOADS |= {
+    kind: {"subdivisions": 3, "size": 64, "output": "rgb", "colors": kind} for kind in COLORS
+}
 TEXELS = 128  # along each side of a texture image
 FAR = 100.0  # depth of the background, the default of nmr.render
 Timing = tuple[float, float]  # seconds: forward pass, total
@@ -89,7 +91,11 @@ class Work:
         elif self.colors != "white":
             options["colors"] = nmr.UVTexture(values, sphere_uv(nmr.icosphere(3)[0]))
             options["lights"] = nmr.Lights() if self.colors == "uv-lights" else None
-        options |= {"outputs": (self.output,), "image_size": self.size, "anti_aliasing": self.anti_aliasing}
+        options |= {
+            "outputs": (self.output,),
+            "image_size": self.size,
+            "anti_aliasing": self.anti_aliasing,
+        }
         return getattr(nmr.render(vertices, self.faces, self.camera, **options), self.output)
 
     def go_back(self, images: Tensor) -> None:
@@ -102,10 +108,14 @@ class Work:
     def part(self, which: slice) -> Work:
         """The workload with these meshes of the batch alone."""
         camera = nmr.LookAt(self.camera.eye[which], half_fov_deg=self.camera.half_fov_deg)
-        return replace(self, vertices=self.vertices[which], camera=camera, target=self.target[which])
+        return replace(
+            self, vertices=self.vertices[which], camera=camera, target=self.target[which]
+        )
 
 
-def spheres(batch: int, subdivisions: int, size: int, colors: str = "white", **more: object) -> Work:
+def spheres(
+    batch: int, subdivisions: int, size: int, colors: str = "white", **more: object
+) -> Work:
     """Icospheres scaled by 0.2 .. 0.6 along each axis, with noise, seen from random azimuths.
 
     The targets are images of the next mesh of the batch, or of an ellipsoid in a batch of one.
@@ -113,7 +123,9 @@ def spheres(batch: int, subdivisions: int, size: int, colors: str = "white", **m
     g = torch.Generator().manual_seed(0)
     sphere, faces = nmr.icosphere(subdivisions)
     scale = 0.4 + 0.8 * torch.rand(batch, 1, 3, generator=g)
-    noise = 0.03 * torch.randn(batch, len(sphere), 3, generator=g) * min(1.0, 2.0 ** (3 - subdivisions))
+    noise = (
+        0.03 * torch.randn(batch, len(sphere), 3, generator=g) * min(1.0, 2.0 ** (3 - subdivisions))
+    )
     azimuth = 360 * torch.rand(batch, generator=g, dtype=torch.float64)
     camera = nmr.LookAt.from_angles(2.732, 30.0, azimuth, half_fov_deg=15.0)
     vertices, values = 0.5 * (sphere * scale + noise), None
@@ -132,7 +144,11 @@ def sphere_uv(vertices: Tensor) -> Tensor:
 
 
 def time_passes(
-    threads: int, draw: Callable[..., Tensor], then: Callable[[Tensor], object], *leaves: Tensor, gradients: bool = True
+    threads: int,
+    draw: Callable[..., Tensor],
+    then: Callable[[Tensor], object],
+    *leaves: Tensor,
+    gradients: bool = True,
 ) -> Timing:
     """Time drawing, and drawing with what comes `then`: the backward pass if the leaves have `gradients`."""
     torch.set_num_threads(threads)
@@ -148,9 +164,15 @@ def bench_render(name: str, options: Options) -> None:
     """Time nmr, without and with gradients of the colours, and deodr if it is installed."""
     work = spheres(**{"batch": options.batch} | WORKLOADS[name])
     counts = dict.fromkeys((options.threads, 1))
-    programs = {f"nmr, {n} threads": partial(time_passes, n, work.draw, work.go_back, work.vertices) for n in counts}
+    programs = {
+        f"nmr, {n} threads": partial(time_passes, n, work.draw, work.go_back, work.vertices)
+        for n in counts
+    }
     if work.values is not None:
-        programs |= {f"{name}, gradients of colours": partial(run, work.values) for name, run in programs.items()}
+        programs |= {
+            f"{name}, gradients of colours": partial(run, work.values)
+            for name, run in programs.items()
+        }
     with ExitStack() as stack:
         if work.output != "rgb" and importlib.util.find_spec("deodr"):
             programs |= deodr_programs(work, options.threads, stack)
@@ -177,7 +199,9 @@ def check_same(name: str, ours: Tensor, theirs: Tensor) -> None:
     background = FAR if ours.max() > 1 else 0.0
     difference = (ours - theirs)[(ours != background) | (theirs != background)].abs().median()
     if not difference < 5e-3:  # pyrender's depth is that of a sample beside the centre
-        raise SystemExit(f"nmr and {name} draw different images (median difference {float(difference):.1e})")
+        raise SystemExit(
+            f"nmr and {name} draw different images (median difference {float(difference):.1e})"
+        )
 
 
 def run_deodr(work: Work) -> Timing:
@@ -188,8 +212,12 @@ def deodr(work: Work) -> Callable[[Tensor], Tensor]:
     """A function that draws vertices with deodr: one mesh at a time, on one thread, without anti-aliasing."""
     from deodr.triangulated_mesh import TriMeshAdjacencies
 
-    mesh = TriMeshAdjacencies(work.faces.numpy().astype(np.uint32), clockwise=True)  # nmr's world is left-handed
-    return lambda vertices: DeodrImages.apply(work.camera.transform(vertices), work.size, mesh, work.output)
+    mesh = TriMeshAdjacencies(
+        work.faces.numpy().astype(np.uint32), clockwise=True
+    )  # nmr's world is left-handed
+    return lambda vertices: DeodrImages.apply(
+        work.camera.transform(vertices), work.size, mesh, work.output
+    )
 
 
 class DeodrImages(torch.autograd.Function):
@@ -199,10 +227,18 @@ class DeodrImages(torch.autograd.Function):
     def forward(ctx, vertices: Tensor, size: int, mesh, output: str) -> Tensor:
         from deodr.differentiable_renderer import Scene2D
 
-        points, ctx.size, ctx.output, ctx.scenes, images = vertices.detach().double().numpy(), size, output, [], []
+        points, ctx.size, ctx.output, ctx.scenes, images = (
+            vertices.detach().double().numpy(),
+            size,
+            output,
+            [],
+            [],
+        )
         num_vertices, num_faces = points.shape[1], mesh.faces.shape[0]
         for xyz in points:
-            ij = np.stack([(xyz[:, 0] + 1) * size / 2 - 0.5, (1 - xyz[:, 1]) * size / 2 - 0.5], axis=1)
+            ij = np.stack(
+                [(xyz[:, 0] + 1) * size / 2 - 0.5, (1 - xyz[:, 1]) * size / 2 - 0.5], axis=1
+            )
             scene = Scene2D(
                 faces=mesh.faces,
                 faces_uv=mesh.faces,
@@ -272,11 +308,18 @@ def report(title: str, programs: dict[str, Program], repeats: int) -> None:
     """
     times = dict(zip(programs, time_by_turns(programs, repeats), strict=True))
     load = os.getloadavg()[0]
-    print(f"\n{title}\n{repeats} repeats, torch {torch.__version__}, {platform.machine()}, load {load:.1f}")
-    print(f"{'program':<40}" + "".join(f"{name:>12}" for name in ("forward", "total", "fastest", "x first")))
+    print(
+        f"\n{title}\n{repeats} repeats, torch {torch.__version__}, {platform.machine()}, load {load:.1f}"
+    )
+    print(
+        f"{'program':<40}"
+        + "".join(f"{name:>12}" for name in ("forward", "total", "fastest", "x first"))
+    )
     first = None
     for name, timings in times.items():
-        forward, total = ([1e3 * second for second in column] for column in zip(*timings, strict=True))
+        forward, total = (
+            [1e3 * second for second in column] for column in zip(*timings, strict=True)
+        )
         first = first or median(total)
         numbers = (median(forward), median(total), min(total), median(total) / first)
         print(f"{name:<40}" + "".join(f"{number:>12.2f}" for number in numbers), flush=True)

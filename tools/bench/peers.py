@@ -31,10 +31,14 @@ def pytorch3d_soft(work: Work) -> tuple[Draw, Draw]:
     blur, flip = math.log(1 / 1e-4 - 1) * sigma, torch.tensor([-1.0, 1.0, 1.0])
 
     def ours(vertices: Tensor) -> Tensor:
-        return nmr.render_soft_silhouette(vertices, work.faces, work.camera, sigma=sigma, image_size=work.size)
+        return nmr.render_soft_silhouette(
+            vertices, work.faces, work.camera, sigma=sigma, image_size=work.size
+        )
 
     def theirs(vertices: Tensor) -> Tensor:
-        meshes = Meshes(work.camera.transform(vertices) * flip, work.faces.expand(len(vertices), -1, -1))
+        meshes = Meshes(
+            work.camera.transform(vertices) * flip, work.faces.expand(len(vertices), -1, -1)
+        )
         found, _, _, distances = rasterize_meshes(meshes, work.size, blur, faces_per_pixel)
         return 1 - (1 - torch.sigmoid(-distances / sigma) * (found >= 0)).prod(-1)
 
@@ -73,14 +77,20 @@ def mesa(work: Work) -> tuple[Draw, Draw]:
     import pyrender
 
     points, tangent = in_camera(work)
-    mesh = pyrender.Primitive(positions=points * np.float32([1, 1, -1]), indices=work.faces.flip(1).numpy())
+    mesh = pyrender.Primitive(
+        positions=points * np.float32([1, 1, -1]), indices=work.faces.flip(1).numpy()
+    )
     scene = pyrender.Scene()
     scene.add(pyrender.Mesh([mesh]))
-    scene.add(pyrender.PerspectiveCamera(2 * math.atan(tangent), znear=0.1, zfar=FAR, aspectRatio=1.0))
+    scene.add(
+        pyrender.PerspectiveCamera(2 * math.atan(tangent), znear=0.1, zfar=FAR, aspectRatio=1.0)
+    )
     renderer = pyrender.OffscreenRenderer(work.size, work.size)
 
     def theirs(_: Tensor) -> Tensor:
-        depth = torch.from_numpy(renderer.render(scene, flags=pyrender.RenderFlags.DEPTH_ONLY).copy())
+        depth = torch.from_numpy(
+            renderer.render(scene, flags=pyrender.RenderFlags.DEPTH_ONLY).copy()
+        )
         return torch.where(depth > 0, depth, FAR)[None]
 
     return work.draw, theirs
@@ -108,9 +118,18 @@ def main(repeats: int = 15) -> None:
         gradients = work.output == "alpha"
         then = (lambda images: (images - 0.5).square().mean().backward()) if gradients else id
         run = partial(time_passes, 1, gradients=gradients)
-        programs = {name: partial(run, draw, then, work.vertices) for name, draw in (("a", theirs), ("b", ours))}
-        a, b = (1e3 * float(np.median([total for _, total in times])) for times in time_by_turns(programs, repeats))
-        print(f"| {work}{', with gradient' * gradients} | {peer} {a:.1f} | {b:.1f} | {a / b:.1f} times |", flush=True)
+        programs = {
+            name: partial(run, draw, then, work.vertices)
+            for name, draw in (("a", theirs), ("b", ours))
+        }
+        a, b = (
+            1e3 * float(np.median([total for _, total in times]))
+            for times in time_by_turns(programs, repeats)
+        )
+        print(
+            f"| {work}{', with gradient' * gradients} | {peer} {a:.1f} | {b:.1f} | {a / b:.1f} times |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -31,28 +31,42 @@ from learn3d.files.sandbox import Call
 
 POINTS = 10_000  # points that are kept of each object's 100,000, which are in random order
 _EYE_TOLERANCE = 0.01  # largest error of a camera position, in units of the object frame
-_MIN_COSINE = 0.9995  # least cosine of the angle between an image axis or a viewing direction and Kato's
+_MIN_COSINE = (
+    0.9995  # least cosine of the angle between an image axis or a viewing direction and Kato's
+)
 _MATRICES = [f"world_mat_{k}" for k in range(NUM_VIEWS)]
 _CAMERAS = "an npz file with world_mat_0 .. world_mat_23, 4x4, from the world to Kato's 24 cameras"
 _CLOUD = "an npz file with the array 'points' [P, 3]: finite, within the unit cube"
 
 
-def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> ViewDataset | None:
+def load(
+    folder: Path | str, category: str, split: str, *, findings: Findings = STRICT
+) -> ViewDataset | None:
     """Read a split; the view classes are Kato's 24 views."""
     root = category_folder(Path(folder), category)
     paths = {s: path for s in SPLITS if (path := root / f"softras_{s}.lst").is_file()}
     path = root / f"softras_{split}.lst"
     if split not in paths:
-        raise MissingFile(path, f"is missing; expected a list of ids. Splits here: {', '.join(paths) or 'none'}")
-    lists = {s: read_text(path, limits.TEXT_BYTES, "a list of ids").split() for s, path in paths.items()}
+        raise MissingFile(
+            path, f"is missing; expected a list of ids. Splits here: {', '.join(paths) or 'none'}"
+        )
+    lists = {
+        s: read_text(path, limits.TEXT_BYTES, "a list of ids").split() for s, path in paths.items()
+    }
     ids = check_lists(path, lists, split, findings)
 
     def files(name: str) -> list[Call]:
-        images, masks = ([root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)] for part in ("image", "mask"))
+        images, masks = (
+            [root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)]
+            for part in ("image", "mask")
+        )
         return [
             Call(npz.read_several, root / name / "cameras.npz", (_MATRICES, _CAMERAS, 16 * 8)),
             Call(npz.read, root / name / "pointcloud.npz", ("points", _CLOUD, limits.OBJECT_BYTES)),
-            *(Call(renderings.read_with_mask, i, (m, IMAGE_SIZE)) for i, m in zip(images, masks, strict=True)),
+            *(
+                Call(renderings.read_with_mask, i, (m, IMAGE_SIZE))
+                for i, m in zip(images, masks, strict=True)
+            ),
         ]
 
     objects = read_objects(ids, files, _build, IMAGE_SIZE, findings, f"{category} {split}")
@@ -60,7 +74,9 @@ def load(folder: Path | str, category: str, split: str, *, findings: Findings = 
         return None
     images, _, _, clouds = objects
     points = np.stack([cloud[: min(map(len, clouds))] for cloud in clouds])
-    return dataclasses.replace(kato.from_arrays(images, None, category, split), object_names=tuple(ids), points=points)
+    return dataclasses.replace(
+        kato.from_arrays(images, None, category, split), object_names=tuple(ids), points=points
+    )
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -68,31 +84,42 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     return find_splits(folder, "*/softras_SPLIT.lst")
 
 
-def _build(path: Path, cameras: list[np.ndarray], cloud: Path, points: np.ndarray) -> tuple[None, np.ndarray]:
+def _build(
+    path: Path, cameras: list[np.ndarray], cloud: Path, points: np.ndarray
+) -> tuple[None, np.ndarray]:
     to_object = _fit_world(path, cameras)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DamagedFile(cloud, f"has the shape {list(points.shape)}; expected {_CLOUD}")
     points = points[:POINTS].astype(np.float64)
     if not np.abs(points).max() < 1:
-        raise DamagedFile(cloud, f"has coordinates up to {np.abs(points).max():.3g}; expected {_CLOUD}")
+        raise DamagedFile(
+            cloud, f"has coordinates up to {np.abs(points).max():.3g}; expected {_CLOUD}"
+        )
     return None, (points @ to_object.T).astype(np.float32)
 
 
 def _fit_world(path: Path, cameras: list[np.ndarray]) -> np.ndarray:
     """Orthogonal matrix [3, 3] from the cameras' world to the object frame. DamagedFile if they are not Kato's."""
-    if wrong := [name for name, matrix in zip(_MATRICES, cameras, strict=True) if matrix.shape != (4, 4)]:
+    if wrong := [
+        name for name, matrix in zip(_MATRICES, cameras, strict=True) if matrix.shape != (4, 4)
+    ]:
         raise DamagedFile(path, f"has no {wrong[0]} of 4x4 numbers; expected {_CAMERAS}")
     matrices = np.stack(cameras)[:, :3].astype(np.float64)
     rotations = matrices[:, :, :3]
     skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     if not (skew <= 1e-3).all() or not np.isfinite(matrices).all():
-        raise DamagedFile(path, f"the left 3x3 part of a matrix is no rotation, or not finite; expected {_CAMERAS}")
+        raise DamagedFile(
+            path,
+            f"the left 3x3 part of a matrix is no rotation, or not finite; expected {_CAMERAS}",
+        )
     eyes = -np.einsum("kij,ki->kj", rotations, matrices[:, :, 3])
     poses = view_poses(torch.arange(NUM_VIEWS))
     true_eyes = poses.features().double().numpy()
     u, _, v = np.linalg.svd(true_eyes.T @ eyes)
     to_object = u @ v
-    true_rotations = poses.cameras().projection().matrix[:, :, :3].numpy()  # rows: right, down, forward
+    true_rotations = (
+        poses.cameras().projection().matrix[:, :, :3].numpy()
+    )  # rows: right, down, forward
     cosines = (rotations @ to_object.T * true_rotations).sum(axis=2)[:, [0, 2]].min(axis=1)
     off = np.linalg.norm(eyes @ to_object.T - true_eyes, axis=1)
     fault = np.maximum(off / _EYE_TOLERANCE, (1 - cosines) / (1 - _MIN_COSINE))

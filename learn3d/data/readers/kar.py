@@ -37,7 +37,11 @@ NUM_RENDERS = 20
 HALF_FOV_DEG = math.degrees(math.atan(16 / 60))  # 14.9314
 VIEW_BINS = "15x20"  # K = 72
 BROKEN = frozenset(
-    {"187f32df6f393d18490ad276cd2af3a4", "391fa4da294c70d0a4e97ce1d10a5ae6", "50cdaa9e33fc853ecb2a965e75be701c"}
+    {
+        "187f32df6f393d18490ad276cd2af3a4",
+        "391fa4da294c70d0a4e97ce1d10a5ae6",
+        "50cdaa9e33fc853ecb2a965e75be701c",
+    }
 )
 _TABLE = "a row per render: azimuth, elevation, (unused), distance"
 _LISTS = 'splits.json of the LSM code: {synset: {"name": .., "train": [id, ..], "val": [..], "test": [..]}}'
@@ -62,7 +66,10 @@ def load(
     folder, synset = Path(folder), synset_of(category)
     path, lists = folder / "splits.json", read_splits(folder)
     if synset not in lists:
-        raise DamagedFile(path, f"has no entry {synset} ({category}); it has: {', '.join(sorted(lists)) or 'none'}")
+        raise DamagedFile(
+            path,
+            f"has no entry {synset} ({category}); it has: {', '.join(sorted(lists)) or 'none'}",
+        )
     lists = {s: [name for name in lists[synset].get(s, []) if name not in BROKEN] for s in SPLITS}
     ids = check_lists(path, lists, split, findings)
     root = folder / "renders" / synset
@@ -71,19 +78,28 @@ def load(
         views = findings.attempt(_rows, root / ids[0] / "view.txt") or NUM_RENDERS
 
     def files(name: str) -> list[Call]:
-        paths = [(root / name / f"render_{k}.png", root / name / f"depth_{k}.png") for k in range(views)]
+        paths = [
+            (root / name / f"render_{k}.png", root / name / f"depth_{k}.png") for k in range(views)
+        ]
         grid = folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat"
         return [
             Call(renderings.read_table, root / name / "view.txt", (views, 4, _TABLE), _TABLE),
             Call(formats.read_matlab, grid, ("Volume", VOXEL_SIZE)),
-            *(Call(renderings.read_with_depth, path, (depth, image_size), "a rendering") for path, depth in paths),
+            *(
+                Call(renderings.read_with_depth, path, (depth, image_size), "a rendering")
+                for path, depth in paths
+            ),
         ]
 
-    def build(path: Path, table: np.ndarray, _: Path, volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def build(
+        path: Path, table: np.ndarray, _: Path, volume: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         return check_poses(path, table[:, [0, 1, 3]], _TABLE), volume
 
     objects = read_objects(ids, files, build, image_size, findings, f"{category} {split}")
-    return join_objects(objects, ids, HALF_FOV_DEG, VIEW_BINS, LAYOUTS["kar"].about(category, split))
+    return join_objects(
+        objects, ids, HALF_FOV_DEG, VIEW_BINS, LAYOUTS["kar"].about(category, split)
+    )
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -101,7 +117,9 @@ def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     lists = read_json(path, limits.JSON_BYTES, _LISTS)
     with faults_of(path, _LISTS):
         named = [entry.get(split, []) for entry in lists.values() for split in SPLITS]
-        if not all(isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named):
+        if not all(
+            isinstance(ids, list) and all(isinstance(name, str) for name in ids) for ids in named
+        ):
             raise ValueError("ids must be lists of text")
     return lists
 

@@ -39,7 +39,9 @@ def split_paths(folder: Path | str, category: str, split: str) -> tuple[Path, Pa
     return Path(folder) / f"{stem}_images.npz", Path(folder) / f"{stem}_voxels.npz"
 
 
-def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> ViewDataset | None:
+def load(
+    folder: Path | str, category: str, split: str, *, findings: Findings = STRICT
+) -> ViewDataset | None:
     """Read a split. Sample `object * 24 + view` is one view of one object; the view classes are the 24 views."""
     paths = split_paths(folder, category, split)
     images = findings.attempt(_read, paths[0], "images", None)
@@ -54,12 +56,16 @@ def load(folder: Path | str, category: str, split: str, *, findings: Findings = 
             findings.warn(paths[1], f"the grid of object {index} is empty")
     if len(images) != len(voxels) or not len(images):
         counts = f"{len(images)} objects and {paths[1].name} {len(voxels)}"
-        raise DamagedFile(paths[0], f"holds {counts}; expected equal numbers above 0: fetch or make both again")
+        raise DamagedFile(
+            paths[0], f"holds {counts}; expected equal numbers above 0: fetch or make both again"
+        )
     findings.objects = len(images)
     return from_arrays(images, voxels, category, split)
 
 
-def from_arrays(images: np.ndarray, voxels: np.ndarray | None, category: str, split: str) -> ViewDataset:
+def from_arrays(
+    images: np.ndarray, voxels: np.ndarray | None, category: str, split: str
+) -> ViewDataset:
     """The data set of images uint8 [N, 24, 4, 64, 64] (or [N * 24, ...]) and voxels bool [N, 32, 32, 32]."""
     images = images.reshape(-1, 4, IMAGE_SIZE, IMAGE_SIZE)
     count = len(images) // NUM_VIEWS
@@ -85,14 +91,24 @@ def _read(path: Path, kind: str, count: int | None) -> np.ndarray:
     """The array of one file. count: largest number of objects; None if unknown."""
     if not path.is_file():
         names = {synset: name for name, synset in SYNSETS.items()}
-        there = [f"{names.get(prefix, prefix)} {s}" for prefix, splits in contents(path.parent).items() for s in splits]
-        missing = "is missing: a split is two files, *_images.npz and *_voxels.npz. The folder holds: "
-        missing += f"{', '.join(there) or 'none'}. Choose one of these, or make it (learn3d make-dataset)"
+        there = [
+            f"{names.get(prefix, prefix)} {s}"
+            for prefix, splits in contents(path.parent).items()
+            for s in splits
+        ]
+        missing = (
+            "is missing: a split is two files, *_images.npz and *_voxels.npz. The folder holds: "
+        )
+        missing += (
+            f"{', '.join(there) or 'none'}. Choose one of these, or make it (learn3d make-dataset)"
+        )
         raise MissingFile(path, missing)
     dtype, shape = _ARRAYS[kind]
     wanted = f"an npz file with {dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}' and no pickled objects"
     max_bytes = None if count is None else count * math.prod(shape) * dtype.itemsize
     array = npz.read(path, _KEY, wanted, max_bytes)
     if (array.dtype, array.shape[1:]) != (dtype, shape) or not array.shape:
-        raise DamagedFile(path, f"the {kind} file must be {wanted}, got {array.dtype} {list(array.shape)}")
+        raise DamagedFile(
+            path, f"the {kind} file must be {wanted}, got {array.dtype} {list(array.shape)}"
+        )
     return array

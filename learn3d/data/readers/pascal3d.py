@@ -43,11 +43,18 @@ _SHAPES = {  # other arrays -> shape of an item
     "rotation_matrices": (3, 3),
     "voxels": (VOXEL_SIZE,) * 3,
 }
-_ROTATION_BYTES = 200_000 * 72  # largest size of a file's rotations; Pascal3D+ has 5,000 photographs
+_ROTATION_BYTES = (
+    200_000 * 72
+)  # largest size of a file's rotations; Pascal3D+ has 5,000 photographs
 
 
 def load(
-    folder: Path | str, category: str, split: str, *, image_size: int = IMAGE_SIZE, findings: Findings = STRICT
+    folder: Path | str,
+    category: str,
+    split: str,
+    *,
+    image_size: int = IMAGE_SIZE,
+    findings: Findings = STRICT,
 ) -> ViewDataset | None:
     """Read a split ("test" is val); each photograph is an object of its own.
 
@@ -57,7 +64,10 @@ def load(
     """
     paths = _paths(folder, category, split)
     found = read_all([Call(npz.read_ragged, path, ("images", _WANTED), _WANTED)] for path in paths)
-    files = [findings.attempt(_parse, path, result, findings) for path, (result,) in zip(paths, found, strict=True)]
+    files = [
+        findings.attempt(_parse, path, result, findings)
+        for path, (result,) in zip(paths, found, strict=True)
+    ]
     findings.objects = sum(len(file[0]) for file in files if file is not None)
     if not findings.strict:
         return None
@@ -66,7 +76,9 @@ def load(
     masks, rotations = references[..., 3], rotations.astype(np.float64)
     training = rotations
     if split != "train":
-        training = np.concatenate([_training_rotations(path) for path in _paths(folder, category, "train")])
+        training = np.concatenate(
+            [_training_rotations(path) for path in _paths(folder, category, "train")]
+        )
     view_ids, view_names = view_classes(rotations, training)
     crops = Crops.from_images(images, boxes, image_size)
     return ViewDataset(
@@ -77,7 +89,11 @@ def load(
         view_ids=view_ids,
         view_names=view_names,
         object_ids=np.arange(len(rotations)),
-        object_names=tuple(f"{p.stem}/{k}" for p, file in zip(paths, files, strict=True) for k in range(len(file[0]))),
+        object_names=tuple(
+            f"{p.stem}/{k}"
+            for p, file in zip(paths, files, strict=True)
+            for k in range(len(file[0]))
+        ),
         voxels=voxels,
         crops=crops,
     )
@@ -104,7 +120,9 @@ def rotation_cells(rotations: np.ndarray) -> np.ndarray:
 def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Class int64 [M] in 0 .. K-1 of each rotation [M, 3, 3], and the K names. Classes are cells of `training`."""
     # The trace of A^T B grows as the angle between the rotations A and B falls.
-    ids, kept = training_classes(*((rotation_cells(r), r.reshape(-1, 9)) for r in (rotations, training)))
+    ids, kept = training_classes(
+        *((rotation_cells(r), r.reshape(-1, 9)) for r in (rotations, training))
+    )
     middle = -180 + CELL_DEG * (np.stack(np.unravel_index(kept, _CELLS), axis=1) + 0.5)
     return ids, tuple(f"y {y:g}°, z {z:g}°, x {x:g}°" for y, z, x in middle)
 
@@ -112,7 +130,11 @@ def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarra
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories of a folder and the splits of each ("test" is val)."""
     found = find_splits(folder, "*_SPLIT.npz").items()
-    return {name: tuple(s for s in splits if s != "test") for name, splits in found if name in CATEGORIES}
+    return {
+        name: tuple(s for s in splits if s != "test")
+        for name, splits in found
+        if name in CATEGORIES
+    }
 
 
 def class_name(category: str) -> str:
@@ -134,8 +156,13 @@ def _parse(path: Path, found: Any, findings: Findings) -> tuple[list[np.ndarray]
     images, arrays = STRICT.take(found), []
     for key, shape in _SHAPES.items():
         array = npz.read(path, key, _WANTED, 8 * len(images) * int(np.prod(shape)))
-        if array.shape != (len(images), *shape) or (key == "images_ref" and array.dtype != np.uint8):
-            wanted, got = f"{list(shape)} for each of {len(images)} images", f"{array.dtype} {list(array.shape)}"
+        if array.shape != (len(images), *shape) or (
+            key == "images_ref" and array.dtype != np.uint8
+        ):
+            wanted, got = (
+                f"{list(shape)} for each of {len(images)} images",
+                f"{array.dtype} {list(array.shape)}",
+            )
             raise DamagedFile(path, f"{key} must be {wanted} (uint8 if images), got {got}")
         arrays.append(array)
     if not len(images):
@@ -153,11 +180,18 @@ def _parse(path: Path, found: Any, findings: Findings) -> tuple[list[np.ndarray]
 
 def _check_image(path: Path, k: int, image: np.ndarray, box: np.ndarray) -> None:
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise DamagedFile(path, f"images[{k}] must be uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
+        raise DamagedFile(
+            path, f"images[{k}] must be uint8 [H, W, 3], got {image.dtype} {list(image.shape)}"
+        )
     sound = np.isfinite(box).all() and (box[2:] > 0).all()
-    left, top, right, bottom = bounds(box, SMALLEST, image.shape[1], image.shape[0]) if sound else (0, 0, 0, 0)
+    left, top, right, bottom = (
+        bounds(box, SMALLEST, image.shape[1], image.shape[0]) if sound else (0, 0, 0, 0)
+    )
     if left >= right or top >= bottom:
-        raise DamagedFile(path, f"bounding_boxes[{k}] must be left, top, width, height within the image, got {box}")
+        raise DamagedFile(
+            path,
+            f"bounding_boxes[{k}] must be left, top, width, height within the image, got {box}",
+        )
 
 
 def _check_rotations(path: Path, rotations: np.ndarray, findings: Findings) -> None:
@@ -165,7 +199,11 @@ def _check_rotations(path: Path, rotations: np.ndarray, findings: Findings) -> N
         raise DamagedFile(path, f"rotation_matrices must be [N, 3, 3], got {list(rotations.shape)}")
     for k, rotation in enumerate(rotations):
         if not np.isfinite(rotation).all() or np.linalg.det(rotation) <= 0:
-            findings.take(DamagedFile(path, f"rotation_matrices[{k}] is no rotation: {rotation.round(3).tolist()}"))
+            findings.take(
+                DamagedFile(
+                    path, f"rotation_matrices[{k}] is no rotation: {rotation.round(3).tolist()}"
+                )
+            )
 
 
 def _training_rotations(path: Path) -> np.ndarray:

@@ -50,14 +50,23 @@ class Photo:
     mask: Path | None
     object: str
     split: Literal[(None, *SPLITS)]
-    azimuth_deg: Annotated[float, Field(strict=False, gt=-limits.ANGLE_DEG, lt=limits.ANGLE_DEG)] | None = None
+    azimuth_deg: (
+        Annotated[float, Field(strict=False, gt=-limits.ANGLE_DEG, lt=limits.ANGLE_DEG)] | None
+    ) = None
     elevation_deg: Annotated[float, Field(strict=False, gt=-90, lt=90)] | None = None
     distance: Annotated[float, Field(strict=False, gt=0.5, lt=limits.DISTANCE[1])] | None = None
-    fov_deg: Annotated[float, Field(strict=False, gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None = None
+    fov_deg: (
+        Annotated[float, Field(strict=False, gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None
+    ) = None
 
 
 def load(
-    folder: Path | str, category: str, split: str, *, image_size: int = MASK_SIZE, findings: Findings = STRICT
+    folder: Path | str,
+    category: str,
+    split: str,
+    *,
+    image_size: int = MASK_SIZE,
+    findings: Findings = STRICT,
 ) -> ViewDataset | None:
     """Read a split of the photographs in `folder/category`.
 
@@ -68,21 +77,36 @@ def load(
     table = Path(folder) / category / TABLE
     photos = read_photo_table(table, findings)
     splits = split_objects(table, photos)
-    chosen, training = ([photo for photo in photos if splits[photo.object] == s] for s in (split, "train"))
+    chosen, training = (
+        [photo for photo in photos if splits[photo.object] == s] for s in (split, "train")
+    )
     names, object_ids = np.unique([photo.object for photo in chosen], return_inverse=True)
     findings.objects = len(names)
     if not chosen or not training:
         there = ", ".join(sorted(set(splits.values())))
-        raise DamagedFile(table, f"has no photograph for {'train' if chosen else split}; it has: {there}")
-    read = read_all([Call(read_framed, photo.file, (photo.mask, image_size), "a photograph")] for photo in chosen)
+        raise DamagedFile(
+            table, f"has no photograph for {'train' if chosen else split}; it has: {there}"
+        )
+    read = read_all(
+        [Call(read_framed, photo.file, (photo.mask, image_size), "a photograph")]
+        for photo in chosen
+    )
     framed = []
-    for photo, (result,) in zip(chosen, tqdm(read, category, len(chosen), disable=not is_watched()), strict=True):
+    for photo, (result,) in zip(
+        chosen, tqdm(read, category, len(chosen), disable=not is_watched()), strict=True
+    ):
         if isinstance(result, Exception):
             result = type(result)(result.path, f"{result.message} ({TABLE}, line {photo.line})")
         elif result.touches_border:
-            findings.warn(photo.file, "its object touches the border; parts outside the image count as empty")
+            findings.warn(
+                photo.file, "its object touches the border; parts outside the image count as empty"
+            )
         framed.append(findings.take(result))
-    left_out = {photo.file: each.left_out for photo, each in zip(chosen, framed, strict=True) if each and each.left_out}
+    left_out = {
+        photo.file: each.left_out
+        for photo, each in zip(chosen, framed, strict=True)
+        if each and each.left_out
+    }
     for file, what in left_out.items():
         findings.warn(file, what)
     unlisted = _unlisted(table, photos)
@@ -92,12 +116,20 @@ def load(
         note(f"note: {table}: {unlisted}")
     if findings.strict and left_out:
         file, what = next(iter(left_out.items()))
-        note(f"note: masks with more than the object: {len(left_out)}; the first is of {file}: {what}")
+        note(
+            f"note: masks with more than the object: {len(left_out)}; the first is of {file}: {what}"
+        )
     poses, view_ids, view_names = None, np.zeros(len(chosen), np.int64), ("unknown",)
     if chosen[0].distance is None:
-        findings.warn(table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks")
+        findings.warn(
+            table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks"
+        )
     else:
-        _check_scales(table, [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None], findings)
+        _check_scales(
+            table,
+            [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None],
+            findings,
+        )
         poses = _poses(chosen)
         view_ids, view_names = view_classes(poses, _poses(training))
     if not findings.strict:
@@ -118,10 +150,18 @@ def load(
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     """The categories of a folder and the splits of each."""
     found = {}
-    for table in sorted({path.parent / TABLE for name in (TABLE, "images") for path in Path(folder).glob(f"*/{name}")}):
+    for table in sorted(
+        {
+            path.parent / TABLE
+            for name in (TABLE, "images")
+            for path in Path(folder).glob(f"*/{name}")
+        }
+    ):
         splits = {"train"}
         with contextlib.suppress(ValueError, OSError):  # `load` raises the same fault
-            splits = set(split_objects(table, read_photo_table(table, Findings())).values()) or splits
+            splits = (
+                set(split_objects(table, read_photo_table(table, Findings())).values()) or splits
+            )
         found[table.parent.name] = tuple(name for name in SPLITS if name in splits)
     return found
 
@@ -133,7 +173,9 @@ def _poses(photos: list[Photo]) -> LookAtPoses:
 
 def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Findings) -> None:
     """Compare the objects' sizes in the photographs with those from distances and fields of view."""
-    scales = [2 * f.object_size * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs]
+    scales = [
+        2 * f.object_size * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs
+    ]
     middle = float(np.median(scales)) if scales else 1.0
     message = f"the objects are {middle:.2g} times as large in the photographs as in the table; distance must be in "
     message += "units of the object's longest side, fov_deg the full angle across the photograph's longer side"
@@ -153,17 +195,29 @@ def read_photo_table(table: Path, findings: Findings) -> list[Photo]:
     Raises MissingFile, and DamagedFile if the file is not a table of photographs.
     """
     if not table.exists() and (table.parent / "images").is_dir():
-        names = sorted(path.name for path in (table.parent / "images").iterdir() if not path.name.startswith("."))
+        names = sorted(
+            path.name
+            for path in (table.parent / "images").iterdir()
+            if not path.name.startswith(".")
+        )
         if not names:
-            raise DamagedFile(table.parent / "images", f"is empty; expected photographs, and {_WANTED} in {TABLE}")
+            raise DamagedFile(
+                table.parent / "images", f"is empty; expected photographs, and {_WANTED} in {TABLE}"
+            )
         lines = ["file", *('"' + name.replace('"', '""') + '"' for name in names)]
     else:
-        lines = read_text(table, limits.PHOTO_TABLE_BYTES, _WANTED, encoding="utf-8-sig").splitlines()
+        lines = read_text(
+            table, limits.PHOTO_TABLE_BYTES, _WANTED, encoding="utf-8-sig"
+        ).splitlines()
     delimiter = ";" if lines and ";" in lines[0] else ","
     reader = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
     reader.fieldnames = names = [name.strip() for name in reader.fieldnames or []]
     numbers = set(names) & set(NUMBERS)
-    if "file" not in names or len(numbers) not in (0, 4) or not set(names) <= {"file", *NUMBERS, *OPTIONAL}:
+    if (
+        "file" not in names
+        or len(numbers) not in (0, 4)
+        or not set(names) <= {"file", *NUMBERS, *OPTIONAL}
+    ):
         raise DamagedFile(table, f"has the columns {', '.join(names)[:200]}; expected {_WANTED}")
     masks = {path.stem: path for path in sorted((table.parent / "masks").glob("*"))}
     photos: dict[Path, Photo] = {}
@@ -202,13 +256,20 @@ def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
         needed = "train, val and test need 3. Photograph more, or give every row a split"
         raise DamagedFile(table, f"lists {len(names)} objects; {needed}")
     test, val = (max(1, round(share * len(names))) for share in (TEST_SHARE, VAL_SHARE))
-    return {name: "test" if k < test else "val" if k < test + val else "train" for k, name in enumerate(names)}
+    return {
+        name: "test" if k < test else "val" if k < test + val else "train"
+        for k, name in enumerate(names)
+    }
 
 
-def _photo(table: Path, line: int, row: dict[str, Any], masks: dict[str, Path], others: Container[Path]) -> Photo:
+def _photo(
+    table: Path, line: int, row: dict[str, Any], masks: dict[str, Path], others: Container[Path]
+) -> Photo:
     """Check one row of the table."""
     try:
-        if None in row or None in row.values():  # csv.DictReader marks too long and too short rows with None
+        if (
+            None in row or None in row.values()
+        ):  # csv.DictReader marks too long and too short rows with None
             raise ValueError("it has more or fewer values than there are columns")
         values = {name: value.strip() for name, value in row.items()}
         name = Path(values["file"].removeprefix("images/"))

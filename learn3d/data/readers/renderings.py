@@ -38,10 +38,17 @@ def read_objects(
     progress bar.
     """
     findings.objects = len(names)
-    whole = (calls for calls in map(files, names) if findings.attempt(_require_folder, calls[0].path.parent))
+    whole = (
+        calls
+        for calls in map(files, names)
+        if findings.attempt(_require_folder, calls[0].path.parent)
+    )
     sent, asked = itertools.tee(whole)
     count = len(names) * (len(files(names[0])) - 2) if findings.strict else 0
-    images, masks = (np.empty((count, *shape), np.uint8) for shape in ((4, image_size, image_size), (MASK_SIZE,) * 2))
+    images, masks = (
+        np.empty((count, *shape), np.uint8)
+        for shape in ((4, image_size, image_size), (MASK_SIZE,) * 2)
+    )
     poses, shapes, row = [], [], 0
     found = tqdm(read_all(sent), title, len(names), disable=not is_watched(), unit="object")
     for results, calls in zip(found, asked, strict=True):
@@ -55,11 +62,17 @@ def read_objects(
                 shapes.append(built[1])
         for path, view in zip(paths, views, strict=True):
             if view is not None and view[2] < 128:
-                findings.warn(path, f"its mask is empty: the brightest of its values 0 .. 255 is {view[2]}")
+                findings.warn(
+                    path, f"its mask is empty: the brightest of its values 0 .. 255 is {view[2]}"
+                )
             if findings.strict:
                 images[row], masks[row] = view[:2]
                 row += 1
-    return (images, None if image_size == MASK_SIZE else masks, poses, shapes) if findings.strict else None
+    return (
+        (images, None if image_size == MASK_SIZE else masks, poses, shapes)
+        if findings.strict
+        else None
+    )
 
 
 def _require_folder(path: Path) -> bool:
@@ -100,7 +113,9 @@ def check_poses(path: Path, poses: np.ndarray, wanted: str) -> np.ndarray:
     """Return poses float64 [V, 3] (azimuth, elevation, distance). Raises DamagedFile if one is out of range."""
     sound = LookAtPoses(*torch.from_numpy(poses.T), 15.0).in_range().numpy()
     if not sound.all():
-        row = "row {} has azimuth {:g}, elevation {:g} and distance {:g}".format(sound.argmin(), *poses[sound.argmin()])
+        row = "row {} has azimuth {:g}, elevation {:g} and distance {:g}".format(
+            sound.argmin(), *poses[sound.argmin()]
+        )
         raise DamagedFile(path, f"{row}; expected {wanted}")
     return poses
 
@@ -110,11 +125,16 @@ def category_folder(folder: Path, category: str) -> Path:
     path = folder / synset_of(category)
     if not path.is_dir():
         found = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
-        raise MissingFile(path, f"there is no folder of {category!r}; those here are: {', '.join(found) or 'none'}")
+        raise MissingFile(
+            path,
+            f"there is no folder of {category!r}; those here are: {', '.join(found) or 'none'}",
+        )
     return path
 
 
-def check_lists(path: Path, lists: dict[str, list[str]], split: str, findings: Findings) -> list[str]:
+def check_lists(
+    path: Path, lists: dict[str, list[str]], split: str, findings: Findings
+) -> list[str]:
     """The ids of the objects of a split. lists: split -> ids. path: file of the lists, for messages.
 
     Raises DamagedFile if there are no ids, or if one is not a plain name of a folder.
@@ -124,10 +144,14 @@ def check_lists(path: Path, lists: dict[str, list[str]], split: str, findings: F
         raise DamagedFile(path, f"names no object for {split}")
     for name in ids:
         if name in ("", ".", "..") or len(name) > limits.NAME_LENGTH or set(name) & set("/\\:\0"):
-            raise DamagedFile(path, f"names the object {name[:40]!r}; expected the plain name of a folder")
+            raise DamagedFile(
+                path, f"names the object {name[:40]!r}; expected the plain name of a folder"
+            )
     if repeated := sorted(name for name, times in Counter(ids).items() if times > 1):
         findings.warn(path, f"{split} lists {', '.join(repeated[:8])} more than once")
     for other, others in lists.items():
         if other != split and (shared := sorted(set(ids) & set(others))):
-            findings.warn(path, f"{split} shares {len(shared)} objects with {other}, such as {shared[0]}")
+            findings.warn(
+                path, f"{split} shares {len(shared)} objects with {other}, such as {shared[0]}"
+            )
     return ids

@@ -37,7 +37,9 @@ class Picture(NamedTuple):
 
     colors: np.ndarray  # uint8 [H, W, 3]
     mask: np.ndarray  # uint8 [H, W], above 127: object; 255 everywhere if unknown
-    strokes: np.ndarray | None = None  # corrections of the mask, uint8 [H, W], see `cutting.correct`
+    strokes: np.ndarray | None = (
+        None  # corrections of the mask, uint8 [H, W], see `cutting.correct`
+    )
     box: Box | None = None  # box around the object
 
 
@@ -47,8 +49,13 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
     Raises ValueError for a wrong size or number of bytes.
     """
     pixels = width * height
-    if not (0 < width <= SIDE and 0 < height <= SIDE) or len(content) not in (4 * pixels, 5 * pixels):
-        raise ValueError(f"a picture of {width} x {height} pixels came in {len(content)} bytes; at most {SIDE} a side")
+    if not (0 < width <= SIDE and 0 < height <= SIDE) or len(content) not in (
+        4 * pixels,
+        5 * pixels,
+    ):
+        raise ValueError(
+            f"a picture of {width} x {height} pixels came in {len(content)} bytes; at most {SIDE} a side"
+        )
     values = np.frombuffer(content, np.uint8)
     rgba = values[: 4 * pixels].reshape(height, width, 4)
     strokes = values[4 * pixels :].reshape(height, width) if len(values) > 4 * pixels else None
@@ -76,7 +83,9 @@ def unpack_several(content: bytes, widths: Sequence[int], heights: Sequence[int]
     Raises ValueError for a wrong number of pictures or bytes.
     """
     if len(widths) != len(heights) or not 2 <= len(widths) <= MOST_PICTURES:
-        raise ValueError(f"{len(widths)} widths and {len(heights)} heights came for 2 to {MOST_PICTURES} pictures")
+        raise ValueError(
+            f"{len(widths)} widths and {len(heights)} heights came for 2 to {MOST_PICTURES} pictures"
+        )
     ends = [0, *itertools.accumulate(4 * w * h for w, h in zip(widths, heights, strict=True))]
     if ends[-1] != len(content):
         raise ValueError(f"{len(content)} bytes came for pictures of {ends[-1]} bytes")
@@ -85,7 +94,10 @@ def unpack_several(content: bytes, widths: Sequence[int], heights: Sequence[int]
 
 
 def make_meshes(
-    models: Mapping[str, Model], pictures: Sequence[Picture], send: Send, category: str | None = None
+    models: Mapping[str, Model],
+    pictures: Sequence[Picture],
+    send: Send,
+    category: str | None = None,
 ) -> None:
     """Send the masks, the progress, and in the end the meshes of all models, or an error as a sentence.
 
@@ -96,15 +108,22 @@ def make_meshes(
         for number, picture in enumerate(pictures):
             outline, left_out = find_object(picture, judge)
             of = {"of": number} if len(pictures) > 1 else {}
-            found = {"mask": _base64(np.packbits(outline.mask > 127).tobytes()), "left_out": left_out}
+            found = {
+                "mask": _base64(np.packbits(outline.mask > 127).tobytes()),
+                "left_out": left_out,
+            }
             send(found | {"how": outline.how} | of)
             try:
                 check_mask(outline.mask, cropped=True)
             except ValueError:
                 which = f" in picture {number + 1}" if of else ""
-                raise ValueError(f"No object was found{which}. Draw a box around it, or paint it with Add.") from None
+                raise ValueError(
+                    f"No object was found{which}. Draw a box around it, or paint it with Add."
+                ) from None
             if outline.doubt and not of:
-                raise ValueError(f"Is this the object? {outline.doubt.capitalize()}. Draw a box around it (Box).")
+                raise ValueError(
+                    f"Is this the object? {outline.doubt.capitalize()}. Draw a box around it (Box)."
+                )
             masks.append(outline.mask)
 
         def progress(text: str, part: float) -> None:
@@ -113,7 +132,10 @@ def make_meshes(
         photos = [(picture.colors, mask) for picture, mask in zip(pictures, masks, strict=True)]
         if len(photos) == 1:
             options = {"progress": progress, "category": category, "guesses": GUESSES}
-            made = {label: reconstruct_guesses(model, *photos[0], **options) for label, model in models.items()}
+            made = {
+                label: reconstruct_guesses(model, *photos[0], **options)
+                for label, model in models.items()
+            }
             send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
             for label, guesses in made.items():
                 for guess in guesses:
@@ -128,7 +150,9 @@ def make_meshes(
 
 def _message(label: str, made: Reconstruction) -> dict[str, Any]:
     if not len(made.surface.faces):
-        raise ValueError(f"The model {label} makes an empty shape of this picture. Try another picture.")
+        raise ValueError(
+            f"The model {label} makes an empty shape of this picture. Try another picture."
+        )
     angle = np.radians(made.azimuth_deg)
     x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
     glb = mesh_bytes(made.surface, "glb", "object")
@@ -152,7 +176,9 @@ def example(category: str) -> bytes:
     rgb, alpha = photograph(vertices, mesh.faces, colors, camera, image_size=SIDE, lights=lights)
     left, top, right, bottom = mask_box(alpha[0])
     image = Image.fromarray(np.dstack([rgb[0], alpha[0]]))
-    image.crop((left - _MARGIN, top - _MARGIN, right + _MARGIN, bottom + _MARGIN)).save(png := io.BytesIO(), "png")
+    image.crop((left - _MARGIN, top - _MARGIN, right + _MARGIN, bottom + _MARGIN)).save(
+        png := io.BytesIO(), "png"
+    )
     return png.getvalue()
 
 

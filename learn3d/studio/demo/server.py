@@ -32,13 +32,23 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from learn3d.studio.demo.picture import EXAMPLES, SIDE, Picture, example, make_meshes, unpack, unpack_several
+from learn3d.studio.demo.picture import (
+    EXAMPLES,
+    SIDE,
+    Picture,
+    example,
+    make_meshes,
+    unpack,
+    unpack_several,
+)
 from learn3d.studio.picture_to_mesh.reconstruction import Model, load_model
 from learn3d.studio.picture_to_mesh.several import MOST_PICTURES
 from learn3d.terminal import plain, say
 
 MOST_BYTES = 5 * SIDE**2  # largest body of a request
-VISITORS = 200  # pictures that are received or wait, 260 MB in all; the browser of a later one tries again
+VISITORS = (
+    200  # pictures that are received or wait, 260 MB in all; the browser of a later one tries again
+)
 OF_ADDRESS = 40  # pictures of one address among them
 CONNECTIONS = 400  # connections of one address; further ones are closed at once
 PATIENCE = 30  # seconds in which a picture must arrive
@@ -171,7 +181,9 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
 
     def about(_: Request) -> Response:
         limits = {"side": SIDE, "most": MOST_PICTURES}
-        return JSONResponse({"kinds": list(dict.fromkeys(kinds)), "examples": list(pictures), **limits})
+        return JSONResponse(
+            {"kinds": list(dict.fromkeys(kinds)), "examples": list(pictures), **limits}
+        )
 
     def show_example(request: Request) -> Response:
         if (png := pictures.get(request.path_params["category"])) is None:
@@ -276,20 +288,34 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     """
     names = [Path(run).resolve().name for run in runs]
     names = [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
-    models = dict(zip(names, map(load_model, runs), strict=True)) or {"small model": load_model(None)}
+    models = dict(zip(names, map(load_model, runs), strict=True)) or {
+        "small model": load_model(None)
+    }
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         listening = socket.create_server((host, port), family=family, backlog=VISITORS)
     except (OSError, OverflowError) as error:
-        raise OSError(f"cannot open a page at {host}:{port}; give another --port or --host") from error
+        raise OSError(
+            f"cannot open a page at {host}:{port}; give another --port or --host"
+        ) from error
     errors = logging.StreamHandler()
-    errors.format = lambda record: plain(logging.Handler.format(errors, record))  # it may contain a visitor's text
+    errors.format = lambda record: plain(
+        logging.Handler.format(errors, record)
+    )  # it may contain a visitor's text
     logging.getLogger("uvicorn").addHandler(errors)
     jobs = JobQueue()
     limits = {"timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
     off = dict.fromkeys(("access_log", "server_header", "proxy_headers"), False)
-    options = {"http": Connection, "ws": "none", "lifespan": "off", "log_config": None, "log_level": "error"}
-    server = uvicorn.Server(uvicorn.Config(application(models, host, jobs), **limits, **options, **off))
+    options = {
+        "http": Connection,
+        "ws": "none",
+        "lifespan": "off",
+        "log_config": None,
+        "log_level": "error",
+    }
+    server = uvicorn.Server(
+        uvicorn.Config(application(models, host, jobs), **limits, **options, **off)
+    )
     jobs.closed = lambda: server.should_exit
     name = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     url = f"http://{name}:{listening.getsockname()[1]}/"

@@ -73,9 +73,13 @@ class DatasetConfig:
 
     def __post_init__(self) -> None:
         if self.source is None and self.procedural == 0:
-            raise ValueError("give --source (a folder of meshes or a mesh pack .npz), --procedural (a number), or both")
+            raise ValueError(
+                "give --source (a folder of meshes or a mesh pack .npz), --procedural (a number), or both"
+            )
         if self.source and self.procedural and (self.up, self.front_axis) != ("y", "z"):
-            raise ValueError("with --procedural, meshes of --source must have its axes: --up y --front z")
+            raise ValueError(
+                "with --procedural, meshes of --source must have its axes: --up y --front z"
+            )
         writer = WRITERS[self.layout]
         if self.shards and writer.join is None:
             raise ValueError(
@@ -91,7 +95,9 @@ class DatasetConfig:
             if given is None:
                 object.__setattr__(self, name, usual)
             elif given != usual and name in writer.fixed:
-                raise ValueError(f"{name} is always {usual:g} in the layout {self.layout}, got {given}; leave it out")
+                raise ValueError(
+                    f"{name} is always {usual:g} in the layout {self.layout}, got {given}; leave it out"
+                )
 
     @property
     def front_axis(self) -> str:
@@ -100,7 +106,9 @@ class DatasetConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """The settings that determine the files, as JSON values."""
-        settings = {name: value for name, value in asdict(self).items() if name not in WITHOUT_EFFECT}
+        settings = {
+            name: value for name, value in asdict(self).items() if name not in WITHOUT_EFFECT
+        }
         return settings | {"source": self.source and self.source.name}
 
 
@@ -119,11 +127,15 @@ class Item:
 def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
     """The meshes of each of the splits train, val and test. Raises ValueError if there are none to train on."""
     if config.procedural and config.category not in CATEGORIES:
-        raise ValueError(f"the procedural generator makes {', '.join(CATEGORIES)}; got category {config.category!r}")
+        raise ValueError(
+            f"the procedural generator makes {', '.join(CATEGORIES)}; got category {config.category!r}"
+        )
     sources = mesh_sources(config.source) if config.source else {}
     augmented = len(sources) or config.procedural
     for i in range(config.procedural):
-        sources[f"{config.category}_{i:05d}"] = partial(numbered_shape, config.category, config.seed, i)
+        sources[f"{config.category}_{i:05d}"] = partial(
+            numbered_shape, config.category, config.seed, i
+        )
     names, files = object_names(sources), list(sources)
     numbers = split_objects(len(files), config.test, config.val, config.seed)
 
@@ -144,10 +156,16 @@ def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
         count = sum(name[:1] == "v" and name[1:].isdigit() for name in npz.names(source, _PACK))
         found = {f"{i:0{len(str(count - 1))}d}": partial(_packed, source, i) for i in range(count)}
     else:
-        paths = {p.relative_to(source).as_posix(): p for p in source.rglob("*") if p.suffix.lower() in EXTENSIONS}
+        paths = {
+            p.relative_to(source).as_posix(): p
+            for p in source.rglob("*")
+            if p.suffix.lower() in EXTENSIONS
+        }
         found = {name: partial(read_mesh, paths[name]) for name in sorted(paths)}
     if not found:
-        raise ValueError(f"there is no mesh in {source}; give {_PACK}, or a folder of {', '.join(EXTENSIONS)}")
+        raise ValueError(
+            f"there is no mesh in {source}; give {_PACK}, or a folder of {', '.join(EXTENSIONS)}"
+        )
     return found
 
 
@@ -156,7 +174,9 @@ def _packed(path: Path, number: int) -> RawMesh:
     vertices, faces = npz.read_several(path, [f"v{number}", f"f{number}"], _PACK)
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
         found = f"{vertices.dtype} {list(vertices.shape)}, {faces.dtype} {list(faces.shape)}"
-        raise ValueError(f"not a triangle mesh: wanted vertices float [V, 3] and faces int [F, 3], got {found}")
+        raise ValueError(
+            f"not a triangle mesh: wanted vertices float [V, 3] and faces int [F, 3], got {found}"
+        )
     return RawMesh(vertices, faces)
 
 
@@ -169,7 +189,10 @@ def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, n
     object is left for training.
     """
     least = min(4, count // (1 + (test > 0) + (val > 0)))
-    sizes = [int(part) if part >= 1 else max(least * (part > 0), round(part * count)) for part in (test, val)]
+    sizes = [
+        int(part) if part >= 1 else max(least * (part > 0), round(part * count))
+        for part in (test, val)
+    ]
     if sum(sizes) >= count:
         raise ValueError(
             f"test ({sizes[0]}) and val ({sizes[1]}) leave none of the {count} meshes to train on; give more meshes, "
@@ -194,9 +217,13 @@ def check(mesh: RawMesh | Trimesh) -> RawMesh:
     """The mesh without unused vertices. Raises ValueError if it cannot be rendered."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if not 0 < len(faces) <= MAX_FACES:
-        raise ValueError(f"too large: {len(faces)} faces, the limit is {MAX_FACES}" if len(faces) else "no faces")
+        raise ValueError(
+            f"too large: {len(faces)} faces, the limit is {MAX_FACES}" if len(faces) else "no faces"
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"faces refer to vertices {faces.min()} .. {faces.max()}, but there are {len(vertices)}")
+        raise ValueError(
+            f"faces refer to vertices {faces.min()} .. {faces.max()}, but there are {len(vertices)}"
+        )
     used, faces = np.unique(faces, return_inverse=True)
     vertices = vertices[used].astype(np.float64)
     extent = np.ptp(vertices, axis=0).max()

@@ -35,26 +35,45 @@ class DatasetReport:
         """meshes: each with name, split, and either objects (names, with those of scaled copies) or reason."""
         self.config, self.skipped = config, [mesh for mesh in meshes if "reason" in mesh]
         self.used = [mesh for mesh in meshes if "objects" in mesh]
-        names = {split: [n for m in self.used if m["split"] == split for n in m["objects"]] for split in SPLITS}
+        names = {
+            split: [n for m in self.used if m["split"] == split for n in m["objects"]]
+            for split in SPLITS
+        }
         self.objects = {split: found for split, found in names.items() if found}
         self.counts = {split: len(found) for split, found in self.objects.items()}
         if "train" not in self.counts:
             reasons = "; ".join(f"{mesh['name']}: {mesh['reason']}" for mesh in self.skipped[:3])
-            raise ValueError(f"no mesh is left for training; give more meshes. Skipped: {reasons or 'none'}")
+            raise ValueError(
+                f"no mesh is left for training; give more meshes. Skipped: {reasons or 'none'}"
+            )
 
     def text(self) -> str:
         """The report for people."""
-        lines = [f"{self.config.category}: {len(self.used)} meshes used, {len(self.skipped)} skipped"]
-        lines.append("objects: " + ", ".join(f"{split} {count}" for split, count in self.counts.items()))
-        lines += [f"skipped {mesh['name']} ({mesh['split']}): {mesh['reason']}" for mesh in self.skipped[:MAX_LISTED]]
-        lines.append(f"contact sheet {self.config.output / report_files(self.config.category)[1]}: {LEGEND}")
+        lines = [
+            f"{self.config.category}: {len(self.used)} meshes used, {len(self.skipped)} skipped"
+        ]
+        lines.append(
+            "objects: " + ", ".join(f"{split} {count}" for split, count in self.counts.items())
+        )
+        lines += [
+            f"skipped {mesh['name']} ({mesh['split']}): {mesh['reason']}"
+            for mesh in self.skipped[:MAX_LISTED]
+        ]
+        lines.append(
+            f"contact sheet {self.config.output / report_files(self.config.category)[1]}: {LEGEND}"
+        )
         return "\n".join(lines)
 
     def write(self, folder: Path, rows: Mapping[str, Sequence[list[np.ndarray]]]) -> None:
         """Write the card, which suffices to make the data set again, and the contact sheet."""
-        splits = {split: [mesh["name"] for mesh in self.used if mesh["split"] == split] for split in self.counts}
+        splits = {
+            split: [mesh["name"] for mesh in self.used if mesh["split"] == split]
+            for split in self.counts
+        }
         card, sheet = (folder / name for name in report_files(self.config.category))
-        write_json(card, {"settings": self.config.to_dict(), "splits": splits, "skipped": self.skipped})
+        write_json(
+            card, {"settings": self.config.to_dict(), "splits": splits, "skipped": self.skipped}
+        )
         write_png(sheet, draw_sheet(rows, self.config.views))
 
 
@@ -86,7 +105,9 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
         )
     config.output.mkdir(parents=True, exist_ok=True)
     made, rows = [], {split: [] for split in SPLITS}
-    bar = tqdm(items, desc=config.category, unit="mesh", disable=not is_watched(), dynamic_ncols=True)
+    bar = tqdm(
+        items, desc=config.category, unit="mesh", disable=not is_watched(), dynamic_ncols=True
+    )
     with publishing(config.output, [*paths, *writer.shared]) as folder:
         writer.write(render_meshes(config, bar, made, rows), config.category, folder, config.output)
         report = DatasetReport(config, made)
@@ -118,7 +139,11 @@ def render_meshes(
             mesh["reason"] = getattr(error, "message", str(error))
         made.append(mesh)
         if objects and item.split in rows and len(rows[item.split]) < ROWS:
-            grid = WRITERS[config.layout].convention.to_object(torch.from_numpy(objects[0].voxels)[None])[0].numpy()
+            grid = (
+                WRITERS[config.layout]
+                .convention.to_object(torch.from_numpy(objects[0].voxels)[None])[0]
+                .numpy()
+            )
             rows[item.split].append(make_row(objects[0].rgb, objects[0].alpha, grid))
         yield from objects
 
@@ -131,13 +156,19 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
     """
     writer, rng = WRITERS[config.layout], np.random.default_rng([config.seed, 1, item.number, copy])
     scale = rng.uniform(*SCALE_RANGE, size=3)
-    color = np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(np.float32)  # light grey
+    color = np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(
+        np.float32
+    )  # light grey
     turned = mesh.vertices @ mesh_to_object(config.up, config.front_axis).T
     placed = fit_to_box(fit_to_box(turned) * (scale if copy else 1.0)) @ writer.turn.T
     if writer.diagonal is not None:
         placed = placed / (np.linalg.norm(np.ptp(placed, axis=0)) / writer.diagonal)
     rng = np.random.default_rng([config.seed, 2, item.number, copy])
-    poses = writer.views(placed, config.views, rng) if writer.views else view_poses(torch.arange(config.views))
+    poses = (
+        writer.views(placed, config.views, rng)
+        if writer.views
+        else view_poses(torch.arange(config.views))
+    )
     lights = studio_lights((writer.turn @ KEY_LIGHT).tolist())
     if writer.natural:
         color, lights = natural_look(placed, mesh.faces, rng)
@@ -145,7 +176,9 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
         torch.as_tensor(placed, dtype=torch.float32).contiguous(),
         torch.from_numpy(mesh.faces),
     )
-    rgb, alpha = photograph(vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights)
+    rgb, alpha = photograph(
+        vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights
+    )
     if not alpha.any():
         raise ValueError("no view shows it: its faces have no area, or are smaller than a pixel")
     voxels = writer.convention.voxelize(vertices, faces)[0].numpy()
@@ -167,14 +200,20 @@ def make_shards(config: DatasetConfig) -> int:
     for split, items in splits.items():
         for number, part in enumerate(_parts(items)):
             path, log = shard_path(folder / split, number), folder / f"{split}-{number:05d}.log"
-            tasks[path] = Task(f"{split} {number}", make_shard, (config, path, number, part, threads), log)
+            tasks[path] = Task(
+                f"{split} {number}", make_shard, (config, path, number, part, threads), log
+            )
     missing = [task for path, task in tasks.items() if not path.is_file()]
-    note(f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}")
+    note(
+        f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}"
+    )
     failed = run_tasks(missing, config.workers)
     if count := sum(not path.is_file() for path in tasks):
         note(f"{count} shards are missing; the same command makes them")
         return 1 if failed else INTERRUPTED
-    lists = [read_json(path.with_suffix(LIST), 2**28, "the list of a shard's meshes") for path in tasks]
+    lists = [
+        read_json(path.with_suffix(LIST), 2**28, "the list of a shard's meshes") for path in tasks
+    ]
     report = DatasetReport(config, [mesh for found in lists for mesh in found])
     rows = {split: [] for split in report.counts}
     for split in rows:
@@ -192,7 +231,9 @@ def make_shards(config: DatasetConfig) -> int:
     return 0
 
 
-def make_shard(config: DatasetConfig, path: Path, number: int, items: Sequence[Item], threads: int) -> bool:
+def make_shard(
+    config: DatasetConfig, path: Path, number: int, items: Sequence[Item], threads: int
+) -> bool:
     """Make one shard and the list of its meshes. Returns False if a signal stopped it."""
     torch.set_num_threads(threads)
     made, objects = [], []

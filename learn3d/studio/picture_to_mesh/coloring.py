@@ -50,10 +50,14 @@ def color_mesh(
     that maps the shape to itself, None without symmetry. textured: double the vertices along sharp edges, and add a
     texture image.
     """
-    of_pictures = [_seen(*mesh, view.select(torch.tensor([n])), picture) for n, picture in enumerate(pictures)]
+    of_pictures = [
+        _seen(*mesh, view.select(torch.tensor([n])), picture) for n, picture in enumerate(pictures)
+    ]
 
     def look_up_seen(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        seen, weight = map(torch.stack, zip(*(each(points, normals) for each in of_pictures), strict=True))
+        seen, weight = map(
+            torch.stack, zip(*(each(points, normals) for each in of_pictures), strict=True)
+        )
         shares = (weight**BEST_PICTURE)[..., None]
         return (shares * seen).sum(0) / shares.sum(0).clamp(min=1e-9), weight.amax(0)
 
@@ -74,15 +78,22 @@ def color_mesh(
 def _seen(vertices: Tensor, faces: Tensor, view: View, picture: np.ndarray) -> LookUp:
     """The colours of a picture at the points of a surface that it shows."""
     camera, size = view.cameras(), DEPTH_SIZE
-    depth_map = nmr.render_depth(view.place(vertices[None]), faces, camera, image_size=size, anti_aliasing=False)
+    depth_map = nmr.render_depth(
+        view.place(vertices[None]), faces, camera, image_size=size, anti_aliasing=False
+    )
     pixels = torch.from_numpy(picture[:3].astype(np.float32) / 255)
     inside = torch.from_numpy((picture[3:] > 127).astype(np.float32))
-    reliable = sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in (1, BORDER)) / 2
+    reliable = (
+        sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in (1, BORDER)) / 2
+    )
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         placed = view.place(points[None])
         x, y, z = camera.transform(placed)[0].unbind(1)
-        grid, options = torch.stack([x, -y], 1)[None, None], {"padding_mode": "border", "align_corners": False}
+        grid, options = (
+            torch.stack([x, -y], 1)[None, None],
+            {"padding_mode": "border", "align_corners": False},
+        )
         found, depth, trusted = (
             F.grid_sample(v[None], grid, **options)[0, :, 0] for v in (pixels, depth_map, reliable)
         )
@@ -104,7 +115,10 @@ def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> 
     """
     clear = (weight >= min(0.5, float(weight.max()))).numpy()
     neighbours = joined(faces.numpy(), len(colors))
-    given, nearest = weight.double().numpy()[:, None] ** 2, _nearest_clear(vertices.numpy(), clear, neighbours)
+    given, nearest = (
+        weight.double().numpy()[:, None] ** 2,
+        _nearest_clear(vertices.numpy(), clear, neighbours),
+    )
     laplacian = diags_array(neighbours.sum(1)) - neighbours
     system = (diags_array(given[:, 0] + 1e-5) + 0.01 * laplacian).tocsc()
     colors = colors.double().numpy()
@@ -156,7 +170,9 @@ def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor
     three of the 3 F corners, int64 [N, 3], and their barycentric shares, float32 [N, 3].
     """
     edges = np.linalg.norm(triangles - np.roll(triangles, 1, 1), axis=2)
-    order = (edges.argmin(1)[:, None] + np.arange(3)) % 3  # the shortest edge goes down from the first corner
+    order = (
+        edges.argmin(1)[:, None] + np.arange(3)
+    ) % 3  # the shortest edge goes down from the first corner
     kinds = np.searchsorted(SIDES[:-1], TEXELS * np.stack([edges.max(1), edges.min(1)], 1))
     corners, texels, top = np.empty((len(triangles), 3, 2), np.float32), [], 0
     for kind in np.unique(kinds, axis=0):
@@ -178,7 +194,12 @@ def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor
         pairs = np.resize(faces, (cells, 2))[:, :, None, None]
         face = np.where(is_second, pairs[:, 1], pairs[:, 0])
         place = (low[:, None, None] + y) * WIDTH + left[:, None, None] + x
-        of_cells = 3 * face[..., None] + order[face], np.broadcast_to(np.float32(shares), (*face.shape, 3))
+        of_cells = (
+            3 * face[..., None] + order[face],
+            np.broadcast_to(np.float32(shares), (*face.shape, 3)),
+        )
         texels.append((place.ravel(), *(each.reshape(-1, 3) for each in of_cells)))
-    place, corner, shares = (torch.from_numpy(np.concatenate(each)) for each in zip(*texels, strict=True))
+    place, corner, shares = (
+        torch.from_numpy(np.concatenate(each)) for each in zip(*texels, strict=True)
+    )
     return top, torch.from_numpy(corners), place, corner, shares

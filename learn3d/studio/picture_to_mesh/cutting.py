@@ -23,12 +23,17 @@ PLAIN = 0.9  # least share of the border with one colour in pictures with a plai
 TOLERANCE = 0.12  # largest difference from the background's colour, in 0 .. 1
 JPEG_NOISE = 6  # levels by which compression changes the background near an object
 PLAIN_HOLE = 0.5  # a hole of the mask shows the background if more than this share of it has the background's colour,
-HOLES = 0.001, 0.4  # and its size, as a share of the object, lies between these; larger ones are often white table tops
+HOLES = (
+    0.001,
+    0.4,
+)  # and its size, as a share of the object, lies between these; larger ones are often white table tops
 KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
 _ROUNDS, _ROUNDS_FROM_GUESS, _ROUNDS_IN_STROKES = 5, 3, 2
 _AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
 
-_BANDS = 12  # bands of rows; a pixel is compared with the background of its own band and its neighbours
+_BANDS = (
+    12  # bands of rows; a pixel is compared with the background of its own band and its neighbours
+)
 _SAMPLES = 600  # pixels of the background in a band
 _SHADES = 0.88, 0.76, 0.65, 0.55, 0.46  # brightness of the background in shadows of different depth
 _SHADED_FROM = 0.4  # height in the picture, from the top, below which there are shadows
@@ -40,11 +45,20 @@ _TOUCHED = 0.03  # share of a side of the picture, from which the object touches
 _PREFERRED = 0.05  # by which GrabCut from the whole region must be judged better
 _FILLED = 0.75  # share of its box, below which an object in a given box is not the whole one
 _PROBABLE = -0.6  # mark of an object that is probably the right one
-_RECTANGLE, _UNLIKELY = 0.9, 0.3  # share of its box that an upright rectangle fills; by which its mark is worse
-_FRAME, _FRAME_FILL = 0.05, 0.7  # least areas of a picture on the wall, over those of the mask and of its own box
+_RECTANGLE, _UNLIKELY = (
+    0.9,
+    0.3,
+)  # share of its box that an upright rectangle fills; by which its mark is worse
+_FRAME, _FRAME_FILL = (
+    0.05,
+    0.7,
+)  # least areas of a picture on the wall, over those of the mask and of its own box
 _FRAME_WIDTH = 5  # pixels
 _OFF_CENTRE = 0.6  # weight of the distance from the centre against the judgement
-_PARTS, _PART = 3, 0.1  # parts that may be the object, and their least area over that of the largest
+_PARTS, _PART = (
+    3,
+    0.1,
+)  # parts that may be the object, and their least area over that of the largest
 _RAGGED = 600  # squared length of an outline over its area, in pixels; a thin-legged chair has 200
 
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
@@ -72,9 +86,15 @@ def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None
     if is_plain(colors):
         mask, how = threshold_mask(colors), "as all that differs from the plain background"
     elif importlib.util.find_spec("rembg") is not None:
-        mask, how = _ask_rembg(colors), "by rembg, which loads its weights from the internet at its first use"
+        mask, how = (
+            _ask_rembg(colors),
+            "by rembg, which loads its weights from the internet at its first use",
+        )
     else:
-        mask, how = cut_out(colors, judge=judge), "by its difference from the background at the border"
+        mask, how = (
+            cut_out(colors, judge=judge),
+            "by its difference from the background at the border",
+        )
     return Outline(mask, how, find_doubt(keep_object(mask)[0]))
 
 
@@ -84,7 +104,9 @@ def find_doubt(mask: np.ndarray) -> str | None:
     scale = min(1.0, SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     inside = np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX)) > 127
-    sides = sum(line.mean() > _TOUCHED for line in (inside[0], inside[-1], inside[:, 0], inside[:, -1]))
+    sides = sum(
+        line.mean() > _TOUCHED for line in (inside[0], inside[-1], inside[:, 0], inside[:, -1])
+    )
     if sides > 1:
         return f"its outline touches {sides} sides of the picture"
     length = np.count_nonzero(inside & ~ndimage.binary_erosion(inside))
@@ -104,7 +126,9 @@ def _ask_rembg(colors: np.ndarray) -> np.ndarray:
     try:
         mask = rembg.remove(Image.fromarray(colors), session=_rembg_session(), only_mask=True)
     except OSError as error:  # the weights cannot be loaded, for example
-        raise ValueError(f"rembg does not cut the object out ({error}); give a box or a mask") from error
+        raise ValueError(
+            f"rembg does not cut the object out ({error}); give a box or a mask"
+        ) from error
     return 255 * (np.asarray(mask) > 127).astype(np.uint8)
 
 
@@ -133,7 +157,10 @@ def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarr
     inside = ndimage.binary_fill_holes(found)
     holes, count = ndimage.label(inside & ~found)
     numbers = np.arange(1, count + 1)
-    plain = ndimage.mean(difference <= max(JPEG_NOISE, np.percentile(noise, 90)), holes, numbers) > PLAIN_HOLE
+    plain = (
+        ndimage.mean(difference <= max(JPEG_NOISE, np.percentile(noise, 90)), holes, numbers)
+        > PLAIN_HOLE
+    )
     share = ndimage.sum(holes > 0, holes, numbers) / max(1, inside.sum())
     seen_through = plain & (share > HOLES[0]) & (share < HOLES[1])
     return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
@@ -152,13 +179,24 @@ def cut_out(colors: np.ndarray, box: Box | None = None, judge: Judge | None = No
     scale = min(1.0, SIDE / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     small = np.asarray(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
-    x, y, w, h = box or (INSET * width, INSET * height, (1 - 2 * INSET) * width, (1 - 2 * INSET) * height)
+    x, y, w, h = box or (
+        INSET * width,
+        INSET * height,
+        (1 - 2 * INSET) * width,
+        (1 - 2 * INSET) * height,
+    )
     if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
-        raise ValueError(f"the box {box} (x, y, width, height) must lie within the {width}x{height} pixels")
+        raise ValueError(
+            f"the box {box} (x, y, width, height) must lie within the {width}x{height} pixels"
+        )
     region = np.zeros(small.shape[:2], bool)
-    region[round(y * scale) : round((y + h) * scale), round(x * scale) : round((x + w) * scale)] = True
+    region[round(y * scale) : round((y + h) * scale), round(x * scale) : round((x + w) * scale)] = (
+        True
+    )
     if region.all():
-        raise ValueError("the box covers the whole picture; leave some background around the object")
+        raise ValueError(
+            "the box covers the whole picture; leave some background around the object"
+        )
     whole = _only_object(_grab_cut(small, region, region, _ROUNDS))
     if box is None:
         inside = _choose(small, region, whole, judge)
@@ -166,7 +204,9 @@ def cut_out(colors: np.ndarray, box: Box | None = None, judge: Judge | None = No
         inside = _only_object(_separate(small, region))
         if _extent(inside) < _FILLED * _extent(whole):
             inside = whole
-    mask = Image.fromarray(255 * inside.astype(np.uint8)).resize((width, height), Image.Resampling.BILINEAR)
+    mask = Image.fromarray(255 * inside.astype(np.uint8)).resize(
+        (width, height), Image.Resampling.BILINEAR
+    )
     return 255 * (np.asarray(mask) > 127).astype(np.uint8)
 
 
@@ -190,7 +230,11 @@ def _parts(inside: np.ndarray) -> list[np.ndarray]:
 
 def _offset(inside: np.ndarray) -> float:
     """Distance of the centre of a mask, bool [H, W], from that of the picture, in sides of the picture."""
-    return float(np.hypot(*(np.nonzero(inside)[k].mean() / side - 0.5 for k, side in enumerate(inside.shape))))
+    return float(
+        np.hypot(
+            *(np.nonzero(inside)[k].mean() / side - 0.5 for k, side in enumerate(inside.shape))
+        )
+    )
 
 
 def _difference(colors: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -237,9 +281,13 @@ def _around(inside: np.ndarray) -> np.ndarray:
     """The box of a mask, bool [H, W], and a little more, but never the border of the picture."""
     region = np.zeros_like(inside)
     height, width = inside.shape
-    left, top, right, bottom = mask_box(255 * inside.astype(np.uint8)) if inside.any() else (0, 0, width, height)
+    left, top, right, bottom = (
+        mask_box(255 * inside.astype(np.uint8)) if inside.any() else (0, 0, width, height)
+    )
     x, y = (round(_AWAY * side) + 2 for side in (right - left, bottom - top))
-    region[max(2, top - y) : min(height - 2, bottom + y), max(2, left - x) : min(width - 2, right + x)] = True
+    region[
+        max(2, top - y) : min(height - 2, bottom + y), max(2, left - x) : min(width - 2, right + x)
+    ] = True
     return region
 
 
@@ -260,7 +308,9 @@ def _without_frames(patches: np.ndarray, inside: np.ndarray) -> Iterator[np.ndar
             yield _only_object(rest)
 
 
-def _choose(colors: np.ndarray, region: np.ndarray, whole: np.ndarray, judge: Judge | None) -> np.ndarray:
+def _choose(
+    colors: np.ndarray, region: np.ndarray, whole: np.ndarray, judge: Judge | None
+) -> np.ndarray:
     """The most probable object, bool [H, W], in a region: `whole`, or a part that is unlike the background.
 
     If none is probable, it is looked for once more beside these parts.
@@ -294,15 +344,22 @@ def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.nda
     Each pixel of the strokes is KEEP (as in the mask), OBJECT, BACKGROUND or OPEN (GrabCut decides). colors: uint8
     [H, W, 3]. Raises ValueError without OpenCV.
     """
-    inside, unsure = np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND)), strokes == OPEN
+    inside, unsure = (
+        np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND)),
+        strokes == OPEN,
+    )
     if unsure.any():
         rows, columns = (np.flatnonzero(unsure.any(axis=axis)) for axis in (1, 0))
-        part = tuple(slice(max(0, line[0] - _AROUND), line[-1] + 1 + _AROUND) for line in (rows, columns))
+        part = tuple(
+            slice(max(0, line[0] - _AROUND), line[-1] + 1 + _AROUND) for line in (rows, columns)
+        )
         inside[part] = _grab_cut(colors[part], inside[part], unsure[part], _ROUNDS_IN_STROKES)
     return 255 * inside.astype(np.uint8)
 
 
-def _grab_cut(colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray, rounds: int) -> np.ndarray:
+def _grab_cut(
+    colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray, rounds: int
+) -> np.ndarray:
     """GrabCut (Rother et al. 2004): decide again which of the pixels `unsure` are inside of an object, bool [H, W]."""
     try:
         import cv2
@@ -316,5 +373,12 @@ def _grab_cut(colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray, rounds
     labels = inside + np.uint8(2) * unsure  # GC_BGD, GC_FGD, GC_PR_BGD, GC_PR_FGD
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(colors[..., ::-1]), labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(
+        np.ascontiguousarray(colors[..., ::-1]),
+        labels,
+        None,
+        *models,
+        rounds,
+        cv2.GC_INIT_WITH_MASK,
+    )
     return labels % 2 == 1

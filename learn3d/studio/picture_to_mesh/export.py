@@ -14,7 +14,12 @@ from learn3d.studio.picture_to_mesh.templates import TEMPLATES, learn_templates
 from learn3d.terminal import note
 
 #: Settings that are not needed any more, or that ask for networks of the training only.
-_UNUSED = {"pretrained": None, "lambda_classification": 0.0, "lambda_adversarial": 0.0, "lambda_novel_view": 0.0}
+_UNUSED = {
+    "pretrained": None,
+    "lambda_classification": 0.0,
+    "lambda_adversarial": 0.0,
+    "lambda_novel_view": 0.0,
+}
 
 
 def export(source: Path, target: Path, *, which: str = "last", others: Tensor | None = None) -> int:
@@ -37,7 +42,9 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         if name.startswith(("network.encoder.", "network.generator.", "network.view_classifier."))
     }
     if not config.data.is_dir():
-        note(f"note: {config.data} is missing, so reconstruction with this file cannot warn of unknown objects")
+        note(
+            f"note: {config.data} is missing, so reconstruction with this file cannot warn of unknown objects"
+        )
     elif isinstance(method, MeshMethod):
         dataset = checkpoint.load_data(config, "train")
         known = zip(KNOWN_CODES, known_codes(method, dataset, others), strict=True)
@@ -47,6 +54,9 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
     settings = {name: value for name, value in _UNUSED.items() if hasattr(config.settings, name)}
     settings = dataclasses.replace(config.settings, **settings)
     config = dataclasses.replace(config, settings=settings, data=Path("data"), output=Path("run"))
-    halves = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+    halves = {
+        name: tensor.half() if tensor.is_floating_point() else tensor
+        for name, tensor in tensors.items()
+    }
     checkpoint.save(target, halves, dataclasses.replace(metadata, config=config))
     return target.stat().st_size

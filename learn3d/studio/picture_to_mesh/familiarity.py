@@ -17,9 +17,18 @@ IMAGES = 4000  # training images whose codes are clustered
 MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
 OTHER = 2.0  # logit of the network above which a picture is unknown
 NEAR = 0.55  # distance to a category below which a picture is of it, whatever the network says
-KNOWN_CODES = "known_codes", "hidden_layer", "output_layer"  # names of the tensors of `KnownCodes` in a checkpoint
+KNOWN_CODES = (
+    "known_codes",
+    "hidden_layer",
+    "output_layer",
+)  # names of the tensors of `KnownCodes` in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
-_HIDDEN, _MEMBERS, _DROPOUT, _STEPS = 64, 2, 0.3, 300  # sizes of the classifiers, whose logits are averaged
+_HIDDEN, _MEMBERS, _DROPOUT, _STEPS = (
+    64,
+    2,
+    0.3,
+    300,
+)  # sizes of the classifiers, whose logits are averaged
 _SCALE = 10.0  # length of the codes that they see
 
 
@@ -27,7 +36,9 @@ class KnownCodes(NamedTuple):
     """Cluster centres (k-means) of normalised codes, and a network that knows codes of other objects."""
 
     kinds: Tensor  # float [N, K, C]: centres of the training images of N categories
-    hidden: Tensor | None = None  # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
+    hidden: Tensor | None = (
+        None  # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
+    )
     output: Tensor | None = None  # float [H + 1]: weights of its logit, the bias last
 
     def nearest_kind(self, code: Tensor) -> int:
@@ -58,15 +69,26 @@ def _distance(code: Tensor, centres: Tensor) -> Tensor:
     return apart.topk(min(_NEAREST, len(apart)), largest=False).values.mean()
 
 
-def known_codes(method: MeshMethod, dataset: ViewDataset, others: Tensor | None = None) -> KnownCodes:
+def known_codes(
+    method: MeshMethod, dataset: ViewDataset, others: Tensor | None = None
+) -> KnownCodes:
     """Known codes of a training set and, optionally, of stored images uint8 [M, 4, S, S] of other objects."""
-    chosen = torch.from_numpy(np.linspace(0, len(dataset) - 1, min(IMAGES, len(dataset))).astype(np.int64))
+    chosen = torch.from_numpy(
+        np.linspace(0, len(dataset) - 1, min(IMAGES, len(dataset))).astype(np.int64)
+    )
     batches = [dataset.batch(part, voxels=False) for part in chosen.split(128)]
-    classes, codes = torch.cat([b.class_ids for b in batches]), _directions(method, (b.images for b in batches))
-    count = min(CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min()))
+    classes, codes = (
+        torch.cat([b.class_ids for b in batches]),
+        _directions(method, (b.images for b in batches)),
+    )
+    count = min(
+        CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min())
+    )
     of_kinds = (codes[classes == kind].numpy() for kind in range(dataset.num_classes))
     options = {"k": count, "minit": "points"}
-    kinds = torch.stack([torch.from_numpy(kmeans2(c, **options, rng=np.random.default_rng(0))[0]) for c in of_kinds])
+    kinds = torch.stack(
+        [torch.from_numpy(kmeans2(c, **options, rng=np.random.default_rng(0))[0]) for c in of_kinds]
+    )
     if others is None:
         return KnownCodes(kinds)
     return KnownCodes(kinds, *learn_others(codes, _directions(method, others.split(128))))
@@ -89,7 +111,9 @@ def learn_others(known: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
             optimizer = torch.optim.AdamW(network.parameters(), 1e-2, weight_decay=0.1)
             for _ in range(_STEPS):
                 optimizer.zero_grad()
-                F.binary_cross_entropy_with_logits(network(codes)[:, 0], wanted, share, reduction="sum").backward()
+                F.binary_cross_entropy_with_logits(
+                    network(codes)[:, 0], wanted, share, reduction="sum"
+                ).backward()
                 optimizer.step()
             hidden.append(torch.cat([first.weight, first.bias[:, None]], 1).detach())
             output.append(last.weight[0].detach() / _MEMBERS)

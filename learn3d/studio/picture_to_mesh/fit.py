@@ -33,10 +33,19 @@ STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
 # Units of azimuth, elevation, distance and shift as variables: a step moves the outline about equally far for each.
 _SCALES = (60.0, 60.0, 1.0, 1.0)
 #: Options of torch's function `adam`. Its class Adam would import torch._dynamo, which takes a second.
-_ADAM = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "weight_decay": 0.0, "amsgrad": False, "maximize": False}
+_ADAM = {
+    "beta1": 0.9,
+    "beta2": 0.999,
+    "eps": 1e-8,
+    "weight_decay": 0.0,
+    "amsgrad": False,
+    "maximize": False,
+}
 
 Meshes = Tensor | Sequence[Tensor]
-Progress = Callable[[str, float], object]  # called with the name of each stage and the share (0 .. 1) that is done
+Progress = Callable[
+    [str, float], object
+]  # called with the name of each stage and the share (0 .. 1) that is done
 
 
 class View(NamedTuple):
@@ -70,7 +79,9 @@ class View(NamedTuple):
 
     def silhouettes(self, vertices: Meshes, faces: Meshes) -> Tensor:
         """Silhouettes float32 [N, 64, 64] of shapes [N, V, 3], [1, V, 3] or N tensors [V_n, 3]."""
-        return nmr.render_silhouette(self.place(vertices), faces, self.cameras(), image_size=MASK_SIZE)
+        return nmr.render_silhouette(
+            self.place(vertices), faces, self.cameras(), image_size=MASK_SIZE
+        )
 
     def ious(self, vertices: Meshes, faces: Meshes, mask: Tensor) -> Tensor:
         """Soft IoU [N] of a mask [64, 64] and the `silhouettes` of shapes."""
@@ -99,7 +110,9 @@ def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> 
 
 
 @torch.no_grad()
-def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None) -> tuple[View, float]:
+def find_view(
+    vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None
+) -> tuple[View, float]:
     """Find the view in which the silhouette of a shape [V, 3], [F, 3] is most like a framed mask [64, 64].
 
     The best of a grid of views, with azimuths more than 20 degrees apart, are optimised. probabilities: float32
@@ -115,7 +128,9 @@ def find_view(vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tens
         if all(wrap_deg(grid[row, 0] - grid[other, 0]).abs() > 20 for other in chosen):
             chosen.append(row)
     starts = view.select(torch.tensor(chosen[:STARTS]))
-    view = minimize(lambda view: -view.ious(vertices[None], faces, mask).sum(), starts, STEPS, (0.03,))
+    view = minimize(
+        lambda view: -view.ious(vertices[None], faces, mask).sum(), starts, STEPS, (0.03,)
+    )
     ious = view.ious(vertices[None], faces, mask)
     best = (ious + belief(view.azimuth_deg, probabilities)).argmax()[None]
     return view.select(best), float(ious[best])
@@ -133,7 +148,11 @@ def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
 
 @torch.no_grad()
 def minimize(
-    loss: Callable[[View], Tensor], view: View, steps: int, rates: Sequence[float], *variables: Tensor
+    loss: Callable[[View], Tensor],
+    view: View,
+    steps: int,
+    rates: Sequence[float],
+    *variables: Tensor,
 ) -> View:
     """The view, from `view` on, that minimises a loss together with other variables, by Adam.
 
@@ -150,8 +169,13 @@ def minimize(
     for step in range(steps):
         with torch.enable_grad():
             gradients = torch.autograd.grad(loss(current()), values)
-        for value, gradient, (mean, square), rate in zip(values, gradients, moments, rates, strict=True):
-            now = {"state_steps": [torch.tensor(float(step))], "lr": rate * (1 - 0.9 * step / steps)}
+        for value, gradient, (mean, square), rate in zip(
+            values, gradients, moments, rates, strict=True
+        ):
+            now = {
+                "state_steps": [torch.tensor(float(step))],
+                "lr": rate * (1 - 0.9 * step / steps),
+            }
             adam([value], [gradient], [mean], [square], [], **now, **_ADAM)
     return current()
 
@@ -186,7 +210,9 @@ def predict(method: MeshMethod, image: Tensor, mask: Tensor) -> Prediction:
 
 
 @torch.no_grad()
-def fit(method: MeshMethod, predicted: Prediction, mask: Tensor, progress: Progress = lambda *_: None) -> Fit:
+def fit(
+    method: MeshMethod, predicted: Prediction, mask: Tensor, progress: Progress = lambda *_: None
+) -> Fit:
     """Fit a predicted shape to its framed mask float32 [64, 64]: the code, then the vertices, each with the camera."""
     progress("shape", 0.3)
     start, code = predicted.code, predicted.code.clone().requires_grad_()

@@ -27,7 +27,9 @@ def inflate(picture: np.ndarray) -> tuple[Surface, View]:
     """
     mask = torch.from_numpy(picture[3])[None, None].float()
     inside = torch.nn.functional.interpolate(mask, (CELLS, CELLS), mode="area")[0, 0].numpy() > 127
-    if ndimage.binary_erosion(inside).sum() <= _SOLID * inside.sum():  # lines, dots: smoothing would remove them
+    if (
+        ndimage.binary_erosion(inside).sum() <= _SOLID * inside.sum()
+    ):  # lines, dots: smoothing would remove them
         inside = torch.nn.functional.adaptive_max_pool2d(mask, CELLS)[0, 0].numpy() > 127
     square = DEPTH**2 * _solve(inside) - 4 * ndimage.distance_transform_edt(~inside)
     z = np.arange(CELLS) - (CELLS - 1) / 2
@@ -55,7 +57,9 @@ def _solve(inside: np.ndarray) -> np.ndarray:
         rows.append(np.flatnonzero(near >= 0))
         columns.append(near[near >= 0])
     pairs = np.concatenate(rows), np.concatenate(columns)
-    system = diags_array(np.full(count, 4.0)) - coo_array((np.ones(len(pairs[0])), pairs), (count, count))
+    system = diags_array(np.full(count, 4.0)) - coo_array(
+        (np.ones(len(pairs[0])), pairs), (count, count)
+    )
     solved = np.zeros(padded.shape)
     solved[padded] = spsolve(system.tocsc(), np.full(count, 4.0))
     return solved[1:-1, 1:-1]

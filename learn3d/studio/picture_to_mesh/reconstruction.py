@@ -31,7 +31,12 @@ from learn3d.studio.picture_to_mesh.cutting import Box, Judge, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
-from learn3d.studio.picture_to_mesh.several import MOST_PICTURES, find_outliers, find_strangers, fit_several
+from learn3d.studio.picture_to_mesh.several import (
+    MOST_PICTURES,
+    find_outliers,
+    find_strangers,
+    fit_several,
+)
 from learn3d.studio.picture_to_mesh.smoothing import divide, outer_surface
 from learn3d.studio.picture_to_mesh.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.terminal import note
@@ -40,10 +45,16 @@ MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
 SMALL_MODEL = Path(__file__).with_name("small.safetensors")  # the model in the package
 STRIP_SIZE = 192  # side of each picture in a strip, in pixels
-_OVERSAMPLING = 4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
-_SEARCHED_SIDE = 1024  # side in pixels to which a photograph is reduced before its object is searched
+_OVERSAMPLING = (
+    4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
+)
+_SEARCHED_SIDE = (
+    1024  # side in pixels to which a photograph is reduced before its object is searched
+)
 _COLORED = 256  # side in pixels of the picture that gives the colours
-_LONGEST_EDGE = 0.1  # longest edge of a coloured template, since hidden parts have the colours of its vertices
+_LONGEST_EDGE = (
+    0.1  # longest edge of a coloured template, since hidden parts have the colours of its vertices
+)
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
@@ -64,7 +75,9 @@ class Model(NamedTuple):
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
         """Call `prepare_image` with the image size, object size and layout of these networks."""
         size, layout = self.method.image_size, self.config.layout
-        return prepare_image(colors, mask, crop=crop, object_size=self.object_size, size=size, layout=layout)
+        return prepare_image(
+            colors, mask, crop=crop, object_size=self.object_size, size=size, layout=layout
+        )
 
     @torch.no_grad()
     def judge(self, colors: np.ndarray, mask: np.ndarray) -> float:
@@ -81,7 +94,9 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     method, config, metadata = checkpoint.load_method(path)
     tensors = checkpoint.load(path)[0]
     stored = ((KnownCodes, KNOWN_CODES), (Templates, TEMPLATES))
-    parts = (kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored)
+    parts = (
+        kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored
+    )
     return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, *parts)
 
 
@@ -132,7 +147,13 @@ def reconstruct_files(
             note(f"warning: {name}: {made[0].warning}")
         elif made[0].kind:
             note(f"{name}: category {', '.join(each.kind for each in made)}")
-        paths += save(folder, [name, *(f"{name}-{k}" for k in range(2, len(made) + 1))], made, model, mesh_format)
+        paths += save(
+            folder,
+            [name, *(f"{name}-{k}" for k in range(2, len(made) + 1))],
+            made,
+            model,
+            mesh_format,
+        )
     for error in faults[1:]:
         note(f"error: {error}")
     if faults:
@@ -177,16 +198,22 @@ def reconstruct_object_files(
     return save(folder, [name], [found.made], model, mesh_format)
 
 
-def check_files(folder: Path, named: Sequence[Path], images: Sequence[Path], masks: Sequence[Path]) -> list[str]:
+def check_files(
+    folder: Path, named: Sequence[Path], images: Sequence[Path], masks: Sequence[Path]
+) -> list[str]:
     """Names of the results of `named` images. ValueError if a result would replace a file, or if a mask is missing."""
     if masks and len(masks) != len(images):
-        raise ValueError(f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none")
+        raise ValueError(
+            f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none"
+        )
     names = [Path(image).stem for image in named]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
     given = {Path(path).resolve() for path in (*images, *masks)}
     if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
-        raise ValueError(f"{taken[0]}.png would replace an image that was given; give another --output")
+        raise ValueError(
+            f"{taken[0]}.png would replace an image that was given; give another --output"
+        )
     return names
 
 
@@ -212,20 +239,32 @@ def reconstruct_dataset(
     dataset = checkpoint.load_data(model.config, split, data=data, category=category)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     if refined and batch.poses is None:
-        raise ValueError(f"the data of {dataset.category} have no poses, which fitting needs; leave out --refine")
-    surfaces = reconstruct(model.method, batch.images, *((batch.masks, batch.poses) if refined else ()))
+        raise ValueError(
+            f"the data of {dataset.category} have no poses, which fitting needs; leave out --refine"
+        )
+    surfaces = reconstruct(
+        model.method, batch.images, *((batch.masks, batch.poses) if refined else ())
+    )
     stored = batch.images.numpy()
     if batch.poses is None:
-        azimuths = [input_azimuth_deg(surface, image[3]) for surface, image in zip(surfaces, stored, strict=True)]
+        azimuths = [
+            input_azimuth_deg(surface, image[3])
+            for surface, image in zip(surfaces, stored, strict=True)
+        ]
     else:
         azimuths = azimuths_deg(batch.poses).tolist()
     names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
-    return save(folder, names, list(map(Reconstruction, surfaces, stored, azimuths)), model, mesh_format)
+    return save(
+        folder, names, list(map(Reconstruction, surfaces, stored, azimuths)), model, mesh_format
+    )
 
 
 @torch.no_grad()
 def reconstruct(
-    method: Method, images: np.ndarray | Tensor, masks: Tensor | None = None, poses: Poses | None = None
+    method: Method,
+    images: np.ndarray | Tensor,
+    masks: Tensor | None = None,
+    poses: Poses | None = None,
 ) -> list[Surface]:
     """Shapes, in the object frame, of stored images uint8 [B,4,S,S], for example from `prepare_image`.
 
@@ -292,19 +331,33 @@ def prepare_image(
     if LAYOUTS[layout].stretched:
         box = np.array([[left, top, right - left, bottom - top]])
         planes = (colors, np.repeat(mask[..., None], 3, axis=2))
-        cut, cut_mask = (Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes)
+        cut, cut_mask = (
+            Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes
+        )
         return np.concatenate([cut, cut_mask[:1]])
     side = max(right - left, bottom - top) / (max(object_size, _MIN_OBJECT_SIZE) if crop else 1)
     reduction = max(1, int(side / (_OVERSAMPLING * size)))  # averaging blocks first is much faster
     alpha = mask.astype(np.float32) / 255
     planes = [(255 - colors[..., channel]) * alpha for channel in range(3)] + [255 * alpha]
     planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduction)) for plane in planes])
-    x, y, half = ((left + right) / 2 / reduction, (top + bottom) / 2 / reduction, side / 2 / reduction)
-    pad = math.ceil(max(0, half - x, half - y, x + half - planes.shape[2], y + half - planes.shape[1]))
-    planes = np.pad(planes, ((0, 0), (pad, pad), (pad, pad)))  # 0 is the background of inverted colours
+    x, y, half = (
+        (left + right) / 2 / reduction,
+        (top + bottom) / 2 / reduction,
+        side / 2 / reduction,
+    )
+    pad = math.ceil(
+        max(0, half - x, half - y, x + half - planes.shape[2], y + half - planes.shape[1])
+    )
+    planes = np.pad(
+        planes, ((0, 0), (pad, pad), (pad, pad))
+    )  # 0 is the background of inverted colours
     box = (x - half + pad, y - half + pad, x + half + pad, y + half + pad)
-    filter = Image.Resampling.BOX if 2 * half >= size else Image.Resampling.BILINEAR  # mean of the covered pixels
-    prepared = np.stack([np.asarray(Image.fromarray(plane).resize((size, size), filter, box)) for plane in planes])
+    filter = (
+        Image.Resampling.BOX if 2 * half >= size else Image.Resampling.BILINEAR
+    )  # mean of the covered pixels
+    prepared = np.stack(
+        [np.asarray(Image.fromarray(plane).resize((size, size), filter, box)) for plane in planes]
+    )
     if not LAYOUTS[layout].inverted:
         prepared[:3] = 255 - prepared[:3]
     return np.rint(prepared).clip(0, 255).astype(np.uint8)
@@ -316,8 +369,12 @@ class Reconstruction(NamedTuple):
     surface: Surface  # object frame; with the picture's colours if it was fitted
     stored: np.ndarray  # uint8 [4, S, S]: the input of the network
     azimuth_deg: float  # estimated azimuth of the picture's camera
-    silhouette_iou: float | None = None  # IoU of the fitted shape's silhouette and the mask; None without a fit
-    kind: str | None = None  # predicted category; None without a fit, or without templates if the model has only one
+    silhouette_iou: float | None = (
+        None  # IoU of the fitted shape's silhouette and the mask; None without a fit
+    )
+    kind: str | None = (
+        None  # predicted category; None without a fit, or without templates if the model has only one
+    )
     warning: str | None = None  # a reason to doubt the shape; None without a fit
 
 
@@ -383,10 +440,14 @@ def reconstruct_guesses(
         mesh = outer_surface(fitted.vertices, fitted.faces)
         progress("colours", 0.9)
         surface = color_mesh(mesh, fitted.view, [framed], method.generator.reflection)
-        yield Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning)
+        yield Reconstruction(
+            surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning
+        )
         return
     options = {"category": category, "guesses": guesses}
-    for fitted, kind in fit_template(templates, model.categories, predicted, mask, progress, **options):
+    for fitted, kind in fit_template(
+        templates, model.categories, predicted, mask, progress, **options
+    ):
         mesh = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE)
         progress("colours", 0.9)
         surface = color_mesh(mesh, fitted.view, [framed], MIRROR, textured=True)
@@ -422,7 +483,9 @@ def reconstruct_several(
             f"an object needs 2 to {MOST_PICTURES} pictures, got {len(pictures)}; leave some out or add some"
         )
     if model.templates is None or not isinstance(model.method, MeshMethod):
-        raise ValueError("this model has no templates, which several pictures need; use the small model of the package")
+        raise ValueError(
+            "this model has no templates, which several pictures need; use the small model of the package"
+        )
     if category is not None:
         check_category(model, category)
     progress("camera", 0.0)
@@ -437,7 +500,9 @@ def reconstruct_several(
     while True:
         used = [number for number in range(len(pictures)) if number not in left_out]
         chosen = [predicted[number] for number in used]
-        fitted = fit_several(model.templates, model.categories, chosen, masks[used], progress, category=category)
+        fitted = fit_several(
+            model.templates, model.categories, chosen, masks[used], progress, category=category
+        )
         outliers = find_outliers(fitted.ious)
         if not outliers:
             break
@@ -446,12 +511,16 @@ def reconstruct_several(
     mesh = fitted.vertices, fitted.faces
     if fitted.is_template:
         mesh = divide(*mesh, _LONGEST_EDGE)
-    surface = color_mesh(mesh, fitted.views, [framed[number] for number in used], MIRROR, textured=True)
+    surface = color_mesh(
+        mesh, fitted.views, [framed[number] for number in used], MIRROR, textured=True
+    )
     code = torch.stack([nn.functional.normalize(each.code[0], dim=0) for each in chosen]).mean(0)
     warning = None if category else recognize(model, code)[1]
     azimuths_deg = fitted.views.azimuth_deg.tolist()
     iou = float(fitted.ious.mean())
-    made = Reconstruction(surface, stored[used[0]], azimuths_deg[0], iou, category or fitted.kind, warning)
+    made = Reconstruction(
+        surface, stored[used[0]], azimuths_deg[0], iou, category or fitted.kind, warning
+    )
     return SeveralPictures(made, used, left_out, azimuths_deg)
 
 
@@ -459,7 +528,9 @@ def check_category(model: Model, category: str) -> None:
     """Raise ValueError if the model was not trained on a category."""
     if category not in model.categories:
         known = ", ".join(model.categories)
-        raise ValueError(f"the model was trained on {known}, not on {category!r}; give one of its categories, or none")
+        raise ValueError(
+            f"the model was trained on {known}, not on {category!r}; give one of its categories, or none"
+        )
 
 
 def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
@@ -486,11 +557,15 @@ def frame(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def reduce_mask(mask: np.ndarray) -> Tensor:
     """A mask uint8 [S, S] as float32 [64, 64] in 0 .. 1."""
-    return nn.functional.interpolate(torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE, mode="area")[0, 0]
+    return nn.functional.interpolate(
+        torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE, mode="area"
+    )[0, 0]
 
 
 @torch.no_grad()
-def input_azimuth_deg(surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None) -> float:
+def input_azimuth_deg(
+    surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None
+) -> float:
     """Azimuth, in degrees, from which the shape's silhouette fits the mask uint8 [S,S] of its image best.
 
     A guess, since elevation and distance are unknown; 0 for an empty shape. probabilities: see `find_view`.
@@ -536,39 +611,58 @@ def _with_texture(mesh: trimesh.Trimesh, image: Tensor, uv: Tensor) -> trimesh.T
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=texture)
     visual = trimesh.visual.TextureVisuals(uv.flip(1).flatten(0, 1).numpy(), material)
     faces, normals = np.arange(len(corners)).reshape(-1, 3), mesh.vertex_normals[corners]
-    return trimesh.Trimesh(mesh.vertices[corners], faces, vertex_normals=normals, visual=visual, process=False)
+    return trimesh.Trimesh(
+        mesh.vertices[corners], faces, vertex_normals=normals, visual=visual, process=False
+    )
 
 
 def _finish_materials(tree: dict) -> None:
     """Make the materials of a glTF tree matt and double-sided, without mipmaps, whose texels would mix faces."""
     materials = tree.setdefault("materials", [{}])
     for material in materials:
-        material.setdefault("pbrMetallicRoughness", {}).update(metallicFactor=0.0, roughnessFactor=1.0)
+        material.setdefault("pbrMetallicRoughness", {}).update(
+            metallicFactor=0.0, roughnessFactor=1.0
+        )
         material["doubleSided"] = True
     for texture in tree.get("textures", ()):
         texture["sampler"] = 0
-        tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]  # linear, clamped
+        tree["samplers"] = [
+            {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}
+        ]  # linear, clamped
     for mesh in tree.get("meshes", ()):  # an empty shape has none
         for primitive in mesh["primitives"]:
             primitive["material"] = 0
 
 
 def save(
-    folder: Path, names: Sequence[str], made: Sequence[Reconstruction], model: Model, mesh_format: MeshFormat
+    folder: Path,
+    names: Sequence[str],
+    made: Sequence[Reconstruction],
+    model: Model,
+    mesh_format: MeshFormat,
 ) -> list[Path]:
     """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input, mask, six views) of each shape.
 
     Returns three paths for each name.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    titles = ["input", "mask", "from the input's side", *(f"turned by {60 * k}°" for k in range(1, 6))]
+    titles = [
+        "input",
+        "mask",
+        "from the input's side",
+        *(f"turned by {60 * k}°" for k in range(1, 6)),
+    ]
     paths = []
     for name, (surface, stored, azimuth_deg, *_) in zip(names, made, strict=True):
-        mesh, animation, strip = (folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png"))
+        mesh, animation, strip = (
+            folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")
+        )
         export_mesh(mesh, surface)
         save_gif(animation, turntable(surface))
         colors = natural_colors(stored, inverted=LAYOUTS[model.config.layout].inverted)
-        views = draw_around(surface, [azimuth_deg - 60 * k for k in range(6)], image_size=STRIP_SIZE)
+        views = draw_around(
+            surface, [azimuth_deg - 60 * k for k in range(6)], image_size=STRIP_SIZE
+        )
         shown = [colors, np.repeat(stored[3][..., None], 3, axis=2), *views]
         save_png(strip, tile([shown], titles, tile_size=STRIP_SIZE))
         paths += [mesh, animation, strip]

@@ -30,7 +30,14 @@ from learn3d.studio.picture_to_mesh.fit import (
     minimize,
 )
 from learn3d.studio.picture_to_mesh.smoothing import smooth
-from learn3d.studio.picture_to_mesh.templates import Candidates, Templates, bend, find_candidates, likeness, stretch
+from learn3d.studio.picture_to_mesh.templates import (
+    Candidates,
+    Templates,
+    bend,
+    find_candidates,
+    likeness,
+    stretch,
+)
 
 MOST_PICTURES = 8
 SEEN = 16  # candidates whose outlines are compared with all pictures from all sides
@@ -41,8 +48,12 @@ NEEDED = 0.9  # share of the largest probability on a line of sight from which a
 SHARPNESS = 0.1  # differences of two shapes' scores that make one e times as likely
 CARVINGS = (1, 0)  # width in pixels by which the outlines are widened in each round
 CAMERA_STEPS = 15  # steps of the cameras between two rounds
-STRAIGHT = 0.85  # mean outline IoU from which the bent template is taken, which has straighter parts
-ALIKE = 0.5  # cosine of a picture's code and the mean of the others below which it shows something else
+STRAIGHT = (
+    0.85  # mean outline IoU from which the bent template is taken, which has straighter parts
+)
+ALIKE = (
+    0.5  # cosine of a picture's code and the mean of the others below which it shows something else
+)
 LEVEL = 0.03  # cost of a camera that stands a level of `ELEVATIONS_DEG` above or below the others
 WORSE = 0.15  # a picture is left out if its outline IoU is so much below the median of all
 
@@ -99,13 +110,20 @@ def fit_several(
         if known is None:
             return views
         copies = len(views.azimuth_deg) // len(masks)
-        return View(*(torch.cat([part] * copies) + 0 * free for part, free in zip(known, views, strict=True)))
+        return View(
+            *(
+                torch.cat([part] * copies) + 0 * free
+                for part, free in zip(known, views, strict=True)
+            )
+        )
 
     progress("shape", 0.3)
     found = find_candidates(templates, categories, predicted, category)
     each = [each.shape.view for each in predicted]
     alike = torch.stack([_guess(found, *pair) for pair in zip(each, masks, strict=True)])
-    found = found.select((alike.mean(0) + found.prior).topk(min(SEEN, len(found.prior))).indices.tolist())
+    found = found.select(
+        (alike.mean(0) + found.prior).topk(min(SEEN, len(found.prior))).indices.tolist()
+    )
     beliefs = [each.azimuths for each in predicted]
     looks = [
         _look_around(shape, faces, masks, beliefs, known)
@@ -119,7 +137,9 @@ def fit_several(
     chosen = [views[row].select(rows[row]) for row in best]
     found = found.select(best)
     stretched, shapes, cost = stretch(_join(chosen), found.shapes, found.faces, masks, held)
-    alike = likeness(stretched, _repeat(shapes, len(masks)), _repeat(found.faces, len(masks)), masks)
+    alike = likeness(
+        stretched, _repeat(shapes, len(masks)), _repeat(found.faces, len(masks)), masks
+    )
     total = (alike + _believe(stretched, beliefs)).view(len(best), -1).mean(1) + found.prior - cost
     one = int(total.argmax())
     found = found._replace(shapes=shapes)
@@ -146,7 +166,11 @@ def fit_several(
 
 
 def _look_around(
-    vertices: Tensor, faces: Tensor, masks: Tensor, beliefs: Sequence[Tensor | None], known: View | None
+    vertices: Tensor,
+    faces: Tensor,
+    masks: Tensor,
+    beliefs: Sequence[Tensor | None],
+    known: View | None,
 ) -> tuple[Tensor, View]:
     """Scores [M, N] of a shape in M views as explanations of N masks, and the views."""
     if known is not None:
@@ -176,7 +200,9 @@ def _choose_views(scores: Tensor) -> tuple[Tensor, Tensor]:
 
 def _guess(found: Candidates, view: View, mask: Tensor) -> Tensor:
     """IoU [K] of the silhouettes of K candidates in the view of the predicted shape and a mask."""
-    return view.select(torch.zeros(len(found.shapes), dtype=torch.int64)).ious(found.shapes, found.faces, mask)
+    return view.select(torch.zeros(len(found.shapes), dtype=torch.int64)).ious(
+        found.shapes, found.faces, mask
+    )
 
 
 def _all_ious(views: View, vertices: Tensor, faces: Tensor, masks: Tensor) -> Tensor:
@@ -216,7 +242,9 @@ class _Seen(NamedTuple):
     @classmethod
     def of(cls, views: View, masks: Tensor, points: Tensor, wider: int) -> _Seen:
         """The cells [C, 3] in N views of masks [N, 64, 64], which are widened by some pixels for `inside`."""
-        x, y, _ = views.cameras().transform(views.place(points.expand(len(masks), -1, -1))).unbind(2)
+        x, y, _ = (
+            views.cameras().transform(views.place(points.expand(len(masks), -1, -1))).unbind(2)
+        )
         grid = torch.stack([x, -y], 2)[:, None]
         widened = F.max_pool2d(masks[:, None], 2 * wider + 1, 1, wider)
         inside = F.grid_sample(widened, grid, align_corners=False)[:, 0, 0]
@@ -238,10 +266,15 @@ def _fill(vertices: Tensor, faces: Tensor) -> Tensor:
 
 def _average(found: Candidates, weights: Tensor) -> Tensor:
     """The probability [s, s, s] of each cell for candidates with weights [N]."""
-    return sum(weight * _fill(*mesh) for weight, *mesh in zip(weights, found.shapes, found.faces, strict=True))
+    return sum(
+        weight * _fill(*mesh)
+        for weight, *mesh in zip(weights, found.shapes, found.faces, strict=True)
+    )
 
 
-def _carve_out(view: View, masks: Tensor, likely: Tensor, held) -> tuple[View, Tensor, Tensor] | None:
+def _carve_out(
+    view: View, masks: Tensor, likely: Tensor, held
+) -> tuple[View, Tensor, Tensor] | None:
     """Carve a shape, and fit the cameras to it, in turn. None if no cell is left."""
     for wider in CARVINGS:
         kept = _largest_piece(_carve(view, masks, likely, wider))
@@ -249,7 +282,9 @@ def _carve_out(view: View, masks: Tensor, likely: Tensor, held) -> tuple[View, T
         if not len(faces):
             return None
         if wider:
-            view = held(minimize(_misfit(vertices, faces, masks, held), view, CAMERA_STEPS, (0.01,)))
+            view = held(
+                minimize(_misfit(vertices, faces, masks, held), view, CAMERA_STEPS, (0.01,))
+            )
     return view, smooth(vertices, faces, rounds=3), faces
 
 

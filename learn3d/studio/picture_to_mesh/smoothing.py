@@ -44,7 +44,9 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     share = gaussian_filter(F.avg_pool3d(solid.float(), 2)[0].numpy(), 0.7)
     points, triangles, *_ = grid_surface(torch.from_numpy(share), level=_LEVEL, box=side)
     points = smooth(points, triangles, rounds=12)
-    return points + centre - _SHRINKAGE * side / CELLS * nmr.vertex_normals(points, triangles), triangles
+    return points + centre - _SHRINKAGE * side / CELLS * nmr.vertex_normals(
+        points, triangles
+    ), triangles
 
 
 def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Tensor]:
@@ -61,7 +63,9 @@ def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Ten
         rank = np.argsort(np.argsort(length, kind="stable"), kind="stable")  # no two are equal
         side = rank[edge].argmax(1)
         chosen = np.take_along_axis(edge, side[:, None], 1)[:, 0]
-        halved = (length > longest) & (np.bincount(chosen, minlength=len(edges)) == np.bincount(edge.ravel()))
+        halved = (length > longest) & (
+            np.bincount(chosen, minlength=len(edges)) == np.bincount(edge.ravel())
+        )
         if not halved.any():
             return torch.from_numpy(points.astype(np.float32)), torch.from_numpy(triangles)
         middle = len(points) + np.cumsum(halved) - 1

@@ -30,12 +30,28 @@ AXES = 24  # principal axes of the codes that are kept
 CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
 KEPT = 16  # best of them, which are stretched
 DIFFERENT = 0.5  # voxel IoU below which two shapes are different guesses
-VOXELS, NEARNESS = 0.5, 0.5  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
-EDGES, FARTHEST = 0.15, 6.0  # weight of the distance of two outlines in pixels, and the largest that counts
+VOXELS, NEARNESS = (
+    0.5,
+    0.5,
+)  # weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
+EDGES, FARTHEST = (
+    0.15,
+    6.0,
+)  # weight of the distance of two outlines in pixels, and the largest that counts
 STRETCHING, STRETCH_STEPS = 1.0, 30  # weight of unequal factors along the axes, steps
-LATTICE, BENDING, BENDING_STEPS = 4, 1.5, 40  # points of the lattice along each axis, weight of their moves, steps
-MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))  # maps most generated shapes to themselves, in the object frame
-TEMPLATES = "template_numbers", "template_codes", "template_axes"  # names of the tensors in a checkpoint
+LATTICE, BENDING, BENDING_STEPS = (
+    4,
+    1.5,
+    40,
+)  # points of the lattice along each axis, weight of their moves, steps
+MIRROR = torch.diag(
+    torch.tensor([-1.0, 1.0, 1.0])
+)  # maps most generated shapes to themselves, in the object frame
+TEMPLATES = (
+    "template_numbers",
+    "template_codes",
+    "template_axes",
+)  # names of the tensors in a checkpoint
 
 
 class Templates(NamedTuple):
@@ -61,7 +77,10 @@ class Templates(NamedTuple):
         cosines = cosines.flatten()
         best = cosines.topk(min(CANDIDATES, int(cosines.isfinite().sum())))
         count = self.numbers.shape[1]
-        names = [(categories[row // count], int(self.numbers.flatten()[row])) for row in best.indices.tolist()]
+        names = [
+            (categories[row // count], int(self.numbers.flatten()[row]))
+            for row in best.indices.tolist()
+        ]
         return names, best.values
 
 
@@ -72,7 +91,9 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
     They are the objects that `make-dataset --procedural` generates with the seed `SEED`. They are recognised by their
     names, and by their voxels, which must be those of the shape with the number in the name.
     """
-    found = {category: [] for category in dataset.class_names or (dataset.category,)}  # numbers and codes
+    found = {
+        category: [] for category in dataset.class_names or (dataset.category,)
+    }  # numbers and codes
     if dataset.voxels is None or not found.keys() <= set(CATEGORIES):
         return None
     for item, name in enumerate(dataset.object_names):
@@ -81,24 +102,35 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
             continue
         batch = dataset.batch(torch.from_numpy(np.flatnonzero(dataset.object_ids == item)))
         vertices, faces = template(category, int(number))
-        if nmr.metrics.voxel_iou(dataset.convention.voxelize(vertices[None], faces), batch.voxels[:1]) > 0.98:
+        if (
+            nmr.metrics.voxel_iou(
+                dataset.convention.voxelize(vertices[None], faces), batch.voxels[:1]
+            )
+            > 0.98
+        ):
             of_views = F.normalize(method.encode(batch.images), dim=1)
             found[category].append((int(number), F.normalize(of_views.mean(0), dim=0)))
     if not (count := min(map(len, found.values()))):
         return None
-    numbers, codes = zip(*(each for of_kind in found.values() for each in of_kind[:count]), strict=True)
+    numbers, codes = zip(
+        *(each for of_kind in found.values() for each in of_kind[:count]), strict=True
+    )
     codes, shape = torch.stack(codes), (len(found), count)
     mean = codes.mean(0)
     axes = torch.linalg.svd(codes - mean, full_matrices=False).Vh[:AXES]
     reduced = ((codes - mean) @ axes.T).view(*shape, -1)
-    return Templates(torch.tensor(numbers, dtype=torch.int32).view(shape), reduced, torch.cat([mean[None], axes]))
+    return Templates(
+        torch.tensor(numbers, dtype=torch.int32).view(shape), reduced, torch.cat([mean[None], axes])
+    )
 
 
 def template(category: str, number: int) -> tuple[Tensor, Tensor]:
     """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame."""
     shape = numbered_shape(category, SEED, number)
     vertices = np.asarray(shape.vertices) @ mesh_to_object("y", "z").T
-    faces = np.asarray(shape.faces)[:, ::-1].copy()  # the reflection of the frame turns them inside out
+    faces = np.asarray(shape.faces)[
+        :, ::-1
+    ].copy()  # the reflection of the frame turns them inside out
     return torch.tensor(vertices, dtype=torch.float32), torch.from_numpy(faces.astype(np.int64))
 
 
@@ -117,7 +149,10 @@ class Candidates(NamedTuple):
 
 
 def find_candidates(
-    templates: Templates, categories: Sequence[str], predicted: Sequence[Prediction], category: str | None = None
+    templates: Templates,
+    categories: Sequence[str],
+    predicted: Sequence[Prediction],
+    category: str | None = None,
 ) -> Candidates:
     """The templates with codes nearest to the mean of those that were predicted for one or several pictures.
 
@@ -127,7 +162,10 @@ def find_candidates(
     names, nearness = templates.nearest(code, categories, category)
     shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
     voxels = torch.cat([_voxels(*mesh) for mesh in zip(shapes, faces, strict=True)])
-    alike = [nmr.metrics.voxel_iou(voxels, _voxels(*each.shape[:2]).expand_as(voxels)) for each in predicted]
+    alike = [
+        nmr.metrics.voxel_iou(voxels, _voxels(*each.shape[:2]).expand_as(voxels))
+        for each in predicted
+    ]
     prior = VOXELS * torch.stack(alike).mean(0).float() + NEARNESS * nearness
     return Candidates(shapes, faces, [name for name, _ in names], prior)
 
@@ -157,14 +195,22 @@ def fit_template(
     found = found.select(best.tolist())
     progress("stretch", 0.5)
     views, shapes, cost = stretch(views.select(best), found.shapes, found.faces, mask)
-    scores = likeness(views, shapes, found.faces, mask) + belief(views.azimuth_deg, predicted.azimuths)
+    scores = likeness(views, shapes, found.faces, mask) + belief(
+        views.azimuth_deg, predicted.azimuths
+    )
     order = (scores + found.prior - cost).argsort(descending=True).tolist()
     progress("surface", 0.8)
-    for row in _choose_different([_voxels(shapes[row], found.faces[row]) for row in order], guesses):
+    for row in _choose_different(
+        [_voxels(shapes[row], found.faces[row]) for row in order], guesses
+    ):
         row = order[row]
-        view, vertices = bend(views.select(torch.tensor([row])), shapes[row], found.faces[row], mask)
+        view, vertices = bend(
+            views.select(torch.tensor([row])), shapes[row], found.faces[row], mask
+        )
         size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
-        view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * view.shift)
+        view = view._replace(
+            log_distance=view.log_distance + math.log(size), shift=size * view.shift
+        )
         vertices = size * vertices
         iou = float(view.ious(vertices[None], found.faces[row], mask))
         yield Fit(vertices, found.faces[row], view, iou), found.kinds[row]
@@ -195,7 +241,9 @@ def likeness(views: View, shapes: list[Tensor], faces: list[Tensor], masks: Tens
     drawn = map(_edges, views.silhouettes(shapes, faces))
     apart = [
         (near_wanted[edge].mean() + near[outline].mean()) / 2
-        for (edge, near), (outline, near_wanted) in zip(drawn, itertools.cycle(wanted), strict=False)
+        for (edge, near), (outline, near_wanted) in zip(
+            drawn, itertools.cycle(wanted), strict=False
+        )
     ]
     ious = views.ious(shapes, faces, masks.repeat(len(shapes) // len(masks), 1, 1))
     return ious - EDGES * torch.tensor(apart).float()
@@ -210,7 +258,11 @@ def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
 
 
 def stretch(
-    views: View, shapes: list[Tensor], faces: list[Tensor], masks: Tensor, held: Callable[[View], View] = lambda v: v
+    views: View,
+    shapes: list[Tensor],
+    faces: list[Tensor],
+    masks: Tensor,
+    held: Callable[[View], View] = lambda v: v,
 ) -> tuple[View, list[Tensor], Tensor]:
     """Stretch N shapes along the three axes until they have the outlines of masks [64, 64] or [M, 64, 64].
 
@@ -229,14 +281,20 @@ def stretch(
         return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
 
     def loss(views: View) -> Tensor:
-        ious = held(views).ious([shape for shape in stretched() for _ in range(copies)], faces, wanted)
+        ious = held(views).ious(
+            [shape for shape in stretched() for _ in range(copies)], faces, wanted
+        )
         return (costs() + 0.1 * logs.square().sum(1)).sum() - ious.sum() / copies
 
     return held(minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs)), stretched(), costs()
 
 
 def bend(
-    view: View, vertices: Tensor, faces: Tensor, masks: Tensor, held: Callable[[View], View] = lambda v: v
+    view: View,
+    vertices: Tensor,
+    faces: Tensor,
+    masks: Tensor,
+    held: Callable[[View], View] = lambda v: v,
 ) -> tuple[View, Tensor]:
     """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them.
 
@@ -245,7 +303,13 @@ def bend(
     low, high = vertices.amin(0), vertices.amax(0)
     place = (vertices - low) / (high - low).clamp(min=1e-3)
     x, y, z = (
-        torch.stack([math.comb(LATTICE - 1, k) * t**k * (1 - t) ** (LATTICE - 1 - k) for k in range(LATTICE)], 1)
+        torch.stack(
+            [
+                math.comb(LATTICE - 1, k) * t**k * (1 - t) ** (LATTICE - 1 - k)
+                for k in range(LATTICE)
+            ],
+            1,
+        )
         for t in place.unbind(1)
     )
     weights = torch.einsum("va,vb,vc->vabc", x, y, z)
@@ -258,7 +322,10 @@ def bend(
         return vertices + torch.einsum("vabc,abcd->vd", weights, moves())
 
     def loss(view: View) -> Tensor:
-        rough = sum(moves().diff(dim=axis).square().sum() for axis in range(3)) + 0.1 * moves().square().sum()
+        rough = (
+            sum(moves().diff(dim=axis).square().sum() for axis in range(3))
+            + 0.1 * moves().square().sum()
+        )
         return BENDING * rough - held(view).ious(bent()[None], faces, masks).mean()
 
     return held(minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice)), bent()

@@ -16,12 +16,16 @@ class Comparison:
 
     offset_deg: float
     accuracy: float  # Acc@30: share of errors of at most 30 degrees
-    half_turn_accuracy: float  # the same, if half a turn does not count: many tables look the same from behind
+    half_turn_accuracy: (
+        float  # the same, if half a turn does not count: many tables look the same from behind
+    )
     median_deg: float
     mean_deg: float
     flips: float  # share of errors of at least 150 degrees
     objects_flipped: float  # share of the objects with flips in most of their images
-    calibration: tuple[tuple[float, float, int], ...]  # mean confidence, accuracy and number of images, by confidence
+    calibration: tuple[
+        tuple[float, float, int], ...
+    ]  # mean confidence, accuracy and number of images, by confidence
 
     def text(self) -> str:
         """Lines for the terminal."""
@@ -31,7 +35,10 @@ class Comparison:
             f"mean {self.mean_deg:.1f} degrees, flips {self.flips:.3f}, "
             f"objects flipped as a whole {self.objects_flipped:.3f}"
         ]
-        return "\n".join(lines + [f"confidence {c:.2f}: Acc@30 {a:.2f} ({n} images)" for c, a, n in self.calibration])
+        return "\n".join(
+            lines
+            + [f"confidence {c:.2f}: Acc@30 {a:.2f} ({n} images)" for c, a, n in self.calibration]
+        )
 
 
 def compare(views: EstimatedViews) -> Comparison:
@@ -46,10 +53,14 @@ def compare(views: EstimatedViews) -> Comparison:
         raise ValueError("--compare needs true poses, but this data set has none")
     true = torch.cat([dataset.poses.azimuth_deg for dataset in views.datasets])
     found = torch.from_numpy(views.table.azimuth_deg[:, 0])
-    chosen = torch.cat([torch.full((len(dataset),), dataset.split != "test") for dataset in views.datasets])
+    chosen = torch.cat(
+        [torch.full((len(dataset),), dataset.split != "test") for dataset in views.datasets]
+    )
     offsets = torch.arange(360.0)
     turned = (wrap_deg(found[chosen] + o - true[chosen]).abs() for o in offsets)
-    offset = float(offsets[torch.stack([(e + _up_to_half_turn(e)).mean() for e in turned]).argmin()])
+    offset = float(
+        offsets[torch.stack([(e + _up_to_half_turn(e)).mean() for e in turned]).argmin()]
+    )
     errors = wrap_deg(found + offset - true).abs()[views.shown]
     flips = (errors >= 150).double()
     _, which = number_objects(views.datasets)[views.shown].unique(return_inverse=True)
@@ -57,7 +68,9 @@ def compare(views: EstimatedViews) -> Comparison:
     right = (errors <= NEAR_DEG).double()
     confidence = views.result.confidence.double()
     bins = [torch.nonzero((10 * confidence).floor().clamp(max=9) == k)[:, 0] for k in range(10)]
-    calibration = tuple((float(confidence[b].mean()), float(right[b].mean()), len(b)) for b in bins if len(b))
+    calibration = tuple(
+        (float(confidence[b].mean()), float(right[b].mean()), len(b)) for b in bins if len(b)
+    )
     up_to_half_turn = (_up_to_half_turn(errors) <= NEAR_DEG).double()
     return Comparison(
         offset_deg=offset,

@@ -133,22 +133,30 @@ def estimate(data: Masks, fitted: Tensor, candidates: Candidates, options: PoseO
     best = posterior.sum(2).argmax(1)
     confidence = MAX_CONFIDENCE * (_near(agreement, best) / agreement.sum(1).clamp_min(1e-9))
     _, which = data.objects.unique(return_inverse=True)
-    views = torch.bincount(which * options.azimuths + best, minlength=options.azimuths * (int(which.max()) + 1))
+    views = torch.bincount(
+        which * options.azimuths + best, minlength=options.azimuths * (int(which.max()) + 1)
+    )
     views = views.view(-1, options.azimuths)[which]
     pairs = int(views.sum()) - len(views)  # of views of an object
     alike = pairs > 0 and int(_near(views, best).sum()) - len(views) > 0.5 * pairs  # from all sides
     if len(fitted) < MIN_IMAGES or alike:
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
-    k = max(range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum()))  # the most typical one
+    k = max(
+        range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum())
+    )  # the most typical one
     shapes[k].turns = (shapes[k].turns + shifts[k] * TURNS // options.azimuths) % TURNS
     votes = sum(front_votes) / len(parts)
-    return Estimate(posterior, confidence, shapes[k].align(), shapes[k].network.faces, weights[k], votes)
+    return Estimate(
+        posterior, confidence, shapes[k].align(), shapes[k].network.faces, weights[k], votes
+    )
 
 
 def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
     """The shifts by quarters, 0 for the first, that make posteriors [N, A] overlap most."""
     quarter = posteriors[0].shape[1] // TURNS
-    stacked = torch.stack([torch.stack([p.roll(t * quarter, 1) for p in posteriors]) for t in range(TURNS)])
+    stacked = torch.stack(
+        [torch.stack([p.roll(t * quarter, 1) for p in posteriors]) for t in range(TURNS)]
+    )
     turns = _solve_turns(torch.einsum("smna,tkna->stmk", stacked, stacked), rng)
     return ((turns - turns[0]) % TURNS * quarter).tolist()
 
@@ -156,7 +164,9 @@ def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
 def _near(mass: Tensor, azimuth: Tensor) -> Tensor:
     """The part [N] of the masses [N, A] of all azimuths that is within NEAR_DEG of the azimuths of index int64 [N]."""
     reach = math.floor(NEAR_DEG * mass.shape[1] / 360)
-    return mass.gather(1, (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]).sum(1)
+    return mass.gather(1, (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]).sum(
+        1
+    )
 
 
 def _estimate_once(
@@ -189,7 +199,10 @@ def _estimate_once(
         own = _posteriors(-_turned(values, turns) / TEMPERATURE, options.prior)
         smoothed = of_fitted.smooth(own.sum(1), options.prior)
         log_prior = (smoothed + 1e-3).log()
-    chunks = (shapes.all_distances(data.select(rows)) for rows in torch.arange(len(data.masks)).split(2048))
+    chunks = (
+        shapes.all_distances(data.select(rows))
+        for rows in torch.arange(len(data.masks)).split(2048)
+    )
     alone = torch.cat([_posteriors(-values / TEMPERATURE, "free").sum(1) for values in chunks])
     posterior = _normalize(alone**0.3 * (of_all.message(smoothed) + 1e-3))
     agreement = of_all.message(own.sum(1)).sum(2)
@@ -219,7 +232,9 @@ class Shapes:
         scale = torch.exp(torch.empty(3).uniform_(np.log(0.3), 0.0, generator=rng))
         self.base = 0.5 * self.network.place(self.network.sphere) * (scale - 1)
         self.codes = torch.zeros(1, CODE_SIZE)
-        self.turns = torch.zeros(1, dtype=torch.int64)  # azimuth 0 of shape m is the common azimuth 90 * turns[m]
+        self.turns = torch.zeros(
+            1, dtype=torch.int64
+        )  # azimuth 0 of shape m is the common azimuth 90 * turns[m]
 
     def vertices(self) -> Tensor:
         """Vertices float32 [M, V, 3], before any turn."""
@@ -233,14 +248,18 @@ class Shapes:
         azimuth_deg, elevation_deg, distance, half_fov_deg = self.candidates
         count = len(vertices)
         half = len(azimuth_deg) // 2 + 1
-        azimuth, elevation = torch.meshgrid(azimuth_deg[:half], elevation_deg[elevations], indexing="ij")
+        azimuth, elevation = torch.meshgrid(
+            azimuth_deg[:half], elevation_deg[elevations], indexing="ij"
+        )
         angles = (elevation.flatten().repeat(count), azimuth.flatten().repeat(count))
         cameras = nmr.LookAt.from_angles(distance, *angles, half_fov_deg=half_fov_deg)
         repeated = vertices.repeat_interleave(azimuth.numel(), 0)
         right = nmr.render_silhouette(repeated, self.network.faces, cameras, image_size=SIZE)
         right = right.reshape(count, half, -1, SIZE, SIZE)
         rendered = torch.cat([right, right[:, 1:-1].flip(1, 4)], 1)
-        values = distances(masks, rendered.flatten(3).flatten(0, 2)).reshape(len(masks), *rendered.shape[:3])
+        values = distances(masks, rendered.flatten(3).flatten(0, 2)).reshape(
+            len(masks), *rendered.shape[:3]
+        )
         return _turned(values, self.turns)
 
     @torch.no_grad()
@@ -250,7 +269,9 @@ class Shapes:
         values = torch.cat([self.distances(part, vertices) for part in data.masks.split(1024)])
         return values.masked_fill(~data.allowed[:, None, None], float("inf"))
 
-    def fit(self, *, start: float, smoothness_weight: float, log_prior: Tensor | None = None) -> None:
+    def fit(
+        self, *, start: float, smoothness_weight: float, log_prior: Tensor | None = None
+    ) -> None:
         """EM: the posteriors over shapes and poses follow from the IoU, then a gradient step fits the shapes.
 
         The temperature falls from `start` to `TEMPERATURE`. log_prior: [N, A, E].
@@ -273,11 +294,15 @@ class Shapes:
             batch = rows[torch.randint(len(rows), (_BATCH,), generator=self.rng)]
             vertices = self.vertices()
             values = self.distances(masks[batch], vertices, elevations)
-            logits = -values.detach() / (start ** (1 - step / steps) * TEMPERATURE ** (step / steps))
+            logits = -values.detach() / (
+                start ** (1 - step / steps) * TEMPERATURE ** (step / steps)
+            )
             if log_prior is not None:
                 logits = logits + log_prior[batch][:, None, :, elevations]
             loss = (_posteriors(logits, self.options.prior) * values).sum((1, 2, 3)).mean()
-            total = loss + smoothness_weight * nmr.losses.smoothness_loss(vertices, self.network.edges)
+            total = loss + smoothness_weight * nmr.losses.smoothness_loss(
+                vertices, self.network.edges
+            )
             optimizer.zero_grad()
             total.backward()
             optimizer.step()
@@ -332,7 +357,9 @@ class Neighbours(NamedTuple):
     weights: Tensor  # float32 [2, N, n]
 
     @classmethod
-    def of(cls, data: Masks, known: Masks, kinds: Tensor | None = None, count: int = _NEIGHBOURS) -> Neighbours:
+    def of(
+        cls, data: Masks, known: Masks, kinds: Tensor | None = None, count: int = _NEIGHBOURS
+    ) -> Neighbours:
         """Neighbours of `data` among `known`: masks of other objects, and of other `kinds` (int64 [N]) if given."""
         found = []
         for source in (data.masks, data.masks.reshape(-1, SIZE, SIZE).flip(2).flatten(1)):
@@ -343,7 +370,9 @@ class Neighbours(NamedTuple):
                     far |= kinds[part][:, None] == kinds
                 values = distances(source[part], known.masks).masked_fill(far, _FAR)
                 found.append(values.topk(min(count, values.shape[1]), 1, largest=False))
-        values, rows = (torch.cat(part).view(2, len(data.masks), -1) for part in zip(*found, strict=True))
+        values, rows = (
+            torch.cat(part).view(2, len(data.masks), -1) for part in zip(*found, strict=True)
+        )
         return cls(rows, torch.exp(-values / _NEIGHBOUR_SCALE))
 
     def message(self, posterior: Tensor) -> Tensor:
@@ -412,7 +441,9 @@ def _solve_turns(couplings: Tensor, rng: torch.Generator) -> np.ndarray:
     return best
 
 
-def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
+def _mask_votes(
+    data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int
+) -> Tensor:
     """Votes float64 [TURNS, TURNS, M, M] of nearest masks of different prototypes: their weight if these turns of the
     two prototypes make the azimuths nearly equal.
 
@@ -421,7 +452,9 @@ def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
     votes = torch.zeros(TURNS, TURNS, count, count, dtype=torch.float64)
     neighbours = Neighbours.of(data, data, prototype, _VOTERS)
     quarter = azimuths // TURNS
-    for mirrored, (rows, weights) in enumerate(zip(neighbours.rows, neighbours.weights, strict=True)):
+    for mirrored, (rows, weights) in enumerate(
+        zip(neighbours.rows, neighbours.weights, strict=True)
+    ):
         pairs = (prototype[:, None].expand_as(rows), prototype[rows])
         for own, other in itertools.product(range(TURNS), repeat=2):
             turned = (azimuth + own * quarter) * (-1 if mirrored else 1)
@@ -431,14 +464,20 @@ def _mask_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
     return votes
 
 
-def _peak_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int) -> Tensor:
+def _peak_votes(
+    data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int
+) -> Tensor:
     """Votes float64 [TURNS, TURNS, M, M] of the peaks of upper outlines: an airplane's fin, a chair's back.
 
     The vote of two turned prototypes is the inner product of their mean peaks at all azimuths,
     each azimuth weighted by the roots of its numbers of masks. prototype, azimuth: int64 [N].
     """
     cells = prototype * azimuths + azimuth
-    total = torch.zeros(count * azimuths, SIZE).index_add_(0, cells, _peaks(data.masks)).view(count, azimuths, SIZE)
+    total = (
+        torch.zeros(count * azimuths, SIZE)
+        .index_add_(0, cells, _peaks(data.masks))
+        .view(count, azimuths, SIZE)
+    )
     number = torch.bincount(cells, minlength=count * azimuths).view(count, azimuths)
     turned = []
     places = torch.arange(azimuths)
@@ -446,7 +485,9 @@ def _peak_votes(data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azi
         plain, mirrored = ((p - turn * (azimuths // TURNS)) % azimuths for p in (places, -places))
         masks = (number[:, plain] + number[:, mirrored])[..., None]
         mean = (total[:, plain] + total[:, mirrored].flip(2)) / masks.clamp_min(1)
-        mean = (mean - (mean * masks).sum(1, keepdim=True) / masks.sum(1, keepdim=True).clamp_min(1)) * masks.sqrt()
+        mean = (
+            mean - (mean * masks).sum(1, keepdim=True) / masks.sum(1, keepdim=True).clamp_min(1)
+        ) * masks.sqrt()
         turned.append(mean.flatten(1))
     stacked = torch.stack(turned).double()
     return torch.einsum("smk,tnk->stmn", stacked, stacked)

@@ -23,19 +23,28 @@ def draw_pose_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarra
     count = min(COLUMNS, len(directions))
     azimuths = directions[torch.linspace(0, len(directions), count + 1)[:-1].long()]
     middle = heights[len(heights) // 2 :][:1]
-    cameras = orbit(LookAtPoses(torch.full((1,), -offset_deg), middle, distance, half_fov), azimuths.tolist())
+    cameras = orbit(
+        LookAtPoses(torch.full((1,), -offset_deg), middle, distance, half_fov), azimuths.tolist()
+    )
     order = result.weights.argsort(descending=True)[:PROTOTYPES]
-    rows = [list(draw_surface(Surface(result.prototypes[m], result.faces), cameras, image_size=TILE)) for m in order]
+    rows = [
+        list(draw_surface(Surface(result.prototypes[m], result.faces), cameras, image_size=TILE))
+        for m in order
+    ]
     places = [(dataset, i) for dataset in views.datasets for i in range(len(dataset))]
     found = torch.from_numpy(views.table.azimuth_deg[:, 0])[views.shown] + offset_deg
     columns = []
     for azimuth in azimuths:
-        near = torch.nonzero(torch.remainder(found - azimuth + 180 / count, 360) < 360 / count)[:, 0]
+        near = torch.nonzero(torch.remainder(found - azimuth + 180 / count, 360) < 360 / count)[
+            :, 0
+        ]
         chosen = near[torch.linspace(0, len(near) - 1, min(ROWS, len(near))).long()]
         pictures = []
         for row in views.shown[chosen].tolist():
             dataset, index = places[row]
-            pictures.append(natural_colors(dataset.images[np.array([index])], inverted=dataset.inverted)[0])
+            pictures.append(
+                natural_colors(dataset.images[np.array([index])], inverted=dataset.inverted)[0]
+            )
         columns.append(pictures + [None] * (ROWS - len(pictures)))
     names = [f"prototype, {float(result.weights[m]):.0%}" for m in order] + [
         "images",

@@ -56,7 +56,9 @@ class CameraOptions:
         with contextlib.suppress(ValueError):
             if -90 < float(low) <= float(high or low) < 90:
                 return float(low), float(high or low)
-        raise ValueError(f"elevation must be degrees within -90 .. 90, or LOW:HIGH, got {self.elevation!r}")
+        raise ValueError(
+            f"elevation must be degrees within -90 .. 90, or LOW:HIGH, got {self.elevation!r}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +79,24 @@ class EstimatedViews:
             warnings.append(f"{empty} images have an empty mask; their poses are unknown")
         training = int((self.shown < len(self.datasets[0])).sum())
         if training < MIN_IMAGES:
-            warnings.append(f"{training} training images are too few to estimate poses; the minimum is {MIN_IMAGES}")
+            warnings.append(
+                f"{training} training images are too few to estimate poses; the minimum is {MIN_IMAGES}"
+            )
         elif float(self.result.confidence.mean()) < MIN_CONFIDENCE:
             warnings.append(
                 "these masks do not determine the poses: nearly equal masks of different objects got different "
                 "azimuths, so objects may look alike from several sides. Check the sheet before training on this table"
             )
         elif self.result.front_votes < _MIN_FRONT_VOTES:
-            warnings.append("many masks look the same from front and back: azimuths may be wrong by 180 degrees")
+            warnings.append(
+                "many masks look the same from front and back: azimuths may be wrong by 180 degrees"
+            )
         return warnings
 
 
-def load_views(layout: Layout, data: Path, category: str, views_per_object: int | None = None) -> list[ViewDataset]:
+def load_views(
+    layout: Layout, data: Path, category: str, views_per_object: int | None = None
+) -> list[ViewDataset]:
     """Read the training split of a data set, and those of the other splits that exist."""
     datasets = [load_dataset(layout, data, category, "train", views_per_object=views_per_object)]
     for split in ("val", "test"):
@@ -97,7 +105,9 @@ def load_views(layout: Layout, data: Path, category: str, views_per_object: int 
     return datasets
 
 
-def estimate_views(datasets: Sequence[ViewDataset], cameras: CameraOptions, options: PoseOptions) -> EstimatedViews:
+def estimate_views(
+    datasets: Sequence[ViewDataset], cameras: CameraOptions, options: PoseOptions
+) -> EstimatedViews:
     """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
 
     The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight.
@@ -128,15 +138,23 @@ def estimate_views(datasets: Sequence[ViewDataset], cameras: CameraOptions, opti
     weights, chosen = posterior.flatten(1).topk(min(MAX_CANDIDATES, posterior[0].numel()), 1)
     weights[:, options.candidates :] = 0
     azimuth = chosen // posterior.shape[2]
-    heights = elevation[:, None].expand_as(weights) if own_elevation else grid[chosen % posterior.shape[2]]
+    heights = (
+        elevation[:, None].expand_as(weights)
+        if own_elevation
+        else grid[chosen % posterior.shape[2]]
+    )
     confidence = torch.zeros(len(masks)).index_copy(0, shown, result.confidence)
     columns = (wrap_deg(azimuths[azimuth]), heights, weights / weights.sum(1, keepdim=True))
-    columns = (part.numpy().astype(np.float32) for part in (*columns, distance, half_fov, confidence))
+    columns = (
+        part.numpy().astype(np.float32) for part in (*columns, distance, half_fov, confidence)
+    )
     table = PoseTable(np.concatenate([fingerprints(dataset) for dataset in datasets]), *columns)
     return EstimatedViews(tuple(datasets), shown, candidates, result, table)
 
 
-def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[Tensor, Tensor, Tensor]:
+def _cameras(
+    datasets: Sequence[ViewDataset], cameras: CameraOptions
+) -> tuple[Tensor, Tensor, Tensor]:
     """Elevation, distance and half field of view of every image: the given ones, the data set's, or defaults."""
     given = cameras.elevations() or (DEFAULT_ELEVATION_DEG,) * 2
     half_fov = torch.full((sum(map(len, datasets)),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
@@ -146,9 +164,13 @@ def _cameras(datasets: Sequence[ViewDataset], cameras: CameraOptions) -> tuple[T
     elevation = torch.full_like(half_fov, sum(given) / 2)
     if any(dataset.poses is not None for dataset in datasets):
         if not all(isinstance(dataset.poses, LookAtPoses) for dataset in datasets):
-            raise ValueError("poses can only be estimated for look-at cameras; the poses of this layout are rotations")
+            raise ValueError(
+                "poses can only be estimated for look-at cameras; the poses of this layout are rotations"
+            )
         poses = vars(LookAtPoses.join([dataset.poses for dataset in datasets])).values()
-        _, own_elevation, distance, own_fov = (torch.as_tensor(part).expand(len(half_fov)) for part in poses)
+        _, own_elevation, distance, own_fov = (
+            torch.as_tensor(part).expand(len(half_fov)) for part in poses
+        )
         elevation = own_elevation if cameras.elevation is None else elevation
         half_fov = half_fov if cameras.fov_deg else own_fov
     if cameras.distance is not None:
@@ -175,7 +197,9 @@ def _masks(datasets: Sequence[ViewDataset], factor: Tensor) -> Tensor:
             masks = torch.from_numpy(dataset.read_masks(rows.numpy()))[:, None].float() / 255
             factors = of_dataset[rows]
             if bool((factors - 1).abs().max() >= 1e-3):
-                grid = F.affine_grid(torch.eye(2, 3) / factors[:, None, None], masks.shape, align_corners=False)
+                grid = F.affine_grid(
+                    torch.eye(2, 3) / factors[:, None, None], masks.shape, align_corners=False
+                )
                 masks = F.grid_sample(masks, grid, align_corners=False)
             reduced.append(F.avg_pool2d(masks, MASK_SIZE // SIZE).flatten(1))
     return torch.cat(reduced)

@@ -13,7 +13,10 @@ from .draw import Draw
 from .parts import assemble
 
 # The recipes of each category, with the weights of a random choice.
-_RECIPES = {module.__name__.rpartition(".")[2]: module.KINDS for module in (airplane, car, chair, lamp, sofa, table)}
+_RECIPES = {
+    module.__name__.rpartition(".")[2]: module.KINDS
+    for module in (airplane, car, chair, lamp, sofa, table)
+}
 CATEGORIES: tuple[str, ...] = tuple(_RECIPES)
 
 

@@ -27,8 +27,12 @@ class Planform:
     dihedral_deg: float  # rise of the wing towards the tip
     z: float  # position of the leading edge in the middle
     y: float  # height of the wing in the middle
-    kink: float = 0.0  # share of the half span at which the trailing edge bends; 0 for a straight one
-    shape: str = "straight"  # "straight", "elliptic", "kinked" (constant chord, then tapered) or "gull"
+    kink: float = (
+        0.0  # share of the half span at which the trailing edge bends; 0 for a straight one
+    )
+    shape: str = (
+        "straight"  # "straight", "elliptic", "kinked" (constant chord, then tapered) or "gull"
+    )
     thickness: float = 0.12  # thickness over chord
 
     def at(self, share: float) -> tuple[float, float, float, float]:
@@ -95,10 +99,14 @@ def fuselage(
     return loft(points(outline[..., 0], outline[..., 1] + y[:, None], z[:, None]))
 
 
-def fin(height: float, root: float, tip: float, sweep_deg: float, z: float, thickness: float = 0.09) -> Part:
+def fin(
+    height: float, root: float, tip: float, sweep_deg: float, z: float, thickness: float = 0.09
+) -> Part:
     """An upright fin on y = 0, its leading edge starting at z."""
     back = height * np.tan(np.radians(sweep_deg))
-    return wing([(0.0, 0.0, z, root, thickness), (height, 0.0, z - back, tip, thickness)], upright=True)
+    return wing(
+        [(0.0, 0.0, z, root, thickness), (height, 0.0, z - back, tip, thickness)], upright=True
+    )
 
 
 def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
@@ -129,7 +137,9 @@ def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
         return plan.wing() + upright.moved(x, y - draw(0.1, 0.45) * height).both_sides()
     part = fin(height + base, root, tip, sweep, z).moved(y=0.4 * base)
     if swept and draw.maybe(0.4):  # a dorsal fillet
-        part += fin(0.45 * height + base, 1.6 * root, 0.5 * root, 62, z + 0.75 * root, 0.04).moved(y=0.4 * base)
+        part += fin(0.45 * height + base, 1.6 * root, 0.5 * root, 62, z + 0.75 * root, 0.04).moved(
+            y=0.4 * base
+        )
     share = {"T": 0.97, "cross": draw(0.35, 0.6), "conventional": 0.0}[kind]
     if kind == "conventional":
         front = -0.5 + chord + draw(0.0, 0.04)
@@ -142,7 +152,9 @@ def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     if kind == "T":
         chord = min(chord, 1.3 * tip)
         tip_chord = min(tip_chord, 0.9 * tip)
-    return part + Planform(half, chord, tip_chord, lean, dihedral, front, level, thickness=0.1).wing()
+    return (
+        part + Planform(half, chord, tip_chord, lean, dihedral, front, level, thickness=0.1).wing()
+    )
 
 
 def along_z(
@@ -201,13 +213,17 @@ def propeller(draw: Draw, radius: float, blades: int, hub: float, *, width, turn
 
 def pod(radius: float, length: float) -> Part:
     """A drop-shaped body along z, its blunt end forward, centred."""
-    profile = np.array([(0.1, 0), (0.3, 0.05), (0.6, 0.15), (0.95, 0.35), (1.0, 0.6), (0.85, 0.85), (0.55, 1)])
+    profile = np.array(
+        [(0.1, 0), (0.3, 0.05), (0.6, 0.15), (0.95, 0.35), (1.0, 0.6), (0.85, 0.85), (0.55, 1)]
+    )
     return along_z(profile - [0, 0.5], radius, length, 12)
 
 
 def nozzle(radius: float, length: float) -> Part:
     """An open jet nozzle along z, centred."""
-    profile = np.array([(0.8, -1), (1, 1), (0.9, 1.02), (0.02, 0.9), (0.02, 0.7), (0.8, 0.6), (0.7, -1)])
+    profile = np.array(
+        [(0.8, -1), (1, 1), (0.9, 1.02), (0.02, 0.9), (0.02, 0.7), (0.8, 0.6), (0.7, -1)]
+    )
     return revolve(profile * [radius, -0.5 * length], 12, hollow=True).rotated("x", -90)
 
 
@@ -230,12 +246,16 @@ def gear(belly: float, drop: float, main_x: float, main_z: float, other_z: float
     if other_z < main_z:
         leg = bar((0, 0, other_z), (0, -0.06, other_z - 0.01), 0.014)
         return part + leg + _wheel(0.015).moved(y=-0.065, z=other_z - 0.01)
-    return part + bar((0, top, other_z), (0, -drop, other_z), 0.016) + main.moved(y=-drop, z=other_z)
+    return (
+        part + bar((0, top, other_z), (0, -drop, other_z), 0.016) + main.moved(y=-drop, z=other_z)
+    )
 
 
 def _wheel(radius: float) -> Part:
     t = 0.35 * radius
-    return revolve([(0.7 * radius, -t), (radius, -0.6 * t), (radius, 0.6 * t), (0.7 * radius, t)], 12).rotated("z", 90)
+    return revolve(
+        [(0.7 * radius, -t), (radius, -0.6 * t), (radius, 0.6 * t), (0.7 * radius, t)], 12
+    ).rotated("z", 90)
 
 
 @recipe(
@@ -250,8 +270,12 @@ def airliner(draw: Draw, *, radius, freighter, tall, nose, nose_power, tail_star
     """A jet airliner, or a freighter with high wings, T-tail and upswept rear."""
     upsweep = draw(0.5, 0.9) if freighter else draw(0.25, 0.6)
     droop = draw(0.1, 0.35)
-    plane = fuselage(radius, tall, nose * radius, nose_power, tail_start, upsweep=upsweep, droop=droop)
-    size = draw.measures(half=(0.40, 0.56), sweep_deg=(15, 38), root=(0.15, 0.21), tip=(0.035, 0.07))
+    plane = fuselage(
+        radius, tall, nose * radius, nose_power, tail_start, upsweep=upsweep, droop=droop
+    )
+    size = draw.measures(
+        half=(0.40, 0.56), sweep_deg=(15, 38), root=(0.15, 0.21), tip=(0.035, 0.07)
+    )
     size["dihedral_deg"] = draw(-4, 0) if freighter else draw(3, 8)
     size |= draw.measures(z=(0.1, 0.17), kink=Perhaps(0.7, (0.25, 0.42)))
     plan = Planform(**size, y=0.8 * radius if freighter else -0.6 * radius)
@@ -271,18 +295,24 @@ def airliner(draw: Draw, *, radius, freighter, tall, nose, nose_power, tail_star
         plane += join(_wing_engine(draw, plan, share, size).both_sides() for share in (0.3, outer))
     if mount.endswith("3"):
         plane += nacelle(0.9 * size, 4.5 * size).moved(y=1.35 * radius, z=-0.36)
-    plane += tail(draw, "T" if freighter or mount.startswith("tail") else "conventional", radius, swept=True)
+    plane += tail(
+        draw, "T" if freighter or mount.startswith("tail") else "conventional", radius, swept=True
+    )
     if draw.maybe(0.4):
         plane += plan.winglets(draw)
     if not freighter and draw.maybe(0.12):  # an upper deck
         plane += ellipsoid((1.5 * radius, 1.5 * radius, 0.4), (0, 0.75 * radius, 0.27))
     if draw.maybe(0.25):
-        plane += gear(radius, radius * draw(1.5, 2.0), main_x=1.2 * radius, main_z=-0.02, other_z=0.38)
+        plane += gear(
+            radius, radius * draw(1.5, 2.0), main_x=1.2 * radius, main_z=-0.02, other_z=0.38
+        )
     return plane
 
 
 @recipe(length=(3.0, 4.6), drop=(1.1, 1.5), forward=(0.0, 0.3))
-def _wing_engine(draw: Draw, plan: Planform, share: float, size: float, *, length, drop, forward) -> Part:
+def _wing_engine(
+    draw: Draw, plan: Planform, share: float, size: float, *, length, drop, forward
+) -> Part:
     """A jet engine of radius `size` on a pylon under the right wing, at a share of its half span."""
     x, y, z, chord = plan.at(share)
     length *= size
@@ -337,13 +367,17 @@ def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
     half = draw(0.28, 0.4) if shape == "delta" else draw(0.3, 0.4)
     if shape == "delta":
         half = min(half, 0.9 * root / np.tan(np.radians(sweep)))
-    plan = Planform(half, root, tip, sweep, draw(-5, 2), z, draw(-0.3, 0.6) * radius, thickness=0.06)
+    plan = Planform(
+        half, root, tip, sweep, draw(-5, 2), z, draw(-0.3, 0.6) * radius, thickness=0.06
+    )
     plane = fuselage(radius, tail_start=0.75, **form) + plan.wing()
     plane += canopy(0.9 * radius, 1.1 * radius, draw(0.18, 0.28), 0.8 * radius, draw(0.15, 0.22))
     if twin:
         plane += _intake_tunnel(radius, draw(0.8, 1.25) * radius).both_sides()
     else:
-        side = box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02).both_sides()
+        side = box(
+            (0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02
+        ).both_sides()
         chin = box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02)
         plane += draw.pick([side, chin, Part()]) + nozzle(0.75 * radius, 0.08).moved(z=-0.52)
     if draw.maybe(0.55 if twin else 0.1):
@@ -352,12 +386,16 @@ def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
         height = draw(0.17, 0.25) + 0.6 * radius
         plane += fin(height, draw(0.2, 0.3), 0.09, draw(35, 52), z=-0.2).moved(y=0.3 * radius)
     if shape != "delta":
-        plane += Planform(draw(0.17, 0.23), 0.15, 0.06, draw(30, 45), -3, -0.34, 0.0, thickness=0.06).wing()
+        plane += Planform(
+            draw(0.17, 0.23), 0.15, 0.06, draw(30, 45), -3, -0.34, 0.0, thickness=0.06
+        ).wing()
         if draw.maybe(0.4):  # strakes from the wing root towards the nose
             outer = (2.0 * radius, plan.y, z - 0.03, 0.7 * root, 0.05)
             plane += wing([(0.0, plan.y, z + 0.2, root + 0.1, 0.05), outer]).both_sides()
     elif draw.maybe(0.5):  # canards
-        plane += Planform(draw(0.15, 0.2), 0.11, 0.04, 45, 4, 0.24, 0.35 * radius, thickness=0.06).wing()
+        plane += Planform(
+            draw(0.15, 0.2), 0.11, 0.04, 45, 4, 0.24, 0.35 * radius, thickness=0.06
+        ).wing()
     places = {(0.4, 0.6, 0.8, 1.0)[draw.count(0, 3)] for _ in range(draw.count(0, 3))}
     return plane + join(_store(draw, plan, share).both_sides() for share in sorted(places))
 
@@ -419,8 +457,14 @@ def turboprop(draw: Draw, *, radius, high, **form) -> Part:
     blades = draw.count(2, 6)
     disc = draw(0.07, 0.1)
     for share in (draw(0.26, 0.34),) if two else (0.27, 0.56):
-        plane += _propeller_engine(draw, plan, share, thick, draw(0.08, 0.13), disc, blades).both_sides()
-    kind = {"T": 2, "conventional": 2, "cross": 0.7} if high else {"conventional": 3, "twin": 1.2, "T": 0.6}
+        plane += _propeller_engine(
+            draw, plan, share, thick, draw(0.08, 0.13), disc, blades
+        ).both_sides()
+    kind = (
+        {"T": 2, "conventional": 2, "cross": 0.7}
+        if high
+        else {"conventional": 3, "twin": 1.2, "T": 0.6}
+    )
     plane += tail(draw, draw.pick(kind), radius, swept=draw.maybe(0.5))
     if draw.maybe(0.2):
         plane += gear(radius, 1.8 * radius, main_x=1.1 * radius, main_z=0.02, other_z=0.36)
@@ -463,9 +507,13 @@ def light_plane(draw: Draw, *, radius, high, pusher, **form) -> Part:
         plane += box((1.5 * radius, 1.1 * tall, 0.2), (0, 0.62 * tall, 0.14), 0.03)
     else:
         plane += canopy(1.5 * radius, 1.3 * tall, draw(0.24, 0.36), 0.72 * tall, 0.1)
-    plane += propeller(draw, draw(0.11, 0.16), draw.count(2, 3), hub=0.025).moved(z=-0.515 if pusher else 0.497)
+    plane += propeller(draw, draw(0.11, 0.16), draw.count(2, 3), hub=0.025).moved(
+        z=-0.515 if pusher else 0.497
+    )
     swept = draw.maybe(0.5)
-    plane += tail(draw, draw.pick({"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5}), radius, swept)
+    plane += tail(
+        draw, draw.pick({"conventional": 4, "T": 1, "V": 0.6, "cross": 0.5}), radius, swept
+    )
     if high and draw.maybe(0.6):
         x, y, z, chord = plan.at(draw(0.4, 0.6))
         z = z - 0.4 * chord
@@ -486,14 +534,18 @@ def _floats(draw: Draw, radius: float, tall: float, *, drop, length) -> Part:
     part = hull.moved(x, y, 0.12).both_sides()
     for z in (0.24, 0.02):
         end = (x, y + 0.02, z)
-        part += (bar((0.5 * radius, -0.6 * tall, z), end, 0.016) + bar((0.0, *end[1:]), end, 0.012)).both_sides()
+        part += (
+            bar((0.5 * radius, -0.6 * tall, z), end, 0.016) + bar((0.0, *end[1:]), end, 0.012)
+        ).both_sides()
     return part
 
 
 @recipe(radius=(0.042, 0.055))
 def glider(draw: Draw, *, radius) -> Part:
     """A sailplane: a slender pod and boom under very long wings."""
-    plane = fuselage(radius, 1.25, 0.26, 1.8, tail_start=0.33, tail_power=0.75, tail_radius=0.22, upsweep=0.1)
+    plane = fuselage(
+        radius, 1.25, 0.26, 1.8, tail_start=0.33, tail_power=0.75, tail_radius=0.22, upsweep=0.1
+    )
     size = draw.measures(
         half=(0.9, 1.35),
         root=(0.085, 0.12),
@@ -565,7 +617,9 @@ def biplane(draw: Draw, *, radius, exponent, gap, stagger, triplane) -> Part:
             plane += bar((x, y0, z0 - along * c0), (x, y1, z1 - along * c1), 0.013).both_sides()
     for z in (top.z - 0.2 * chord, top.z - 0.7 * chord):
         plane += bar((0.7 * radius, 0.5 * radius, z), (0.08, top.y, z), 0.012).both_sides()
-    plane += propeller(draw, draw(0.12, 0.15), 2, hub=0.025).moved(z=0.495) + tail(draw, "conventional", radius)
+    plane += propeller(draw, draw(0.12, 0.15), 2, hub=0.025).moved(z=0.495) + tail(
+        draw, "conventional", radius
+    )
     return plane + gear(radius, 2.6 * radius, main_x=0.11, main_z=0.27, other_z=-0.46)
 
 

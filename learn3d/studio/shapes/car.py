@@ -39,7 +39,9 @@ def car(draw: Draw, kind: str) -> Part:
     _, least, greatest = _KINDS[kind]
     limits = dict(zip(_FIELDS, zip(least, greatest, strict=True), strict=True))
     body = SimpleNamespace(**draw.measures(**limits), has_bed=kind == "pickup")
-    body.shoulder = max(body.belt * body.height, 2 * body.wheel + 0.15)  # height of the shoulder line, above the wheels
+    body.shoulder = max(
+        body.belt * body.height, 2 * body.wheel + 0.15
+    )  # height of the shoulder line, above the wheels
     # Distances of the axles from the front bumper.
     body.axles = body.wheel + 0.48, body.length - body.wheel - 0.44
     part = _hull(body)
@@ -47,7 +49,9 @@ def car(draw: Draw, kind: str) -> Part:
     x = (body.width - TYRE) / 2 - 0.02
     y = body.wheel
     dish = draw(0.1, 0.6)
-    rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])  # of a wheel with a dished hub
+    rim = np.array(
+        [(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)]
+    )  # of a wheel with a dished hub
     profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
     pair = revolve(profile).rotated("z", 90).moved(x, y).both_sides() + crossbar((-x, y, 0), 0.1)
     part += join(pair.moved(z=body.length / 2 - s) for s in body.axles)
@@ -56,7 +60,9 @@ def car(draw: Draw, kind: str) -> Part:
     y = body.shoulder + 0.07
     z = (0.5 - body.bonnet) * body.length - 0.2
     mirror = box((draw(0.14, 0.22), draw(0.09, 0.16), 0.08), (half + 0.07, y, z), 0.03)
-    part += (mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)).both_sides()
+    part += (
+        mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)
+    ).both_sides()
     if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):
         part += _roof_box(draw, body)
     if kind == "coupe" and draw.maybe(0.5):
@@ -71,7 +77,9 @@ def _roof_box(draw: Draw, body: SimpleNamespace, *, width, tall) -> Part:
     half = 0.35 * body.width - 0.5 * body.lean * (body.height - body.shoulder)
     z = (0.5 - (start + body.roof) / 2) * body.length
     long = 0.8 * (body.roof - start) * body.length
-    bars = (box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1))
+    bars = (
+        box((2 * half, 0.12, 0.06), (0, body.height + 0.01, z + s * 0.3 * long)) for s in (-1, 1)
+    )
     top = slab(rectangle(width * half, long, 0.2, 3), tall, 0.1).moved(y=body.height + 0.05, z=z)
     return join(bars) + top
 
@@ -91,7 +99,9 @@ def _hull(body: SimpleNamespace) -> Part:
     length = body.length
     belt = body.shoulder
     boot = min(body.window * length, length - 0.12)
-    bed = (boot + 0.06, length - 0.08) if body.has_bed else (length, length)  # start and end of the open box
+    bed = (
+        (boot + 0.06, length - 0.08) if body.has_bed else (length, length)
+    )  # start and end of the open box
 
     # The upper edge of the body seen from the side: distance from the front bumper, and height.
     cowl = body.bonnet * length
@@ -117,7 +127,9 @@ def _hull(body: SimpleNamespace) -> Part:
     arch = body.wheel + 0.055  # radius of the wheel arches
     around_axle = arch * np.append([-1.02, 1.02], 0.999 * np.cos(np.linspace(0, np.pi, 8)))
     ends = [end + side for end in bed for side in (-0.015, 0.015)]
-    s = np.concatenate([line[:, 0], np.linspace(0, length, 7), *(a + around_axle for a in body.axles), ends])
+    s = np.concatenate(
+        [line[:, 0], np.linspace(0, length, 7), *(a + around_axle for a in body.axles), ends]
+    )
     s = np.unique(s[(s >= 0) & (s <= length)].round(3))
     s = s[np.append(True, np.diff(s) > 0.004)]
 
@@ -127,7 +139,11 @@ def _hull(body: SimpleNamespace) -> Part:
     top = np.interp(s, *line.T)
     width = body.width / 2 * (1 - 0.15 * np.clip(1 - to_front / 0.18, 0, 1) ** 2)
     width = width * (1 - 0.06 * np.clip(1 - to_rear / 0.15, 0, 1) ** 2)
-    floor = body.clearance + 0.12 * np.clip(1 - to_front / 0.08, 0, 1) + 0.15 * np.clip(1 - to_rear / 0.1, 0, 1)
+    floor = (
+        body.clearance
+        + 0.12 * np.clip(1 - to_front / 0.08, 0, 1)
+        + 0.15 * np.clip(1 - to_rear / 0.1, 0, 1)
+    )
     inner = np.full_like(s, body.width / 2 - TYRE - 0.06)  # the floor between the wheels
     cut = floor + 0.002  # lower edge of the sides
     for axle in body.axles:
@@ -135,11 +151,15 @@ def _hull(body: SimpleNamespace) -> Part:
         cut = np.where(np.abs(s - axle) < arch, np.maximum(cut, over_wheel), cut)
     shoulder = np.minimum(belt, top - 0.03)
     middle = np.maximum(0.55 * floor + 0.45 * shoulder, 0.5 * (cut + shoulder))
-    edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)  # rim of the roof
+    edge = np.maximum(
+        top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01
+    )  # rim of the roof
     roof = np.maximum(0.96 * width - 0.03 - body.lean * (edge - shoulder), 0.45 * width)
     rim = shoulder + 0.02  # of the bed
     bottom = np.full_like(s, belt - 0.38)  # of the bed
-    hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))  # the wheel arch seen from the bed
+    hump = np.maximum(
+        bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03)
+    )  # the wheel arch seen from the bed
 
     # The right half of each cross-section: points (x, y) from the middle of the floor outwards
     # and up to the middle.

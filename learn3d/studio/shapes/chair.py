@@ -98,7 +98,9 @@ _BACKS = {
 
 def jointed_chair(draw: Draw, family: Family) -> Part:
     """A dining, office, lounge or bar chair, put together from a seat, a support, a back and arms."""
-    return _join_chair(draw, family, **draw.measures(**_MEASURES) | draw.measures(**family.measures))
+    return _join_chair(
+        draw, family, **draw.measures(**_MEASURES) | draw.measures(**family.measures)
+    )
 
 
 def _join_chair(
@@ -114,7 +116,9 @@ def _join_chair(
 ) -> Part:
     back_height = throne or back_height
     cushioned = cushioned or family is OFFICE
-    exponent = draw.pick({8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1})  # outline of the seat: 2 = ellipse ... 8 = rectangle
+    exponent = draw.pick(
+        {8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1}
+    )  # outline of the seat: 2 = ellipse ... 8 = rectangle
     thickness = draw(0.07, 0.13) if cushioned else draw(0.025, 0.05)
     taper = draw.of(Perhaps(0.4, (0.8, 1.0), 1.0))  # narrower at the rear
     outline = ellipse(width, depth, 24, exponent)
@@ -131,7 +135,9 @@ def _join_chair(
 
     angular = exponent > 4
     stile_x = 0.5 * width * taper - 0.03 if angular else 0.36 * width
-    rear_edge = depth / 2 * (1 - (2 * stile_x / width) ** exponent) ** (1 / exponent)  # -z of the seat at x = stile_x
+    rear_edge = (
+        depth / 2 * (1 - (2 * stile_x / width) ** exponent) ** (1 / exponent)
+    )  # -z of the seat at x = stile_x
     curve = max(0.0 if angular else depth / 2 - rear_edge, draw.of(Perhaps(0.6, (0.0, 0.08))))
     back, bulge = _back(draw, family, stile_x, back_height, curve)
     part += back.rotated("x", -recline).moved(y=height - 0.5 * thickness, z=-depth / 2 + 0.03)
@@ -139,7 +145,9 @@ def _join_chair(
         rise = draw(0.17, 0.26)
         rear = -depth / 2 + 0.03 + (curve + bulge) - np.tan(np.radians(recline)) * rise
         edge = 0.5 * width - 0.02 if angular else max(stile_x, half_x)
-        part += _arm(draw, (stile_x, height + rise, rear), rise, edge, height - 0.6 * thickness, depth).both_sides()
+        part += _arm(
+            draw, (stile_x, height + rise, rear), rise, edge, height - 0.6 * thickness, depth
+        ).both_sides()
     return part
 
 
@@ -189,23 +197,31 @@ def _arm(
     arm = strip(path, size * width, 0.7 * size, side=X)
     if kind == "cantilever":
         return arm + bar((edge - 0.01, base, rear / 2), (edge, y, rear / 2), 0.03, 0.05)
-    outline = ellipse(0.8 * size, 0.8 * size, 8) if draw.maybe(0.5) else rectangle(0.8 * size, 0.8 * size)
+    outline = (
+        ellipse(0.8 * size, 0.8 * size, 8) if draw.maybe(0.5) else rectangle(0.8 * size, 0.8 * size)
+    )
     profile = [(0, 1), (0.5, draw(0.8, 1.5)), (1, 0.9)]
     return arm + post((edge - 0.012, base, foot_z), (edge, y, foot_z), outline, profile)
 
 
-def _back(draw: Draw, family: Family, half: float, height: float, curve: float) -> tuple[Part, float]:
+def _back(
+    draw: Draw, family: Family, half: float, height: float, curve: float
+) -> tuple[Part, float]:
     """A back in the plane z = 0, from y = 0 to `height`, between stiles at x = +-half; and the z of its front."""
     top = height + 0.02
     if not draw.maybe(family.padded):
         kind = draw.pick(_BACKS)
         if kind == "solid":
             return _plate(draw, half, top, curve, draw(0.02, 0.045)), 0.0
-        return _hoop(draw, half, top, curve) if kind == "hoop" else _frame(draw, half, height, curve, kind), 0.0
+        return _hoop(draw, half, top, curve) if kind == "hoop" else _frame(
+            draw, half, height, curve, kind
+        ), 0.0
     thickness = draw(0.05, 0.11)
     if family is OFFICE and not draw.maybe(0.3):  # mostly held above the seat by a spine
         gap = draw(0.12, 0.35) * top
-        back = _plate(draw, draw(0.8, 1.1) * half, top - gap, max(curve, 0.03), thickness).moved(y=gap)
+        back = _plate(draw, draw(0.8, 1.1) * half, top - gap, max(curve, 0.03), thickness).moved(
+            y=gap
+        )
         path = [(0, -0.06, 0.12), (0, -0.06, -0.07), (0, gap + 0.3 * (top - gap), -0.4 * thickness)]
         back += strip(rounded_path(path, 0.06), 0.06, 0.02, side=X)
     elif draw.maybe(0.5):
@@ -216,12 +232,16 @@ def _back(draw: Draw, family: Family, half: float, height: float, curve: float) 
 
 
 @recipe(stile=(0.022, 0.045), thick=(0.015, 0.028), rounded=0.4, taper=(0.7, 1))
-def _frame(draw: Draw, half: float, height: float, curve: float, kind: str, *, stile, thick, rounded, taper) -> Part:
+def _frame(
+    draw: Draw, half: float, height: float, curve: float, kind: str, *, stile, thick, rounded, taper
+) -> Part:
     """Two stiles and a rail on top, filled with boards, slats, spindles, a splat, a cross, a lattice, or open."""
     top = height + 0.02
     high = height > 0.3
     outline = ellipse(stile, stile, 8) if rounded else rectangle(stile, stile, segments=1)
-    part = post((half, -0.02, curve), (half, top, curve), outline, [(0, 1), (1, taper)]).both_sides()
+    part = post(
+        (half, -0.02, curve), (half, top, curve), outline, [(0, 1), (1, taper)]
+    ).both_sides()
     rail = draw(0.04, 0.12) if high else draw(0.03, 0.06)
     arch = draw.of(Perhaps(0.4, (0.01, 0.07)))
     part += _rail(half, top - 0.45 * rail, rail, thick, curve, arch)
@@ -232,7 +252,10 @@ def _frame(draw: Draw, half: float, height: float, curve: float, kind: str, *, s
         count = draw.count(1, 4) if high else 1
         pitch = (top - rail - low) / (count + 0.5)
         each = min(draw(0.25, 0.6) * pitch, 0.08)
-        return part + join(_rail(half, low + (k + 0.5) * pitch, each, thick, curve, 0.6 * arch) for k in range(count))
+        return part + join(
+            _rail(half, low + (k + 0.5) * pitch, each, thick, curve, 0.6 * arch)
+            for k in range(count)
+        )
     if kind in ("panel", "band"):
         x = np.linspace(-half, half, 9)
         y = np.array([[low if kind == "panel" else 0.55 * height], [top - 0.5 * rail]])
@@ -261,7 +284,9 @@ def _frame(draw: Draw, half: float, height: float, curve: float, kind: str, *, s
 
 
 @recipe(wide=(0.25, 0.5), swell=(0.1, 0.5), waves=(0.6, 1.4), phase=(0, 1))
-def _splat(draw: Draw, low: float, high: float, half: float, thick: float, *, wide, swell, waves, phase) -> Part:
+def _splat(
+    draw: Draw, low: float, high: float, half: float, thick: float, *, wide, swell, waves, phase
+) -> Part:
     """A vase-shaped board in the middle of a back."""
     wide *= half
     t = shares(9)[:, None]
@@ -275,14 +300,20 @@ def _bow(x: np.ndarray, half: float, curve: float) -> np.ndarray:
     return curve * (np.abs(x) / half) ** 2
 
 
-def _rail(half: float, y: float, height: float, thickness: float, curve: float, arch: float = 0.0) -> Part:
+def _rail(
+    half: float, y: float, height: float, thickness: float, curve: float, arch: float = 0.0
+) -> Part:
     """A horizontal board between the stiles, following the bow of the back, its middle lifted by `arch`."""
     x = np.linspace(-half, half, 9)
-    return strip(points(x, y + arch * (1 - (x / half) ** 2), _bow(x, half, curve)), thickness, height)
+    return strip(
+        points(x, y + arch * (1 - (x / half) ** 2), _bow(x, half, curve)), thickness, height
+    )
 
 
 @recipe(flare=(-0.25, 0.2), power=[2.0, 3.0, 6.0, 12.0], wave=(-0.02, 0.03))
-def _plate(draw: Draw, half: float, top: float, curve: float, thickness: float, *, flare, power, wave) -> Part:
+def _plate(
+    draw: Draw, half: float, top: float, curve: float, thickness: float, *, flare, power, wave
+) -> Part:
     """A one-piece back: straight or flared, its upper corners rounded, bowed and with a lumbar bulge."""
     t = np.concatenate([np.linspace(0, 0.7, 4), 1 - 0.3 * np.linspace(0.75, 0, 5) ** 1.8])[:, None]
     v = np.linspace(-1, 1, 11)[None]
@@ -302,7 +333,9 @@ def _hoop(draw: Draw, half: float, top: float, curve: float, *, straight, thick,
     part = tube(points(x, y, _bow(x, half, curve)), thick / 2)
     for x in spread(half, spindles):
         end = straight + (top - straight) * (1 - (x / half) ** 2) ** 0.45
-        part += bar((0.75 * x, -0.01, _bow(0.75 * x, half, curve)), (x, end, _bow(x, half, curve)), 0.016)
+        part += bar(
+            (0.75 * x, -0.01, _bow(0.75 * x, half, curve)), (x, end, _bow(x, half, curve)), 0.016
+        )
     return part
 
 
@@ -410,7 +443,9 @@ def barrel_chair(
             x = radius * np.sin(a)
             z = -radius * np.cos(a)
             end = height + np.interp(a, angle, bottom) + 0.02
-            part += bar((0.93 * x, height - 0.5 * cushion, 0.93 * z), (0.99 * x, end, 0.99 * z), 0.022)
+            part += bar(
+                (0.93 * x, height - 0.5 * cushion, 0.93 * z), (0.99 * x, end, 0.99 * z), 0.022
+            )
     if draw.maybe(0.2):  # a solid drum down to the floor
         return part + slab(ellipse(1.9 * radius, 1.9 * radius, 28), under + 0.02, 0.02)
     support = draw.pick({legs: 3, disc: 1, star: 0.7, loops: 0.7})
@@ -455,7 +490,9 @@ def bench(draw: Draw, *, width, depth, height, boards, thick, gap, support) -> P
         for x in (-0.4 * width, 0.4 * width):
             part += bar((x, height - 0.02, rear), (x, height + top, rear - lean), 0.05)
         for t in np.linspace(0.35, 0.95, draw.count(1, 3)):
-            part += crossbar((-width / 2, height + t * top, rear - t * lean), 0.03, draw(0.06, 0.12))
+            part += crossbar(
+                (-width / 2, height + t * top, rear - t * lean), 0.03, draw(0.06, 0.12)
+            )
     return part
 
 

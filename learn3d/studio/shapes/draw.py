@@ -110,7 +110,9 @@ def ellipse(width: float, depth: float, count: int = 20, exponent: float = 2.0) 
     return np.c_[0.5 * width * x, 0.5 * depth * y]
 
 
-def rectangle(width: float, depth: float, radius: float | None = None, segments: int = 2) -> np.ndarray:
+def rectangle(
+    width: float, depth: float, radius: float | None = None, segments: int = 2
+) -> np.ndarray:
     """The outline [4 (segments + 1), 2] of a rectangle with rounded corners.
 
     The default radius is 12 % of the short side. With 0 segments the corners are sharp.
@@ -122,18 +124,25 @@ def rectangle(width: float, depth: float, radius: float | None = None, segments:
     radius = 0.12 * short if radius is None else min(max(radius, 0.01 * short), 0.49 * short)
     angle = np.concatenate([np.linspace(k, k + 1, segments + 1) for k in range(4)]) * (np.pi / 2)
     corner = np.repeat(corner, segments + 1, 0)
-    return corner * (np.array([width, depth]) / 2 - radius) + radius * np.c_[np.cos(angle), np.sin(angle)]
+    return (
+        corner * (np.array([width, depth]) / 2 - radius)
+        + radius * np.c_[np.cos(angle), np.sin(angle)]
+    )
 
 
 def inset(outline: np.ndarray, distance: float) -> np.ndarray:
     """The outline moved inwards by `distance` along its mitred vertex normals."""
     edge = np.roll(outline, -1, 0) - outline
-    normal = np.c_[edge[:, 1], -edge[:, 0]] / np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
+    normal = np.c_[edge[:, 1], -edge[:, 0]] / np.maximum(
+        np.linalg.norm(edge, axis=1, keepdims=True), 1e-12
+    )
     mitre = normal + np.roll(normal, 1, 0)
     return outline - mitre * (2.0 * distance / np.maximum((mitre**2).sum(1, keepdims=True), 0.5))
 
 
-def rounded_path(points: Sequence[Point], radius: float, segments: int = 4, closed: bool = False) -> np.ndarray:
+def rounded_path(
+    points: Sequence[Point], radius: float, segments: int = 4, closed: bool = False
+) -> np.ndarray:
     """The polyline [P, 3] with each corner replaced by an arc-like curve that starts `radius` before the corner."""
     points = np.asarray(points, dtype=float)
     t = np.linspace(0.0, 1.0, segments + 1)[:, None]

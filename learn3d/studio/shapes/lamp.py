@@ -46,7 +46,9 @@ def _foot(draw: Draw, size: float, *, outline, thickness) -> Part:
     shade=(1.15, 2.2),
     shade_height=(0.15, 0.3),
 )
-def table_lamp(draw: Draw, *, height, width, belly, balls, form, sides, neck, shade, shade_height) -> Part:
+def table_lamp(
+    draw: Draw, *, height, width, belly, balls, form, sides, neck, shade, shade_height
+) -> Part:
     """A turned base under a shade."""
     t = shares(17)
     radius = {
@@ -114,11 +116,15 @@ def desk_lamp(draw: Draw, *, lower_deg, upper_deg, lower, upper, thick, foot) ->
         lamp += tube(rounded_path([base, elbow, head], 0.2, 7), thick / 2)
     else:
         lamp += bar(base, elbow, thick) + bar(elbow, head, thick)
-        lamp += join(bar(joint - [0.02, 0, 0], joint + [0.02, 0, 0], 0.04) for joint in (elbow, head))
+        lamp += join(
+            bar(joint - [0.02, 0, 0], joint + [0.02, 0, 0], 0.04) for joint in (elbow, head)
+        )
     size = draw(0.06, 0.11)
     tilt_deg = draw(-10, 60)
     t = shares(6)
-    profile = np.sqrt(1 - 0.93 * t**2) if draw.pick(["round", "conical"]) == "round" else 1 - 0.7 * t
+    profile = (
+        np.sqrt(1 - 0.93 * t**2) if draw.pick(["round", "conical"]) == "round" else 1 - 0.7 * t
+    )
     shade = _shell(size * profile, 1.5 * size * t, 16)
     shade += ellipsoid((0.9 * size, size, 0.9 * size), (0, 0.7 * size, 0), 10, 6)
     shade += revolve([(0.5 * size, 1.2 * size), (0.4 * size, 1.7 * size)], 12)
@@ -157,7 +163,9 @@ def chandelier(draw: Draw, *, count, reach, drop, swing, rise, globes, waves) ->
     if globes:
         arm += ellipsoid((0.12, 0.12, 0.12), (reach, rise + 0.05, 0), 12, 8)
     else:
-        arm += revolve([(0.012, 0), (0.045, 0.01), (0.045, 0.02), (0.012, 0.022)], 10).moved(reach, rise - 0.01)
+        arm += revolve([(0.012, 0), (0.045, 0.01), (0.045, 0.02), (0.012, 0.022)], 10).moved(
+            reach, rise - 0.01
+        )
         arm += bar((reach, rise, 0), (reach, rise + 0.1, 0), 0.026)
     t = shares(9)
     column = revolve(np.c_[0.02 + 0.04 * np.abs(np.sin(waves * np.pi * t)), -0.12 + 0.3 * t], 12)

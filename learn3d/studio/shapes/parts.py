@@ -105,7 +105,9 @@ def between(lower: Point, upper: Point, radius: float | None = None) -> Part:
     return box(upper - lower, (lower + upper) / 2, radius)
 
 
-def post(foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[float, float]]) -> Part:
+def post(
+    foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[float, float]]
+) -> Part:
     """A post, perhaps slanted, with horizontal sections. profile: [(height from 0 at the foot to 1, outline scale)]."""
     foot, section = np.asarray(foot), points(outline[:, 0], 0.0, outline[:, 1])
     return loft([foot + t * (head - foot) + scale * section for t, scale in profile])
@@ -126,7 +128,9 @@ def revolve(profile: Sequence[Point], sides: int = 16, hollow: bool = False) -> 
     )
 
 
-def ellipsoid(size: Point, center: Point = (0.0, 0.0, 0.0), sides: int = 14, stacks: int = 8) -> Part:
+def ellipsoid(
+    size: Point, center: Point = (0.0, 0.0, 0.0), sides: int = 14, stacks: int = 8
+) -> Part:
     """An ellipsoid of the given size [3] about `center`."""
     angle = np.linspace(-0.5, 0.5, stacks + 1) * np.pi
     profile = np.c_[np.maximum(np.cos(angle), 0.02), np.sin(angle)] * 0.5
@@ -165,12 +169,16 @@ def tube(
         size = np.linalg.norm(bend)
         if size > 1e-6:  # mitre: stretch towards the bend by 1 / cos(half the bend)
             bend = bend / size
-            ring = ring + (ring @ bend)[:, None] * bend * (1.0 / max(ahead[k] @ tangent[k], 0.4) - 1.0)
+            ring = ring + (ring @ bend)[:, None] * bend * (
+                1.0 / max(ahead[k] @ tangent[k], 0.4) - 1.0
+            )
         rings.append(path[k] + ring)
     return loft(rings, "ring" if closed else "fan")
 
 
-def bar(start: Point, end: Point, width: float, height: float | None = None, side: Point = Z) -> Part:
+def bar(
+    start: Point, end: Point, width: float, height: float | None = None, side: Point = Z
+) -> Part:
     """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
     if height is None:
         section = ellipse(width, width, 6)
@@ -179,7 +187,9 @@ def bar(start: Point, end: Point, width: float, height: float | None = None, sid
     return tube([start, end], 1.0, section, side=side)
 
 
-def strip(path: ArrayLike, width: float, height: float, scale: ArrayLike = 1.0, side: Point = Z) -> Part:
+def strip(
+    path: ArrayLike, width: float, height: float, scale: ArrayLike = 1.0, side: Point = Z
+) -> Part:
     """A flat bar along a path: its section is `width` (along `side`) by `height`, times `scale` (a number or [P])."""
     return tube(path, scale, rectangle(width, height, segments=1), side=side)
 
@@ -189,7 +199,9 @@ def pole(low: float, high: float, width: float) -> Part:
     return bar((0, low, 0), (0, high, 0), width)
 
 
-def board(half: float, y: tuple[float, float], z: tuple[float, float], radius: float | None = None) -> Part:
+def board(
+    half: float, y: tuple[float, float], z: tuple[float, float], radius: float | None = None
+) -> Part:
     """The rounded box from x = -half to half between two heights and two depths."""
     return between((-half, y[0], z[0]), (half, y[1], z[1]), radius)
 
@@ -213,8 +225,13 @@ def wing(sections: Sequence[Sequence[float]], upright: bool = False) -> Part:
     The span is along x and the rise along y; `upright` swaps them, for a fin. The airfoil is a
     symmetric four-digit NACA profile with a blunt trailing edge.
     """
-    c = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, 7)))  # dense at the leading edge (0) and the trailing edge (1)
-    half = 5.0 * (0.2969 * np.sqrt(c) - 0.1260 * c - 0.3516 * c**2 + 0.2843 * c**3 - 0.1015 * c**4) + 0.02
+    c = 0.5 * (
+        1.0 - np.cos(np.linspace(0.0, np.pi, 7))
+    )  # dense at the leading edge (0) and the trailing edge (1)
+    half = (
+        5.0 * (0.2969 * np.sqrt(c) - 0.1260 * c - 0.3516 * c**2 + 0.2843 * c**3 - 0.1015 * c**4)
+        + 0.02
+    )
     span, rise, front, chord, ratio = np.array(sections, dtype=float).T[:, :, None]
     y, z = (
         rise + np.append(half, -half[::-1]) * chord * ratio,

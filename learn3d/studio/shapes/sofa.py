@@ -9,10 +9,15 @@ from .parts import Part, X, bar, between, board, crossbar, join, sheet, slab
 from .supports import feet, legs, loops, panels
 
 
-def _cushions(lower: tuple[float, float, float], upper: tuple[float, float, float], count: int) -> Part:
+def _cushions(
+    lower: tuple[float, float, float], upper: tuple[float, float, float], count: int
+) -> Part:
     """Cushions side by side along x that fill the box between two corners."""
     edges = pairwise(np.linspace(lower[0], upper[0], count + 1))
-    return join(between((left + 0.008, *lower[1:]), (right - 0.008, *upper[1:]), 0.05) for left, right in edges)
+    return join(
+        between((left + 0.008, *lower[1:]), (right - 0.008, *upper[1:]), 0.05)
+        for left, right in edges
+    )
 
 
 @recipe(
@@ -33,11 +38,15 @@ def upholstered(draw: Draw, *, seats, half, depth, foot, seat) -> Part:
     front = depth / 2
     rear = -depth / 2
     part = board(half, (foot, low + 0.005), (rear, front - 0.03), 0.02)
-    part += _cushions((-half, low, rear + 0.7 * back), (half, seat, front), draw.pick([1, seats, seats]))
+    part += _cushions(
+        (-half, low, rear + 0.7 * back), (half, seat, front), draw.pick([1, seats, seats])
+    )
     upright = board(half, (low - 0.1, high), (rear, rear + back), soft)
     if draw.maybe(0.5):
         top = high + draw(-0.08, 0.08)
-        upright += _cushions((-half, seat - 0.05, rear + 0.4 * back), (half, top, rear + 1.6 * back), seats)
+        upright += _cushions(
+            (-half, seat - 0.05, rear + 0.4 * back), (half, top, rear + 1.6 * back), seats
+        )
     if seats == 1 and high > 0.8 and draw.maybe(0.35):  # wings
         t = shares(6)[:, None]
         reach = draw(0.18, 0.3) * np.sin(np.pi * (0.12 + 0.8 * t)) ** 0.7
@@ -131,7 +140,9 @@ def settee(draw: Draw, *, seats, half, depth, size, seat, high, rest, sink, supp
         x = half - 0.02
         start = z - np.tan(np.radians(lean)) * (rest - low)
         arm = bar((x, rest, start), (x, rest, front - 0.03), 1.6 * size, 0.8 * size, side=X)
-        sofa += (arm + bar((x, low - 0.03, front - 0.08), (x, rest, front - 0.08), size, size)).both_sides()
+        sofa += (
+            arm + bar((x, low - 0.03, front - 0.08), (x, rest, front - 0.08), size, size)
+        ).both_sides()
     return sofa
 
 
@@ -147,11 +158,15 @@ def settee(draw: Draw, *, seats, half, depth, size, seat, high, rest, sink, supp
     fall=(0, 0.25),
     bulge=(-0.1, 0.1),
 )
-def curved_sofa(draw: Draw, *, half, depth, seat, foot, high, thick, turn_deg, power, fall, bulge) -> Part:
+def curved_sofa(
+    draw: Draw, *, half, depth, seat, foot, high, thick, turn_deg, power, fall, bulge
+) -> Part:
     """A sofa on an arc, or a tub sofa: the back continues into the arms."""
     turn = np.radians(turn_deg)
     angle = np.linspace(-turn, turn, 31)
-    forward = (1 - np.cos(angle)) / (1 - np.cos(turn))  # 0 in the middle of the back, 1 at the ends of the arms
+    forward = (1 - np.cos(angle)) / (
+        1 - np.cos(turn)
+    )  # 0 in the middle of the back, 1 at the ends of the arms
     sine = np.sin(angle) / np.sin(turn)
     x = (half - thick / 2) * np.sign(sine) * np.abs(sine) ** power  # flatter than a circle's arc
     z = -depth / 2 + thick / 2 + (depth - thick) * forward

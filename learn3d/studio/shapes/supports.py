@@ -47,11 +47,16 @@ def legs(
     if hairpin:
         return _hairpin_legs(half_x, half_z, height, splay)
     profile, turned = (TAPERED, True) if plain else _leg_profile(draw)
-    outline = ellipse(size, size, 10) if turned or draw.maybe(0.3) else rectangle(size, size, segments=1)
+    outline = (
+        ellipse(size, size, 10) if turned or draw.maybe(0.3) else rectangle(size, size, segments=1)
+    )
     splay_rear = splay * draw.pick([0.3, 1.0, 1.6])
     head = np.array([[half_x, height, half_z], [half_x, height, -half_z]])  # front, rear
     foot = head * [1, 0, 1] + [[splay, 0, splay], [splay, 0, -splay_rear]]
-    part = join(post(f, h + [0, 0.01, 0], outline, profile).both_sides() for f, h in zip(foot, head, strict=True))
+    part = join(
+        post(f, h + [0, 0.01, 0], outline, profile).both_sides()
+        for f, h in zip(foot, head, strict=True)
+    )
 
     stretchers = draw.pick({"none": 3, "H": 1, "box": 1, "sides": 0.7, "X": 0.4})
     level = draw(0.15, 0.5)
@@ -119,7 +124,9 @@ def apron(half_x: float, half_z: float, top: float, depth: float, thickness: flo
 def feet(draw: Draw, half_x: float, half_z: float, height: float, *, size, kind) -> Part:
     """Four short feet under a block: tapered blocks, cones or bun feet."""
     if kind == "bun":
-        return ellipsoid((1.4 * size, height, 1.4 * size), (half_x, height / 2, half_z)).four_corners()
+        return ellipsoid(
+            (1.4 * size, height, 1.4 * size), (half_x, height / 2, half_z)
+        ).four_corners()
     outline = rectangle(size, size, segments=1) if kind == "block" else ellipse(size, size, 10)
     lean = draw.maybe(0.4) * 0.03
     foot = (half_x + lean, 0, half_z + lean)
@@ -133,7 +140,9 @@ def feet(draw: Draw, half_x: float, half_z: float, height: float, *, size, kind)
     hub=(0.02, 0.12),
     thick=(0.018, 0.032),
 )
-def star(draw: Draw, half_x: float, half_z: float, height: float, *, reach, arms, castors, hub, thick) -> Part:
+def star(
+    draw: Draw, half_x: float, half_z: float, height: float, *, reach, arms, castors, hub, thick
+) -> Part:
     """A column on a star of 3 to 6 arms, perhaps on castors, with a plate under the seat."""
     reach *= max(half_x, half_z)
     castors = castors and height < 0.6
@@ -150,7 +159,9 @@ def star(draw: Draw, half_x: float, half_z: float, height: float, *, reach, arms
     path = rounded_path(path, 0.1, 3)
     arm = strip(path, width, 0.8 * width, np.linspace(1.0, 0.6, len(path)))
     if castors:
-        wheel = revolve([(0.02, -0.02), (0.03, -0.012), (0.03, 0.012), (0.02, 0.02)], 10).rotated("z", 90)
+        wheel = revolve([(0.02, -0.02), (0.03, -0.012), (0.03, 0.012), (0.02, 0.02)], 10).rotated(
+            "z", 90
+        )
         arm += wheel.rotated("y", 35).moved(reach - 0.01, 0.03)
     part += arm.around(-turn - 360 / arms * np.arange(arms))
     return part + slab(rectangle(1.2 * half_x, 1.2 * half_z), 0.03).moved(y=height - 0.025)
@@ -195,7 +206,9 @@ def disc(draw: Draw, half_x: float, half_z: float, height: float, *, reach, thic
     flare=Perhaps(0.4, (0.0, 0.2)),
     rear_lean=(-0.3, 0.5),
 )
-def loops(draw: Draw, half_x: float, half_z: float, height: float, *, lean, flat, size, flare, rear_lean) -> Part:
+def loops(
+    draw: Draw, half_x: float, half_z: float, height: float, *, lean, flat, size, flare, rear_lean
+) -> Part:
     """A closed frame of tube or flat bar on each side (a sled), joined by cross bars."""
     lean *= height
     foot_x = half_x * (1.0 + flare)
@@ -218,7 +231,9 @@ def loops(draw: Draw, half_x: float, half_z: float, height: float, *, lean, flat
 
 
 @recipe(size=(0.022, 0.034), reach=(0.9, 1.15), forward=(-0.05, 0.08), bend=(0.05, 0.1))
-def cantilever(draw: Draw, half_x: float, half_z: float, height: float, *, size, reach, forward, bend) -> Part:
+def cantilever(
+    draw: Draw, half_x: float, half_z: float, height: float, *, size, reach, forward, bend
+) -> Part:
     """One bent tube: under the seat to the front, down to the floor, to the rear and across. It has no rear legs."""
     low = size / 2
     high = height - 0.3 * size
@@ -236,7 +251,9 @@ def cross(draw: Draw, half_x: float, half_z: float, height: float, *, size, deep
     part = Part()
     for s in (-1, 1):
         outer = x - (0.5 + 0.5 * s) * size
-        part += bar((outer, 0.012, s * z * 1.1), (outer, height, -s * z), size, deep * size, side=X).both_sides()
+        part += bar(
+            (outer, 0.012, s * z * 1.1), (outer, height, -s * z), size, deep * size, side=X
+        ).both_sides()
         part += crossbar((-outer, 0.12 * height, s * z * 0.84), 0.9 * size)
         part += crossbar((-outer, height - 0.015, -s * z), 0.9 * size)
     part += crossbar((-x, height / 2, 0), 0.9 * size)
@@ -266,6 +283,8 @@ def rocker(draw: Draw, half_x: float, half_z: float, height: float, *, size, rad
     for end in (-half_z, half_z):
         foot_z = end * 1.08
         foot = (x, np.interp(foot_z, z[::-1], y[::-1]), foot_z)
-        part += post(foot, (half_x, height + 0.01, end), ellipse(size, size, 8), [(0, 0.8), (1, 1)]).both_sides()
+        part += post(
+            foot, (half_x, height + 0.01, end), ellipse(size, size, 8), [(0, 0.8), (1, 1)]
+        ).both_sides()
         part += crossbar((-half_x - 0.01, 0.4 * height, foot_z + 0.4 * (end - foot_z)), 0.6 * size)
     return part

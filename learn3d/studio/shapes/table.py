@@ -27,7 +27,9 @@ def _size(draw: Draw) -> tuple[float, float, float]:
 @recipe(thickness=(0.02, 0.07), bevel=[0.1, 0.2, 0.45])
 def _top(draw: Draw, outline: np.ndarray, height: float, *, thickness, bevel) -> tuple[Part, float]:
     """A table top whose upper side is at `height`, and the height of its lower side."""
-    return slab(outline, thickness, bevel * thickness).moved(y=height - thickness), height - thickness
+    return slab(outline, thickness, bevel * thickness).moved(
+        y=height - thickness
+    ), height - thickness
 
 
 def table_with_legs(draw: Draw) -> Part:
@@ -152,7 +154,9 @@ def desk(draw: Draw, *, half_x, half_z, height) -> Part:
         drawers += bar(handle - 0.05 * X, handle + 0.05 * X, 0.02)
     if low > 0.03:
         x = half_x - 0.05
-        drawers += join(bar((x, 0, z), (x, low + 0.01, z), 0.04, 0.04) for z in (-half_z + 0.07, half_z - 0.08))
+        drawers += join(
+            bar((x, 0, z), (x, low + 0.01, z), 0.04, 0.04) for z in (-half_z + 0.07, half_z - 0.08)
+        )
     panel = between((half_x - 0.05, 0, -half_z + 0.02), (right, high, front))
     other = draw.pick([drawers, panel])
     side = draw.pick([-1.0, 1.0])
@@ -177,7 +181,11 @@ def drum_table(draw: Draw, *, width, height, solid) -> Part:
         waist = (draw(0.3, 0.55) * width, height / 2)
         return top + revolve([(0.45 * width, 0), waist, (0.45 * width, height - 0.02)], 32)
     rod = bar((width / 2 - 0.07, 0.005, 0), (width / 2 - 0.07, height - 0.02, 0), 0.016)
-    return top + slab(inset(plate, 0.04), 0.02) + rod.around(np.arange(0, 360, 360 / draw.count(10, 21)))
+    return (
+        top
+        + slab(inset(plate, 0.04), 0.02)
+        + rod.around(np.arange(0, 360, 360 / draw.count(10, 21)))
+    )
 
 
 KINDS = {table_with_legs: 4, pedestal_table: 2.5, trestle_table: 1.5, desk: 2, drum_table: 0.8}

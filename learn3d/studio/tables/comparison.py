@@ -149,7 +149,9 @@ def _run_rows(done: Runs) -> Cells:
             str(result.images),
         ]
         minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
-        rows.append([name_run(run), *counts, *format_measures(vars(result)), minutes, result.commit])
+        rows.append(
+            [name_run(run), *counts, *format_measures(vars(result)), minutes, result.commit]
+        )
     return rows
 
 
@@ -192,7 +194,9 @@ def _format_printed(printed: Mapping[str, float], column: str, categories: Seque
 
 def _compare(measure: str, *sides: Side) -> str:
     """The mean of one method, or the difference of two, with its intervals; "-" if a result is missing."""
-    values = [[[getattr(r, measure) for r in by_seed.values()] for by_seed in side] for side in sides]
+    values = [
+        [[getattr(r, measure) for r in by_seed.values()] for by_seed in side] for side in sides
+    ]
     if not all(v and None not in v for side in values for v in side):
         return "-"
     form = ".3f" if len(sides) == 1 else "+.3f"
@@ -205,7 +209,16 @@ def _compare(measure: str, *sides: Side) -> str:
     if measure == "mmd":
         return text + (f" (x {means[0] / means[1]:.2f})" if len(means) == 2 else "")
     for of_category in zip(*sides, strict=True):
-        if len({tuple(o.name for o in r.objects) for by_seed in of_category for r in by_seed.values()}) > 1:
+        if (
+            len(
+                {
+                    tuple(o.name for o in r.objects)
+                    for by_seed in of_category
+                    for r in by_seed.values()
+                }
+            )
+            > 1
+        ):
             return text  # on different objects: they cannot be resampled together
     ours, *theirs = (_resample(measure, side) for side in sides)
     if interval := percentile_interval(ours - sum(theirs)):
@@ -217,8 +230,12 @@ def _resample(measure: str, side: Side) -> np.ndarray:
     """Mean IoUs over resampled objects [2000]. The IoUs of an object are those of all seeds."""
     sums, counts = [], []
     for by_seed in side:
-        images = np.array([[o.images for o in result.objects] for result in by_seed.values()], float)
-        means = [[getattr(o, measure) or 0.0 for o in result.objects] for result in by_seed.values()]
+        images = np.array(
+            [[o.images for o in result.objects] for result in by_seed.values()], float
+        )
+        means = [
+            [getattr(o, measure) or 0.0 for o in result.objects] for result in by_seed.values()
+        ]
         sums.append((means * images).sum(0))
         counts.append(images.sum(0))
     return resampled_means(sums, counts)
@@ -226,7 +243,9 @@ def _resample(measure: str, side: Side) -> np.ndarray:
 
 def read_pose_errors(poses: Path) -> dict[str, float]:
     """The JSON file beside a table of estimated poses."""
-    return read_json(poses.with_suffix(".json"), limits.JSON_BYTES, "the errors of a table of poses")
+    return read_json(
+        poses.with_suffix(".json"), limits.JSON_BYTES, "the errors of a table of poses"
+    )
 
 
 def _pose_rows(runs: Sequence[TrainConfig], results: Mapping[Path, Result]) -> Cells:
@@ -254,13 +273,19 @@ def _pose_rows(runs: Sequence[TrainConfig], results: Mapping[Path, Result]) -> C
         if len(by_seed) > 1:
             by_seed["mean"] = np.mean(list(by_seed.values()), axis=0)
         for seed, values in by_seed.items():
-            cells = [f"{value:.1f}" if place == 3 else f"{value:.3f}" for place, value in enumerate(values)]
+            cells = [
+                f"{value:.1f}" if place == 3 else f"{value:.3f}"
+                for place, value in enumerate(values)
+            ]
             rows.append([category, seed, *cells])
     return rows
 
 
 def _markdown(table: Cells) -> str:
     """The table as Markdown, with HTML escaped, because names in results come from untrusted files."""
-    cells = [[html.escape(" ".join(c.splitlines()), quote=False).replace("|", "\\|") for c in row] for row in table]
+    cells = [
+        [html.escape(" ".join(c.splitlines()), quote=False).replace("|", "\\|") for c in row]
+        for row in table
+    ]
     lines = ["| " + " | ".join(row) + " |" for row in cells]
     return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]])

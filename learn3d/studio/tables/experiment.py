@@ -46,7 +46,9 @@ def estimate_poses(config: TrainConfig) -> None:
     note(comparison.text())
     config.poses.parent.mkdir(parents=True, exist_ok=True)
     confidence = {"confidence": float(views.table.confidence.mean())}
-    writing.write_json(config.poses.with_suffix(".json"), dataclasses.asdict(comparison) | confidence)
+    writing.write_json(
+        config.poses.with_suffix(".json"), dataclasses.asdict(comparison) | confidence
+    )
     views.table.turned(comparison.offset_deg).write(config.poses)
 
 
@@ -72,7 +74,9 @@ def train_and_test(config: TrainConfig) -> bool:
     if config.poses is not None:
         estimate_poses(config)
     resume = run_folder.is_run(config.output)
-    if not train(config, resume=resume, overwrite=not resume).finished:  # the folder exists: log.txt is in it
+    if not train(
+        config, resume=resume, overwrite=not resume
+    ).finished:  # the folder exists: log.txt is in it
         return False
     if config.poses is not None:
         _measure_updated_poses(config)
@@ -84,7 +88,9 @@ def train_and_test(config: TrainConfig) -> bool:
     return True
 
 
-def run_experiment(request: Request, *, work: Callable[[TrainConfig], bool] = train_and_test) -> int:
+def run_experiment(
+    request: Request, *, work: Callable[[TrainConfig], bool] = train_and_test
+) -> int:
     """Train and test the missing runs of a table and write its report.
 
     Returns the exit status: 0, 1 if a run failed, 130 if a signal stopped it. The report of the
@@ -114,7 +120,9 @@ def run_experiment(request: Request, *, work: Callable[[TrainConfig], bool] = tr
     say(align(tables["main"]))
     note(f"report: {path}; its tables for other programs: {path.with_suffix('.json').name}")
     if failed:
-        note(f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}); the same command tries them again")
+        note(
+            f"{len(failed)} of {len(runs)} runs failed ({', '.join(failed)}); the same command tries them again"
+        )
         return 1
     if len(results) < len(runs) and not request.report_only:
         note("stopped; the same command goes on")
@@ -125,10 +133,14 @@ def run_experiment(request: Request, *, work: Callable[[TrainConfig], bool] = tr
 def read_result(path: Path) -> Result:
     """Read a test.json. Raises ValueError naming the file if it is damaged or no result."""
     try:
-        return Result.model_validate_json(read_bytes(path, limits.JSON_BYTES, "the measurement of a run as JSON"))
+        return Result.model_validate_json(
+            read_bytes(path, limits.JSON_BYTES, "the measurement of a run as JSON")
+        )
     except ValueError as error:
         reason = " ".join(str(error).splitlines()[1:3])
-        raise ValueError(f"{path} is no measurement of a run ({reason}); remove it, and it is made again") from None
+        raise ValueError(
+            f"{path} is no measurement of a run ({reason}); remove it, and it is made again"
+        ) from None
 
 
 def read_results(runs: Sequence[TrainConfig]) -> dict[Path, Result]:
@@ -159,7 +171,9 @@ def describe_tables() -> str:
     lines = []
     for name, table in TABLES.items():
         lines.append(f"{name}: {table.title}")
-        lines.append(f"  layout {table.layout}, {len(table.categories)} categories, seeds {table.seeds}")
+        lines.append(
+            f"  layout {table.layout}, {len(table.categories)} categories, seeds {table.seeds}"
+        )
         for label, row in table.rows.items():
             about = ["quoted"]
             if variant := VARIANTS.get(row.variant):

@@ -32,15 +32,21 @@ def comparison_grid(
     """
     dataset = runs[0].dataset
     batch = dataset.batch(samples)
-    shown = [(run.label, run.method.decode(run.method.encode(batch.images)).surfaces()) for run in runs]
+    shown = [
+        (run.label, run.method.decode(run.method.encode(batch.images)).surfaces()) for run in runs
+    ]
     if truth:
         if dataset.voxels is None:
             raise ValueError(f"{dataset.category}, {dataset.split} has no true voxels to show")
         voxels = dataset.convention.to_object(batch.voxels.float())
-        shown.insert(0, ("truth", [grid_surface(grid, box=dataset.convention.cube_side) for grid in voxels]))
+        shown.insert(
+            0, ("truth", [grid_surface(grid, box=dataset.convention.cube_side) for grid in voxels])
+        )
     poses = [dataset.poses[sample[None]] for sample in samples]
     cameras = [orbit(pose, TURNS_DEG) for pose in poses]
-    zoom = common_zoom([pair for _, shapes in shown for pair in zip(shapes, cameras, strict=True)], batch.masks)
+    zoom = common_zoom(
+        [pair for _, shapes in shown for pair in zip(shapes, cameras, strict=True)], batch.masks
+    )
     inputs = magnify(natural_colors(batch.images.numpy(), inverted=dataset.inverted), zoom)
     rows = []
     for i, pose in enumerate(poses):
@@ -49,7 +55,9 @@ def comparison_grid(
         rows += [[inputs[i] if k == 0 else None, *row] for k, row in enumerate(pictures)]
     labels = [label for label, _ in shown] * len(samples)
     rules = range(len(shown), len(rows), len(shown))
-    return tile(rows, [title, "input view", *AROUND], tile_size=TILE_SIZE, row_titles=labels, rules=rules)
+    return tile(
+        rows, [title, "input view", *AROUND], tile_size=TILE_SIZE, row_titles=labels, rules=rules
+    )
 
 
 @torch.no_grad()
@@ -110,7 +118,10 @@ def save_interpolation(
     samples = [choose_samples(run.dataset, images, indices) for run in runs]
     titles = [run.label for run in runs] if len(runs) > 1 else ["input"]
     return _save(
-        [interpolate(*each, title=title) for *each, title in zip(runs, samples, titles, strict=True)],
+        [
+            interpolate(*each, title=title)
+            for *each, title in zip(runs, samples, titles, strict=True)
+        ],
         output,
     )
 
@@ -130,7 +141,9 @@ def choose_samples(dataset: ViewDataset, count: int, indices: Sequence[int] = ()
 def _save(blocks: Sequence[np.ndarray], output: Path) -> list[Path]:
     """Save pictures uint8 [h,w,3] below each other, flush left, ten white rows apart."""
     width = max(block.shape[1] for block in blocks)
-    padded = [np.pad(b, ((0, 10), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks]
+    padded = [
+        np.pad(b, ((0, 10), (0, width - b.shape[1]), (0, 0)), constant_values=255) for b in blocks
+    ]
     output.parent.mkdir(parents=True, exist_ok=True)
     save_png(path := output.with_suffix(".png"), np.concatenate(padded)[:-10])
     return [path]

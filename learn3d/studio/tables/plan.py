@@ -75,12 +75,18 @@ def select_rows(request: Request) -> dict[str, Row]:
     Quoted rows are always included. Raises ValueError for a method that the table does not have.
     """
     rows = TABLES[request.table].rows
-    names = {label.lower(): row.variant for label, row in rows.items()} | {r.variant: r.variant for r in rows.values()}
+    names = {label.lower(): row.variant for label, row in rows.items()} | {
+        r.variant: r.variant for r in rows.values()
+    }
     asked = [method.lower() for method in request.methods] or list(names)
     if unknown := [method for method in asked if method not in names]:
-        raise ValueError(unknown_name("method of the table", unknown[0], filter(None, names.values())))
+        raise ValueError(
+            unknown_name("method of the table", unknown[0], filter(None, names.values()))
+        )
     chosen = {names[method] for method in asked}
-    return {label: row for label, row in rows.items() if row.variant is None or row.variant in chosen}
+    return {
+        label: row for label, row in rows.items() if row.variant is None or row.variant in chosen
+    }
 
 
 def plan_runs(request: Request) -> list[TrainConfig]:
@@ -92,7 +98,9 @@ def plan_runs(request: Request) -> list[TrainConfig]:
     table = TABLES[request.table]
     layout = request.layout or table.layout
     if not LAYOUTS[layout].voxels:
-        raise ValueError(f"the layout {layout!r} has no true voxels, so that no run of the table could be measured")
+        raise ValueError(
+            f"the layout {layout!r} has no true voxels, so that no run of the table could be measured"
+        )
     variants = [row.variant for row in select_rows(request).values() if row.variant]
     changes = _parse_changes(variants, request.set)
     return [
@@ -114,13 +122,17 @@ def _configure(
     iterations = (request.iterations or length_of.iterations) * divisor
     batch_size = request.batch_size or length_of.batch_size
     if batch_size % divisor:
-        raise ValueError(f"{name} divides batches by {divisor}: batch_size must be a multiple, got {batch_size}")
+        raise ValueError(
+            f"{name} divides batches by {divisor}: batch_size must be a multiple, got {batch_size}"
+        )
     return configure(
         variant.preset,
         data=request.data,
         category=category,
         output=request.output / "runs" / category / f"{name}-seed{seed}",
-        poses=request.output / "poses" / f"{category}-seed{seed}.npz" if variant.estimates_poses else None,
+        poses=request.output / "poses" / f"{category}-seed{seed}.npz"
+        if variant.estimates_poses
+        else None,
         settings=preset.settings.for_iterations(iterations),
         layout=layout,
         iterations=iterations,
@@ -140,7 +152,9 @@ def _parse_changes(variants: Sequence[str], texts: Sequence[str]) -> dict[str, d
         target, separator, value = text.partition("=")
         variant, _, name = target.rpartition(":")
         name = name.replace("-", "_")
-        meant = [v for v in variants if variant in ("", v) and name in known[v] and name not in _FIXED]
+        meant = [
+            v for v in variants if variant in ("", v) and name in known[v] and name not in _FIXED
+        ]
         if not meant or not separator:
             raise ValueError(
                 f"--set {text}: give NAME=VALUE or METHOD:NAME=VALUE, with a method of {', '.join(variants)}, and an "

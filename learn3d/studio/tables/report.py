@@ -96,7 +96,10 @@ def write_report(
     page = _measure(runs, results, objects) | {"split": split, "which": which}
     page["data"] = plain((data or runs[0].metadata.config.data).name)
     page["browser"]["curves"] = draw_curves(logs)
-    texts = {kind: Path(__file__).with_suffix(f".{kind}").read_text("utf-8") for kind in ("html", "css", "js")}
+    texts = {
+        kind: Path(__file__).with_suffix(f".{kind}").read_text("utf-8")
+        for kind in ("html", "css", "js")
+    }
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["plain"] = plain
     parts = {
@@ -112,15 +115,21 @@ def write_report(
 def _check_same_images(runs: Sequence[TrainedModel], data: Path | None) -> None:
     classes = dict.fromkeys(run.dataset.category for run in runs)
     if len(classes) > 1 or "," in next(iter(classes)):
-        raise ValueError(f"a report is about one class, and these runs are of {', '.join(classes)}; give --category")
+        raise ValueError(
+            f"a report is about one class, and these runs are of {', '.join(classes)}; give --category"
+        )
     folders = sorted({str(data or run.metadata.config.data.resolve()) for run in runs})
     if len(folders) > 1:
         read = ", ".join(folders)
-        raise ValueError(f"these runs were trained on different data ({read}); give --data to measure all on one")
+        raise ValueError(
+            f"these runs were trained on different data ({read}); give --data to measure all on one"
+        )
     images = [(run.dataset.object_names, run.dataset.object_ids.tolist()) for run in runs]
     for run, read in zip(runs, images, strict=True):
         if read != images[0]:
-            raise ValueError(f"{run.label} and {runs[0].label} read different images of this data; report them apart")
+            raise ValueError(
+                f"{run.label} and {runs[0].label} read different images of this data; report them apart"
+            )
 
 
 def _measure(
@@ -138,11 +147,15 @@ def _measure(
     ids = dataset.object_ids
     sums = np.stack([np.bincount(ids, np.nan_to_num(row), len(names)) for row in ious])
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
-    means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)  # run by object
+    means = np.divide(
+        sums, counts, out=np.full_like(sums, np.nan), where=counts > 0
+    )  # run by object
 
     of_objects = _mean(means, axis=0)
     numbers = np.unique(ids)
-    ranked = numbers[np.argsort(-np.nan_to_num(of_objects[numbers], nan=-1.0), kind="stable")]  # the best object first
+    ranked = numbers[
+        np.argsort(-np.nan_to_num(of_objects[numbers], nan=-1.0), kind="stable")
+    ]  # the best object first
     shown = _typical_images(_mean(ious, axis=0), of_objects, ids, ranked, objects)
     items = pack_shapes(runs, shown)
     for item, sample in zip(items, shown, strict=True):
@@ -151,10 +164,20 @@ def _measure(
     views = []
     if dataset.poses is not None:
         by_view = [mean_by_azimuth(azimuths_deg(dataset.poses).numpy(), row) for row in ious]
-        views = [{"azimuths": azimuths.tolist(), "ious": _numbers(values)} for azimuths, values in by_view]
-    legend = [{"name": plain(run.label), "color": COLORS[k % len(COLORS)]} for k, run in enumerate(runs)]
-    resampled = [resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)]
-    rows = [entry | _describe(*each, metric) for entry, *each in zip(legend, runs, results, resampled, strict=True)]
+        views = [
+            {"azimuths": azimuths.tolist(), "ious": _numbers(values)}
+            for azimuths, values in by_view
+        ]
+    legend = [
+        {"name": plain(run.label), "color": COLORS[k % len(COLORS)]} for k, run in enumerate(runs)
+    ]
+    resampled = [
+        resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)
+    ]
+    rows = [
+        entry | _describe(*each, metric)
+        for entry, *each in zip(legend, runs, results, resampled, strict=True)
+    ]
     for row, samples in zip(rows[1:], resampled[1:], strict=True):
         if None not in (row["iou"], rows[0]["iou"]):
             row["difference"] = row["iou"] - rows[0]["iou"]
@@ -163,7 +186,10 @@ def _measure(
         "runs": rows,
         "category": plain(dataset.category),
         "images": len(dataset),
-        "objects": [{"name": names[n], "ious": _numbers(means[:, n]), "item": first_item.get(n)} for n in ranked],
+        "objects": [
+            {"name": names[n], "ious": _numbers(means[:, n]), "item": first_item.get(n)}
+            for n in ranked
+        ],
         "kind": kind,
         "meaning": MEASURES[metric][1],
         "mmd": MEASURES["mmd"][1],
@@ -172,7 +198,9 @@ def _measure(
     }
 
 
-def _describe(run: TrainedModel, result: Evaluation, resampled: np.ndarray, metric: str) -> dict[str, Any]:
+def _describe(
+    run: TrainedModel, result: Evaluation, resampled: np.ndarray, metric: str
+) -> dict[str, Any]:
     """A run's row of the first table, but for its difference to the first run."""
     config = run.metadata.config
     return {
@@ -200,8 +228,12 @@ def mean_by_azimuth(azimuths_deg: np.ndarray, values: np.ndarray) -> tuple[np.nd
 
     Sectors have 15 degrees and are centred at 0, 15, 30 ... azimuths_deg, values: float [M].
     """
-    sectors, ids = np.unique(np.round(azimuths_deg / SECTOR_DEG) % (360 / SECTOR_DEG), return_inverse=True)
-    return SECTOR_DEG * sectors, np.array([_mean(values[ids == number]) for number in range(len(sectors))])
+    sectors, ids = np.unique(
+        np.round(azimuths_deg / SECTOR_DEG) % (360 / SECTOR_DEG), return_inverse=True
+    )
+    return SECTOR_DEG * sectors, np.array(
+        [_mean(values[ids == number]) for number in range(len(sectors))]
+    )
 
 
 def _mean(values: np.ndarray, axis: int | None = None) -> np.ndarray:
@@ -219,11 +251,16 @@ def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[di
     dataset = max((run.dataset for run in runs), key=lambda dataset: dataset.image_size)
     batch = dataset.batch(torch.tensor(samples))
     images = [run.dataset.batch(torch.tensor(samples)).images for run in runs]
-    shapes = [run.method.decode(run.method.encode(own)).surfaces() for run, own in zip(runs, images, strict=True)]
+    shapes = [
+        run.method.decode(run.method.encode(own)).surfaces()
+        for run, own in zip(runs, images, strict=True)
+    ]
     if batch.voxels is not None:
         grids = dataset.convention.to_object(batch.voxels).float()
         surfaces = [grid_surface(grid, box=dataset.convention.cube_side) for grid in grids]
-        shapes.append([Surface(smooth(s.vertices, s.faces), s.faces) if len(s.faces) else s for s in surfaces])
+        shapes.append(
+            [Surface(smooth(s.vertices, s.faces), s.faces) if len(s.faces) else s for s in surfaces]
+        )
     pictures = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     oblique = LookAtPoses(torch.full((len(samples),), -30.0), 20.0, 1.0, 15.0)
     cameras = eyes(batch.poses or oblique).numpy() @ _TO_PAGE
@@ -237,7 +274,10 @@ def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[di
             "index": sample,
             "image": "data:image/png;base64," + base64.b64encode(png.getvalue()).decode(),
             "eye": cameras[number].round(4).tolist(),
-            "reach": max([float(s.vertices.norm(dim=1).max()) for s in surfaces if len(s.faces)], default=1) / UNIT,
+            "reach": max(
+                [float(s.vertices.norm(dim=1).max()) for s in surfaces if len(s.faces)], default=1
+            )
+            / UNIT,
             "meshes": [_mesh(surface) for surface in surfaces],
         }
         items.append(item)
@@ -247,7 +287,9 @@ def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[di
 def _mesh(surface: Surface) -> dict[str, Any]:
     """A surface in plotly's encoding of arrays."""
     points = np.rint(surface.vertices.double().numpy() @ _TO_PAGE / UNIT).clip(-32767, 32767)
-    corners = surface.faces.numpy()[:, [0, 2, 1]]  # reversed, because the object frame is left-handed
+    corners = surface.faces.numpy()[
+        :, [0, 2, 1]
+    ]  # reversed, because the object frame is left-handed
     kind = "<u2" if len(points) <= 2**16 else "<u4"
     arrays = dict(zip("xyzijk", [*points.T.astype("<i2"), *corners.T.astype(kind)], strict=True))
     packed = {
@@ -269,10 +311,17 @@ def read_metrics(folder: Path) -> Log:
         step, split = record.pop("step"), record.pop("split")
         for name, value in record.items():
             title, known = f"{split} {name}", type(value) in (int, float) and abs(value) <= MOST
-            if known and name not in _NOT_CURVES and title.isprintable() and len(title) <= limits.CURVE_NAME:
+            if (
+                known
+                and name not in _NOT_CURVES
+                and title.isprintable()
+                and len(title) <= limits.CURVE_NAME
+            ):
                 curves.setdefault((split, name), {})[step] = float(value)
     if not 0 < len(curves) <= limits.CURVES:
-        raise ValueError(f"{file} holds {len(curves)} different numbers; from 1 to {limits.CURVES} are drawn")
+        raise ValueError(
+            f"{file} holds {len(curves)} different numbers; from 1 to {limits.CURVES} are drawn"
+        )
     return {key: dict(sorted(curve.items())) for key, curve in curves.items()}
 
 
@@ -280,7 +329,9 @@ def draw_curves(logs: Sequence[Log]) -> list[dict[str, Any]]:
     """A plot for each number in the logs, with a line per run: those of the validation first, then the losses."""
     keys = dict.fromkeys(key for log in logs for key in log)
     plots = []
-    for split, name in sorted(keys, key=lambda key: (key[0] == "train", [*_FIRST, key[1]].index(key[1]))):
+    for split, name in sorted(
+        keys, key=lambda key: (key[0] == "train", [*_FIRST, key[1]].index(key[1]))
+    ):
         lines = [list(log.get((split, name), {}).items()) for log in logs]
         lines = [line[:: len(line) // POINTS + 1] for line in lines]
         plot = {"title": plain(f"{TITLES.get(name, name)}, {split}")}

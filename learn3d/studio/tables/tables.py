@@ -25,11 +25,21 @@ class Variant:
     """A preset with changes. Its name is that of its run folders, so equal names mean the same runs in every table."""
 
     preset: str
-    changes: Mapping[str, Any] = field(default_factory=dict)  # settings of the method and options of the training
-    checkpoint: Literal["last", "best"] = "last"  # networks to test: the last ones, or the best on the validation split
-    small_batches_of: str = ""  # preset that sees as many images, in BATCH_DIVISOR times larger batches; "" for none
-    batch_factor: int = 1  # multiplies the batch size, if a batch also has images that are not encoded
-    estimates_poses: bool = False  # azimuths are estimated with the run's seed, and turned into the data's frame
+    changes: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # settings of the method and options of the training
+    checkpoint: Literal["last", "best"] = (
+        "last"  # networks to test: the last ones, or the best on the validation split
+    )
+    small_batches_of: str = (
+        ""  # preset that sees as many images, in BATCH_DIVISOR times larger batches; "" for none
+    )
+    batch_factor: int = (
+        1  # multiplies the batch size, if a batch also has images that are not encoded
+    )
+    estimates_poses: bool = (
+        False  # azimuths are estimated with the run's seed, and turned into the data's frame
+    )
 
 
 class Row(NamedTuple):
@@ -37,7 +47,9 @@ class Row(NamedTuple):
 
     variant: str | None  # name in `VARIANTS`; None: a quoted row, never trained here
     about: str  # the voxelizer of the printed figures, and their source if they are quoted
-    printed: dict[str, float]  # the paper's figures by category, and their "mean"; without those that it lacks
+    printed: dict[
+        str, float
+    ]  # the paper's figures by category, and their "mean"; without those that it lacks
 
 
 _PLUS = PlusSettings()
@@ -60,7 +72,9 @@ _SHARED_NAMES = (
 _SHARED = _SCHEDULE | _SYMMETRY | {name: getattr(_PLUS, name) for name in _SHARED_NAMES}
 #: Networks, smoothness and schedule of the table of supervision, whose methods encode as many
 #: images as Plus.
-_SUPERVISION = _SCHEDULE | _SYMMETRY | {"encoder": "conv-light", "generator": "sphere", "clamp_to_cube": True}
+_SUPERVISION = (
+    _SCHEDULE | _SYMMETRY | {"encoder": "conv-light", "generator": "sphere", "clamp_to_cube": True}
+)
 _SUPERVISION |= {"lambda_smooth": 3e-4, "augment": ("colors",)}
 _SMALL: dict[str, Any] = {"small_batches_of": _PROPOSED}
 #: Widths of the view bins in azimuth and elevation, in degrees.
@@ -76,7 +90,9 @@ VARIANTS: dict[str, Variant] = {
     "plus": Variant("plus-kato", **_SMALL),
     "plus-estimated-poses": Variant("plus-kato", estimates_poses=True, **_SMALL),
     "without-prior": Variant(_PROPOSED, {"lambda_prior": 0.0}),
-    "without-adversarial": Variant(_PROPOSED, {"lambda_adversarial": 0.0, "lambda_classification": 0.0}),
+    "without-adversarial": Variant(
+        _PROPOSED, {"lambda_adversarial": 0.0, "lambda_classification": 0.0}
+    ),
     "without-smoothness": Variant(_PROPOSED, {"lambda_smooth": 0.0}),
     **{f"bins-{widths}": Variant("peng2020-kar", {"view_bins": widths}, "best") for widths in BINS},
     "kar-vanilla": Variant("peng2020-kar-vanilla", checkpoint="best"),
@@ -93,7 +109,9 @@ VARIANTS: dict[str, Variant] = {
     "vanilla-shared": Variant(_VANILLA, _SHARED, **_SMALL),
     "single-views": Variant(_VANILLA, _SUPERVISION, **_SMALL),
     "pairs": Variant("multi-view-kato", _SUPERVISION, **_SMALL),
-    "five-views": Variant("many-views-kato", _SUPERVISION, batch_factor=GROUP_SIZE, **_SMALL),  # encodes one of five
+    "five-views": Variant(
+        "many-views-kato", _SUPERVISION, batch_factor=GROUP_SIZE, **_SMALL
+    ),  # encodes one of five
     "plus-without-symmetry": Variant("plus-kato", {"symmetry": None}, **_SMALL),
     "plus-without-novel-views": Variant("plus-kato", {"lambda_novel_view": 0.0}, **_SMALL),
 }
@@ -124,7 +142,9 @@ def read_tables() -> dict[str, Table]:
             line.pop("experiment"),
             tuple(line["categories"].split()) or tuple(SYNSETS),
         )
-        tables[name] = Table(**line | {"categories": categories, "seeds": int(line["seeds"]), "rows": rows[name]})
+        tables[name] = Table(
+            **line | {"categories": categories, "seeds": int(line["seeds"]), "rows": rows[name]}
+        )
     return tables
 
 

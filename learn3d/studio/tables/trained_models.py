@@ -47,7 +47,11 @@ def open_runs(
     for path in paths:
         note(f"opening {path}")
         method, config, metadata = checkpoint.load_method(path, which)
-        configs.append(dataclasses.replace(config, data=data or config.data, category=category or config.category))
+        configs.append(
+            dataclasses.replace(
+                config, data=data or config.data, category=category or config.category
+            )
+        )
         key = (
             config.layout,
             configs[-1].data.resolve(),
@@ -59,10 +63,15 @@ def open_runs(
         if key not in datasets:
             datasets[key] = checkpoint.load_data(config, split, data=data, category=category)
         runs.append((method, datasets[key], metadata))
-    return [TrainedModel(name, *run) for name, run in zip(name_runs(configs, paths, labels), runs, strict=True)]
+    return [
+        TrainedModel(name, *run)
+        for name, run in zip(name_runs(configs, paths, labels), runs, strict=True)
+    ]
 
 
-def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()) -> list[str]:
+def name_runs(
+    configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()
+) -> list[str]:
     """The names of runs in a figure: `labels`, else those of the presets, with the category if there are several.
 
     Runs of the same preset and category get the names of their folders. Raises ValueError for a
@@ -70,9 +79,17 @@ def name_runs(configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Seq
     """
     if labels:
         if len(labels) != len(paths):
-            raise ValueError(f"there are {len(paths)} runs but {len(labels)} labels; give one label per run, or none")
+            raise ValueError(
+                f"there are {len(paths)} runs but {len(labels)} labels; give one label per run, or none"
+            )
         return list(labels)
     several = len({config.category for config in configs}) > 1
     names = [f"{c.category}: " * several + c.label for c in configs]
-    folders = [f"{p.parent.name}/{p.stem}" if p.is_file() else p.name for p in map(Path.resolve, map(Path, paths))]
-    return [folder if names.count(name) > 1 else name for name, folder in zip(names, folders, strict=True)]
+    folders = [
+        f"{p.parent.name}/{p.stem}" if p.is_file() else p.name
+        for p in map(Path.resolve, map(Path, paths))
+    ]
+    return [
+        folder if names.count(name) > 1 else name
+        for name, folder in zip(names, folders, strict=True)
+    ]

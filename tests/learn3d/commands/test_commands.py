@@ -44,9 +44,16 @@ def test_options_reach_the_configuration(tmp_path) -> None:
     assert read(f"{words} --symmetry auto --clamp-to-cube").config.settings.symmetry == "auto"
 
 
-@pytest.mark.parametrize(("options", "steps"), [("", 100), ("--iterations 60", 6), ("--warmup-steps 9", 9)])
+@pytest.mark.parametrize(
+    ("options", "steps"), [("", 100), ("--iterations 60", 6), ("--warmup-steps 9", 9)]
+)
 def test_the_warm_up_is_at_most_a_tenth_of_a_run(options: str, steps: int) -> None:
-    assert read(f"--data d --category chair --output o --preset plus {options}").config.schedule.warmup_steps == steps
+    assert (
+        read(
+            f"--data d --category chair --output o --preset plus {options}"
+        ).config.schedule.warmup_steps
+        == steps
+    )
 
 
 @pytest.mark.parametrize("form", ["--output {}", "--output={}"])
@@ -76,7 +83,10 @@ def test_tab_completes_commands_options_and_values_in_bash(command, tmp_path) ->
         ("evaluate", "--cat"): "--category",
     }.items():
         bash = ["bash", "-c", f"{ask}; echo ${{COMPREPLY[*]}}", "learn3d", *words]
-        assert subprocess.run(bash, cwd=tmp_path, capture_output=True, text=True).stdout.strip() == wanted
+        assert (
+            subprocess.run(bash, cwd=tmp_path, capture_output=True, text=True).stdout.strip()
+            == wanted
+        )
 
 
 @pytest.mark.parametrize(
@@ -138,7 +148,11 @@ def test_help_has_every_preset_and_the_options_of_the_chosen_one(command) -> Non
 def test_the_help_of_evaluate_explains_every_column(command) -> None:
     lines = command("evaluate", "--help")[1].splitlines()
     for column, _ in MEASURES.values():
-        assert [line for line in lines if line.startswith(f"  {column} ") and len(line) > len(column) + 30], column
+        assert [
+            line
+            for line in lines
+            if line.startswith(f"  {column} ") and len(line) > len(column) + 30
+        ], column
 
 
 @pytest.mark.parametrize(
@@ -148,9 +162,15 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
         ("train --output {tmp} --resume", "to start a new run, leave out --resume"),
         ("train --out {tmp} --resume", "--resume needs --output: the folder of the run"),
         ("train --data {tmp}/no --category chair --output {tmp}/run", "data set with --data"),
-        ("train --output {run} --resume --preset vanilla", "with the preset peng2020-kato, got peng2020-kato-vanilla"),
+        (
+            "train --output {run} --resume --preset vanilla",
+            "with the preset peng2020-kato, got peng2020-kato-vanilla",
+        ),
         ("train --output {run} --resume --overwrite", "give one of them"),
-        ("train --data {data} --category lamp --output {tmp}/run", "03636649_train_images.npz: is missing"),
+        (
+            "train --data {data} --category lamp --output {tmp}/run",
+            "03636649_train_images.npz: is missing",
+        ),
         ("check-dataset {tmp}/no", "there is no such folder"),
         ("evaluate", "give at least one run"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),
@@ -160,7 +180,10 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
         ),
         ("evaluate {run} --data {tmp}/nope", "nope: there is no such folder"),
         ("reconstruct --run {run} --output {tmp}/out", "either image files, or --data"),
-        ("reconstruct a.png --output {tmp}/out --split val --indices 3", "--split, --indices does not go with image"),
+        (
+            "reconstruct a.png --output {tmp}/out --split val --indices 3",
+            "--split, --indices does not go with image",
+        ),
         ("reconstruct --data {tmp} --output {tmp}/out --no-crop", "--crop does not go with --data"),
         (
             "reconstruct --run {run} --data {data} --output {tmp}/file/x",
@@ -187,12 +210,18 @@ def test_mistakes_are_one_clear_line_before_a_model_is_loaded(
 @pytest.mark.parametrize(
     ("error", "said", "status"),
     [
-        (ModuleNotFoundError("no", name="plotly"), "report needs the package plotly,.*pip install '.\\[report\\]'", 1),
+        (
+            ModuleNotFoundError("no", name="plotly"),
+            "report needs the package plotly,.*pip install '.\\[report\\]'",
+            1,
+        ),
         (MemoryError("out of memory"), "error: out of memory", 1),
         (KeyboardInterrupt(), "interrupted", INTERRUPTED),
     ],
 )
-def test_errors_while_libraries_are_imported_are_one_line(error, said: str, status: int, command, monkeypatch) -> None:
+def test_errors_while_libraries_are_imported_are_one_line(
+    error, said: str, status: int, command, monkeypatch
+) -> None:
     def fail(*_: object) -> None:
         raise error
 
@@ -202,18 +231,24 @@ def test_errors_while_libraries_are_imported_are_one_line(error, said: str, stat
 
 
 @pytest.mark.parametrize(("best_step", "shown"), [(0, False), (500, True)])
-def test_best_iou_is_said_if_there_is_one(best_step: int, shown: bool, tmp_path, monkeypatch, command) -> None:
+def test_best_iou_is_said_if_there_is_one(
+    best_step: int, shown: bool, tmp_path, monkeypatch, command
+) -> None:
     progress = Progress(700, 0.25 if best_step else -1.0, best_step, 600.0)
     summary = Summary(tmp_path, progress, False, 60.0)
     monkeypatch.setattr(train_command, "train", lambda *_, **__: summary)
-    status, out, _ = command("train", "--data", tmp_path, "--category", "chair", "--output", tmp_path)
+    status, out, _ = command(
+        "train", "--data", tmp_path, "--category", "chair", "--output", tmp_path
+    )
     assert status == INTERRUPTED
     assert out.startswith("stopped at step 700 after 1.0 min (10.0 min of training in all); ")
     assert ("best validation IoU 0.2500 at step 500" in out, "IoU" in out) == (shown, shown)
     assert out.endswith(f"everything is in {tmp_path}\n")
 
 
-def test_evaluate_prints_a_table_and_writes_json(finished_run, tmp_path, command, monkeypatch) -> None:
+def test_evaluate_prints_a_table_and_writes_json(
+    finished_run, tmp_path, command, monkeypatch
+) -> None:
     words = ("evaluate", finished_run, "--split", "val", "--json", tmp_path / "t.json")
     status, out, _ = command(*words)
     report = json.loads((tmp_path / "t.json").read_text())
@@ -235,10 +270,28 @@ def test_the_fit_of_pictures_is_measured(tmp_path, capsys) -> None:
 
 
 def test_interrupting_the_command_saves_and_says_so(tiny_folder, run_folder) -> None:
-    command = [sys.executable, str(TOOLS / "train.py"), "--data", str(tiny_folder), "--category", "airplane"]
-    command += ["--output", str(run_folder), "--batch-size", "2", "--log-every", "1", "--preset", "vanilla"]
+    command = [
+        sys.executable,
+        str(TOOLS / "train.py"),
+        "--data",
+        str(tiny_folder),
+        "--category",
+        "airplane",
+    ]
+    command += [
+        "--output",
+        str(run_folder),
+        "--batch-size",
+        "2",
+        "--log-every",
+        "1",
+        "--preset",
+        "vanilla",
+    ]
     command += ["--encoder", "conv-small", "--generator", "sphere-small"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         deadline = time.monotonic() + 120
         metrics = run_folder / "metrics.jsonl"
         while not (metrics.exists() and metrics.stat().st_size) and time.monotonic() < deadline:

@@ -19,11 +19,15 @@ from learn3d.methods import create_method
 from learn3d.presets import PRESETS
 
 
-def continuous(objects: int = 3, views: int = 4, category: str = "cup", seed: int = 0) -> ViewDataset:
+def continuous(
+    objects: int = 3, views: int = 4, category: str = "cup", seed: int = 0
+) -> ViewDataset:
     """Random images seen from random sides, in two view classes."""
     rng = np.random.default_rng(seed)
     count = objects * views
-    poses = LookAtPoses(*(rng.uniform(*limits, count) for limits in ((-180, 180), (-20, 40), (2, 3))), 15.0)
+    poses = LookAtPoses(
+        *(rng.uniform(*limits, count) for limits in ((-180, 180), (-20, 40), (2, 3))), 15.0
+    )
     return ViewDataset(
         category=category,
         split="train",
@@ -49,7 +53,10 @@ def test_a_batch_has_the_fields_of_its_samples() -> None:
     assert batch.class_ids.tolist() == [0, 0, 0]
     assert torch.equal(batch.voxels, torch.from_numpy(data.voxels[[1, 0, 1]]))
     wanted = nmr.LookAt.from_angles(
-        data.poses.distance[7], data.poses.elevation_deg[7], data.poses.azimuth_deg[7], half_fov_deg=15.0
+        data.poses.distance[7],
+        data.poses.elevation_deg[7],
+        data.poses.azimuth_deg[7],
+        half_fov_deg=15.0,
     )
     assert torch.allclose(batch.cameras.eye[0], wanted.eye, atol=1e-6)
     assert data.batch([0], voxels=False).voxels is None
@@ -69,11 +76,26 @@ def test_separate_masks_replace_the_fourth_channel() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"images": np.zeros((12, 4, 64, 64))}, r"images must be uint8 \[M, 4, S, S\], got float64"),
-        ({"images": np.zeros((12, 4, 32, 32), np.uint8)}, "images of 32 pixels need masks of 64, got None"),
-        ({"masks": np.zeros((12, 32, 32), np.uint8)}, r"masks .* must be \[12, 64, 64\], got \[12, 32, 32\]"),
-        ({"view_ids": np.zeros(5, np.int64)}, r"view_ids of 12 images of 3 objects must be \[12\], got \[5\]"),
-        ({"voxels": np.zeros((2, 32, 32, 32), bool)}, r"voxels .* must be \[3, 32, 32, 32\], got \[2, 32, 32, 32\]"),
+        (
+            {"images": np.zeros((12, 4, 64, 64))},
+            r"images must be uint8 \[M, 4, S, S\], got float64",
+        ),
+        (
+            {"images": np.zeros((12, 4, 32, 32), np.uint8)},
+            "images of 32 pixels need masks of 64, got None",
+        ),
+        (
+            {"masks": np.zeros((12, 32, 32), np.uint8)},
+            r"masks .* must be \[12, 64, 64\], got \[12, 32, 32\]",
+        ),
+        (
+            {"view_ids": np.zeros(5, np.int64)},
+            r"view_ids of 12 images of 3 objects must be \[12\], got \[5\]",
+        ),
+        (
+            {"voxels": np.zeros((2, 32, 32, 32), bool)},
+            r"voxels .* must be \[3, 32, 32, 32\], got \[2, 32, 32, 32\]",
+        ),
         ({"view_ids": np.full(12, 2)}, r"view_ids must lie in 0 .. 1, got 2 .. 2"),
         ({"object_ids": np.full(12, -1)}, r"object_ids must lie in 0 .. 2, got -1 .. -1"),
     ],
@@ -86,13 +108,20 @@ def test_parts_that_do_not_fit_are_named(change: dict, message: str) -> None:
 def test_several_categories_become_one_set_with_classes() -> None:
     cups, jars = continuous(), continuous(2, 3, "jar", seed=1)
     both = concatenate([cups, jars])
-    assert (both.category, both.class_names, both.num_classes, both.num_objects) == ("cup,jar", ("cup", "jar"), 2, 5)
+    assert (both.category, both.class_names, both.num_classes, both.num_objects) == (
+        "cup,jar",
+        ("cup", "jar"),
+        2,
+        5,
+    )
     batch, alone = both.batch(torch.tensor([3, 12 + 4])), jars.batch(torch.tensor([4]))
     assert (batch.class_ids.tolist(), batch.object_ids.tolist()) == ([0, 1], [0, 4])
     assert torch.equal(batch.images[1], alone.images[0])
     assert torch.equal(batch.voxels[1], alone.voxels[0])
     assert torch.equal(batch.cameras.eye[1], alone.cameras.eye[0])
-    near = dataclasses.replace(jars, poses=dataclasses.replace(jars.poses, distance=2.0))  # one number for all
+    near = dataclasses.replace(
+        jars, poses=dataclasses.replace(jars.poses, distance=2.0)
+    )  # one number for all
     distances = concatenate([cups, near]).poses.distance
     assert torch.equal(distances, torch.cat([cups.poses.distance, torch.full((6,), 2.0)]))
     assert concatenate([cups]) is cups
@@ -124,7 +153,15 @@ def test_classes_are_drawn_uniformly_whatever_their_size() -> None:
 
 @pytest.mark.parametrize(
     ("text", "count"),
-    [("60x60", 6), ("30x30", 24), ("20x20", 54), ("20x15", 72), ("15x20", 72), ("15x15", 96), ("10x10", 216)],
+    [
+        ("60x60", 6),
+        ("30x30", 24),
+        ("20x20", 54),
+        ("20x15", 72),
+        ("15x20", 72),
+        ("15x15", 96),
+        ("10x10", 216),
+    ],
 )
 def test_the_papers_seven_settings(text: str, count: int) -> None:
     bins = AngleBins.parse(text)
@@ -142,14 +179,25 @@ def test_the_papers_seven_settings(text: str, count: int) -> None:
 
 
 def test_ends_of_the_range_belong_to_cells() -> None:
-    azimuths, elevations = np.array([180.0, -180.0, 179.9, 0.0, 0.0]), np.array([40.0, -20.0, 40.0, 55.0, -90.0])
-    assert AngleBins(15, 20).ids(LookAtPoses(azimuths, elevations, 2.0, 15.0)).tolist() == [71, 0, 71, 38, 36]
+    azimuths, elevations = (
+        np.array([180.0, -180.0, 179.9, 0.0, 0.0]),
+        np.array([40.0, -20.0, 40.0, 55.0, -90.0]),
+    )
+    assert AngleBins(15, 20).ids(LookAtPoses(azimuths, elevations, 2.0, 15.0)).tolist() == [
+        71,
+        0,
+        71,
+        38,
+        36,
+    ]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        *dict.fromkeys(["15", "ax20", "15x20:1", "15x20x3"], "view bins are written as AZIMUTHxELEVATION").items(),
+        *dict.fromkeys(
+            ["15", "ax20", "15x20:1", "15x20x3"], "view bins are written as AZIMUTHxELEVATION"
+        ).items(),
         ("0x20", "azimuth_width_deg"),
         ("15x20:40:-20", "from low to high"),
         ("0.001x0.001", "there would be .* bins"),
@@ -165,8 +213,14 @@ def test_rebinning_changes_the_classes_alone() -> None:
     binned = data.with_bins(AngleBins.parse("60x60"))
     assert binned.num_views == 6
     assert np.array_equal(binned.view_ids, AngleBins.parse("60x60").ids(data.poses).numpy())
-    candidates = PoseCandidates(data.poses.mirrored(torch.ones(12, dtype=bool)), data.view_ids, *2 * [np.ones((12, 1))])
-    drawn = dataclasses.replace(data, candidates=candidates).with_bins(AngleBins.parse("60x60")).candidates
+    candidates = PoseCandidates(
+        data.poses.mirrored(torch.ones(12, dtype=bool)), data.view_ids, *2 * [np.ones((12, 1))]
+    )
+    drawn = (
+        dataclasses.replace(data, candidates=candidates)
+        .with_bins(AngleBins.parse("60x60"))
+        .candidates
+    )
     assert np.array_equal(drawn.view_ids, AngleBins.parse("60x60").ids(candidates.poses).numpy())
     assert not np.array_equal(drawn.view_ids, binned.view_ids)
     turned = dataclasses.replace(data, poses=RotationPoses(torch.eye(3).expand(12, 3, 3)))
@@ -188,7 +242,9 @@ def test_mirrored_pose_sees_the_mirrored_image_of_a_symmetric_object(kind: str) 
         vertices = vertices[:, [2, 1, 0]]
         poses = LookAtPoses(np.array([35.0, -100.0]), np.array([20.0, -10.0]), 2.732, 15.0)
     else:
-        rotation = torch.linalg.qr(torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0)))[0]
+        rotation = torch.linalg.qr(
+            torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0))
+        )[0]
         poses = RotationPoses(rotation * torch.linalg.det(rotation)[:, None, None])
     seen, mirrored = (
         nmr.render_silhouette(vertices, faces, p.cameras(), image_size=64)
@@ -215,7 +271,10 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
     assert concatenate([unknown, unknown]).poses is None
     assert unknown.select(np.array([0, 1])).poses is None
     indices = torch.tensor([1, 30])
-    batch, known = (augment(dataset.batch(indices), ("flip",), 0, 1, inverted=True) for dataset in (unknown, tiny_set))
+    batch, known = (
+        augment(dataset.batch(indices), ("flip",), 0, 1, inverted=True)
+        for dataset in (unknown, tiny_set)
+    )
     assert batch.poses is None
     assert torch.equal(batch.images, known.images)
     with pytest.raises(ValueError, match="no poses"):
@@ -224,7 +283,9 @@ def test_poses_may_be_unknown(tiny_set: ViewDataset) -> None:
         concatenate([unknown, tiny_set])
 
 
-@pytest.mark.parametrize("preset", ["peng2020-kato", "multi-view-kato", "peng2020-kato-vpl", "gadelha2017-kato"])
+@pytest.mark.parametrize(
+    "preset", ["peng2020-kato", "multi-view-kato", "peng2020-kato-vpl", "gadelha2017-kato"]
+)
 def test_methods_that_need_poses_say_so(preset: str) -> None:
     with pytest.raises(ValueError, match="has no poses"):
         create_method(
@@ -239,7 +300,9 @@ def test_methods_that_need_poses_say_so(preset: str) -> None:
 def test_few_views_of_every_object(tiny_set) -> None:
     few = tiny_set.with_few_views(2)
     assert few.object_ids.tolist() == [0, 0, 1, 1, 2, 2]
-    assert len({tuple(few.view_ids[i : i + 2]) for i in (0, 2, 4)}) == 3  # not the same views of every object
+    assert (
+        len({tuple(few.view_ids[i : i + 2]) for i in (0, 2, 4)}) == 3
+    )  # not the same views of every object
     np.testing.assert_array_equal(few.view_ids, tiny_set.with_few_views(2).view_ids)
     for sample in range(6):
         of_all = 24 * few.object_ids[sample] + few.view_ids[sample]
@@ -247,7 +310,13 @@ def test_few_views_of_every_object(tiny_set) -> None:
         assert few.poses.azimuth_deg[sample] == tiny_set.poses.azimuth_deg[of_all]
     assert len(tiny_set.with_few_views(24)) == len(tiny_set)
     uneven = tiny_set.select(np.array([0, 1, 2, 24, 50, 51]))
-    assert uneven.with_few_views(2).object_ids.tolist() == [0, 0, 1, 2, 2]  # those that have fewer keep them
+    assert uneven.with_few_views(2).object_ids.tolist() == [
+        0,
+        0,
+        1,
+        2,
+        2,
+    ]  # those that have fewer keep them
     for wrong in (0, 25):
         with pytest.raises(ValueError, match=r"views_per_object must lie in 1 \.\. 24"):
             tiny_set.with_few_views(wrong)
@@ -259,23 +328,31 @@ def test_colours_are_permuted_scaled_or_left_out(tiny_set) -> None:
     assert torch.equal(changed.images[:, 3], batch.images[:, 3])
     assert torch.equal(changed.masks, batch.masks)
     assert torch.equal(augment(batch, ("colors",), 0, 1, inverted=True).images, changed.images)
-    means, before = (b.images[:, :3].double().mean((2, 3)).sort(dim=1).values for b in (changed, batch))
+    means, before = (
+        b.images[:, :3].double().mean((2, 3)).sort(dim=1).values for b in (changed, batch)
+    )
     without = (means == 0).all(1)
     assert 8 < without.sum() < 36  # 30 % of 72
     ratio = means[~without] / before[~without]
     assert ratio.min() > 0.6 and ratio.max() < 1.4 and ratio.std() > 0.05
     # The same images stored as they are, not inverted, get the same change: a white background stays white.
     natural = torch.cat([255 - batch.images[:, :3], batch.images[:, 3:]], dim=1)
-    images = augment(dataclasses.replace(batch, images=natural), ("colors",), 0, 1, inverted=False).images
+    images = augment(
+        dataclasses.replace(batch, images=natural), ("colors",), 0, 1, inverted=False
+    ).images
     assert torch.equal(255 - images[:, :3], changed.images[:, :3])
 
 
 def test_batches_are_sampled_and_augmented_from_any_step_on(tiny_set) -> None:
-    options = SimpleNamespace(sampling="views", batch_size=4, augment=("flip", "channels"), seed=5, iterations=6)
+    options = SimpleNamespace(
+        sampling="views", batch_size=4, augment=("flip", "channels"), seed=5, iterations=6
+    )
     found = list(batches(tiny_set, options, 3))
     assert len(found) == 4
     for step, batch in enumerate(found, 3):
         samples = sample_indices(tiny_set, "views", 4, 5, step)
-        wanted = augment(tiny_set.batch(samples, voxels=False), ("flip", "channels"), 5, step, inverted=True)
+        wanted = augment(
+            tiny_set.batch(samples, voxels=False), ("flip", "channels"), 5, step, inverted=True
+        )
         assert batch.voxels is None and torch.equal(batch.images, wanted.images)
         assert torch.equal(batch.poses.azimuth_deg, wanted.poses.azimuth_deg)

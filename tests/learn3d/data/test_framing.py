@@ -17,10 +17,17 @@ from learn3d.data.masks import mask_box
 def silhouette(size: int) -> np.ndarray:
     """A box of sides 0.5, 1, 0.7 with its centre at the origin, uint8 [size, size]."""
     camera = nmr.LookAt.from_angles([2.5], [25.0], [40.0], half_fov_deg=24.0)
-    corners = torch.tensor([[x, y, z] for x in (-0.25, 0.25) for y in (-0.5, 0.5) for z in (-0.35, 0.35)])
+    corners = torch.tensor(
+        [[x, y, z] for x in (-0.25, 0.25) for y in (-0.5, 0.5) for z in (-0.35, 0.35)]
+    )
     quads = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
     faces = torch.tensor([triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))])
-    return (255 * nmr.render_silhouette(corners, faces, camera, image_size=size)[0]).round().byte().numpy()
+    return (
+        (255 * nmr.render_silhouette(corners, faces, camera, image_size=size)[0])
+        .round()
+        .byte()
+        .numpy()
+    )
 
 
 def gray(mask: np.ndarray, value: int = 200) -> np.ndarray:
@@ -43,7 +50,9 @@ def test_the_photo_keeps_its_camera(shape: tuple[int, int]) -> None:
     assert image.shape == (4, 96, 96) and image.dtype == small.dtype == np.uint8
     for found, wanted in ((image[3], silhouette(96)), (small, silhouette(64))):
         assert share_that_differs(found, wanted) < 0.02
-        assert share_that_differs(found, np.roll(wanted, 1, axis=1)) > 0.03  # it would notice a pixel's shift
+        assert (
+            share_that_differs(found, np.roll(wanted, 1, axis=1)) > 0.03
+        )  # it would notice a pixel's shift
 
 
 def test_colours_have_katos_form() -> None:
@@ -100,16 +109,22 @@ def test_photos_are_turned_upright(tmp_path: Path) -> None:
     mask[0] = 255
     _, turned = read_photo(path, save(tmp_path / "turned.png", np.rot90(mask).copy(), exif=exif))
     np.testing.assert_array_equal(turned, mask)
-    with pytest.raises(ValueError, match=r"has 6x8 pixels, its mask .*m.png 8x6 pixels; is one of them rotated"):
+    with pytest.raises(
+        ValueError, match=r"has 6x8 pixels, its mask .*m.png 8x6 pixels; is one of them rotated"
+    ):
         read_photo(path, save(tmp_path / "m.png", np.rot90(mask).copy()))
 
 
 def test_unreadable_photos_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"a.png: is missing"):
         read_photo(tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"a.png: has no transparency and no mask: cut it out, or give a mask"):
+    with pytest.raises(
+        ValueError, match=r"a.png: has no transparency and no mask: cut it out, or give a mask"
+    ):
         read_photo(save(tmp_path / "a.png", np.full((8, 6, 3), 10, np.uint8)))
     # Pillow would cut values of more than 8 bits off at 255, which leaves all white.
     path = save(tmp_path / "b.png", np.full((8, 6), 30_000, np.uint16))
-    with pytest.raises(ValueError, match=r"b.png: has more than 8 bits a pixel and channel \(.*\); save it with 8"):
+    with pytest.raises(
+        ValueError, match=r"b.png: has more than 8 bits a pixel and channel \(.*\); save it with 8"
+    ):
         read_photo(path, path)

@@ -69,22 +69,41 @@ def test_mesh_to_object_puts_up_up_and_front_to_the_first_camera() -> None:
             matrix = mesh_to_object(up, front)
             np.testing.assert_array_equal(matrix @ axes[up], [0, 1, 0])
             np.testing.assert_array_equal(matrix @ axes[front], [0, 0, -1])
-            assert np.linalg.det(matrix) == pytest.approx(-1)  # right-handed files, left-handed renderer
+            assert np.linalg.det(matrix) == pytest.approx(
+                -1
+            )  # right-handed files, left-handed renderer
     np.testing.assert_array_equal(mesh_to_object() @ [1, 2, 3], [-3, 2, -1])
     with pytest.raises(ValueError, match="one of"):
         mesh_to_object("w")
 
 
 def test_synset_of_known_and_other_names() -> None:
-    assert synset_of("airplane") == synset_of("aeroplane") == "02691156" and synset_of("vessel") == "04530566"
+    assert (
+        synset_of("airplane") == synset_of("aeroplane") == "02691156"
+        and synset_of("vessel") == "04530566"
+    )
     assert synset_of("teapot") == "teapot" and synset_of("03001627") == "03001627"
-    for bad in ("a\nb", "a\0b", "\x1b[31m", "\udcff", "", "..", "../chair", "/tmp/chair", "a/b", "a\\b", ".hidden"):
+    for bad in (
+        "a\nb",
+        "a\0b",
+        "\x1b[31m",
+        "\udcff",
+        "",
+        "..",
+        "../chair",
+        "/tmp/chair",
+        "a/b",
+        "a\\b",
+        ".hidden",
+    ):
         with pytest.raises(ValueError, match="plain name"):
             synset_of(bad)
 
 
 def test_missing_files_are_named_with_those_that_are_there(folder) -> None:
-    with pytest.raises(FileNotFoundError, match=r"03001627_train_images.npz.*The folder holds: chair test\."):
+    with pytest.raises(
+        FileNotFoundError, match=r"03001627_train_images.npz.*The folder holds: chair test\."
+    ):
         kato.load(folder, "chair", "train")
     (folder / VOXELS).unlink()
     with pytest.raises(FileNotFoundError, match=rf"{VOXELS}: is missing: a split is two files"):
@@ -96,9 +115,17 @@ def test_missing_files_are_named_with_those_that_are_there(folder) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        (IMAGES, lambda images: images.astype(np.float32), r"images file .* uint8 \[N, 24, 4, 64, 64\].* got float32"),
+        (
+            IMAGES,
+            lambda images: images.astype(np.float32),
+            r"images file .* uint8 \[N, 24, 4, 64, 64\].* got float32",
+        ),
         (IMAGES, lambda images: images[0], r"got uint8 \[24, 4, 64, 64\]"),
-        (VOXELS, lambda voxels: voxels.astype(np.uint8), r"voxels file .* bool \[N, 32, 32, 32\].* got uint8"),
+        (
+            VOXELS,
+            lambda voxels: voxels.astype(np.uint8),
+            r"voxels file .* bool \[N, 32, 32, 32\].* got uint8",
+        ),
         (VOXELS, lambda voxels: voxels[:1], "holds 2 objects and .*_voxels.npz 1"),
         (IMAGES, lambda images: images[:0], "holds 0 objects"),
         (IMAGES, lambda images: np.array([{}, None], dtype=object), "no pickled objects"),

@@ -25,7 +25,10 @@ def folders(tmp_path_factory):
     rng = np.random.default_rng(0)
     (root / "kato").mkdir()
     for prefix in (CHAIR, TABLE):
-        np.savez(root / "kato" / f"{prefix}_test_images.npz", rng.integers(0, 256, (2, 24, 4, 64, 64), np.uint8))
+        np.savez(
+            root / "kato" / f"{prefix}_test_images.npz",
+            rng.integers(0, 256, (2, 24, 4, 64, 64), np.uint8),
+        )
         np.savez(root / "kato" / f"{prefix}_test_voxels.npz", rng.random((2, 32, 32, 32)) < 0.5)
     write_dvr(root / "dvr", {"test": ["a0"]})
     write_kar(root / "kar", {"train": ["b1"], "val": ["c2"], "test": ["a0"]}, 64)
@@ -36,7 +39,9 @@ def folders(tmp_path_factory):
     return root
 
 
-@pytest.mark.parametrize(("layout", "views", "classes"), [("kato", 48, 24), ("dvr", 24, 24), ("kar", 20, 72)])
+@pytest.mark.parametrize(
+    ("layout", "views", "classes"), [("kato", 48, 24), ("dvr", 24, 24), ("kar", 20, 72)]
+)
 def test_one_category_or_several(folders, layout, views, classes) -> None:
     one = load_dataset(layout, folders / layout, "chair", "test")
     assert (len(one), one.num_views, one.num_classes) == (views, classes, 1)
@@ -49,10 +54,15 @@ def test_one_category_or_several(folders, layout, views, classes) -> None:
     assert len(few) == 2 * one.num_objects
 
 
-def test_a_folder_that_is_not_there_or_of_another_layout_is_named(folders, tmp_path, monkeypatch) -> None:
+def test_a_folder_that_is_not_there_or_of_another_layout_is_named(
+    folders, tmp_path, monkeypatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     for folder, message in (
-        ("data", rf"data: there is no such folder \({tmp_path / 'data'}\); give the folder of the data set"),
+        (
+            "data",
+            rf"data: there is no such folder \({tmp_path / 'data'}\); give the folder of the data set",
+        ),
         (tmp_path / "nowhere", "nowhere: there is no such folder; give"),
         (folders / "kar", "kar: this is a data set of the layout 'kar', not 'dvr'; .*--layout"),
     ):
@@ -70,12 +80,18 @@ def test_progress_is_shown_on_a_terminal_only(folders, capsys, monkeypatch) -> N
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_options_of_a_layout(layout) -> None:
-    known = set(inspect.signature(reader(layout).load).parameters) & {"image_size", "views_per_object"}
+    known = set(inspect.signature(reader(layout).load).parameters) & {
+        "image_size",
+        "views_per_object",
+    }
     assert known == set(LAYOUTS[layout].options)
     if "image_size" in known:
         check_options(layout, image_size=224)
     else:
-        with pytest.raises(ValueError, match=f"images of the layout '{layout}' have 64x64 pixels, but 224 are wanted"):
+        with pytest.raises(
+            ValueError,
+            match=f"images of the layout '{layout}' have 64x64 pixels, but 224 are wanted",
+        ):
             check_options(layout, image_size=224)
 
 
@@ -93,7 +109,10 @@ AIRPLANE = "02691156"
 
 def test_missing_categories_and_splits_are_errors(tiny_folder, tmp_path) -> None:
     found = check_folder("kato", tiny_folder, ["table"], ["train", "test"])
-    assert [(s.split, s.objects, s.count("error")) for s in found] == [("train", 0, 2), ("test", 0, 2)]
+    assert [(s.split, s.objects, s.count("error")) for s in found] == [
+        ("train", 0, 2),
+        ("test", 0, 2),
+    ]
     with pytest.raises(FileNotFoundError, match="there is no such folder"):
         check_folder("kato", tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match="layout 'kato', not 'dvr'; add --layout kato"):
@@ -102,11 +121,16 @@ def test_missing_categories_and_splits_are_errors(tiny_folder, tmp_path) -> None
         check_folder("lsm", tiny_folder)
 
 
-def test_command_prints_problems_and_a_table_and_sets_its_exit_status(tiny_folder, tmp_path, command) -> None:
+def test_command_prints_problems_and_a_table_and_sets_its_exit_status(
+    tiny_folder, tmp_path, command
+) -> None:
     status, printed, _ = command("check-dataset", tiny_folder)
     assert status == 0 and "0 errors, 0 warnings" in printed
     rows = [line.split() for line in printed.splitlines() if line]
-    assert rows[:2] == [["category", "split", "objects", "errors", "warnings"], [AIRPLANE, "train", "3", "0", "0"]]
+    assert rows[:2] == [
+        ["category", "split", "objects", "errors", "warnings"],
+        [AIRPLANE, "train", "3", "0", "0"],
+    ]
     assert rows[2:4] == [[AIRPLANE, "val", "1", "0", "0"], [AIRPLANE, "test", "1", "0", "0"]]
 
     for kind in ("images", "voxels"):

@@ -29,14 +29,33 @@ def rectangle(mask: np.ndarray, x: int, y: int, width: int, height: int, factor:
         ([(390, 290, 1, 1)], 0, None),
         ([(390, 290, 1, 1), (0, 0, 3, 3), (190, 150, 1, 1)], 0, None),
         ([(330, 20, 20, 20)], 0, "one part away from the object, 4% of its size, was left out"),
-        ([(330, 20, 8, 8), (5, 5, 10, 9)], 0, "2 parts away from the object, 1% of its size, were left out"),
-        ([(260, 90, 100, 100)], 0, "several objects of similar size were found, and only the largest is used"),
+        (
+            [(330, 20, 8, 8), (5, 5, 10, 9)],
+            0,
+            "2 parts away from the object, 1% of its size, were left out",
+        ),
+        (
+            [(260, 90, 100, 100)],
+            0,
+            "several objects of similar size were found, and only the largest is used",
+        ),
         ([(183, 150, 20, 4), (206, 150, 20, 4)], 2, None),
         ([(192, 100, 80, 90)], 1, None),
     ],
-    ids=["alone", "a pixel", "specks", "a thing", "two", "a twin", "broken leg", "a large part is near"],
+    ids=[
+        "alone",
+        "a pixel",
+        "specks",
+        "a thing",
+        "two",
+        "a twin",
+        "broken leg",
+        "a large part is near",
+    ],
 )
-def test_the_object_is_the_largest_region_and_its_parts(parts, kept: int, said: str | None, factor: int) -> None:
+def test_the_object_is_the_largest_region_and_its_parts(
+    parts, kept: int, said: str | None, factor: int
+) -> None:
     mask = disc(factor)
     for part in parts[:kept]:
         rectangle(mask, *part, factor)
@@ -63,7 +82,9 @@ def test_masks_full_of_holes_take_no_longer_than_others(kind: str) -> None:
     assert time.thread_time() - begun < 2
 
 
-@pytest.mark.parametrize(("outside", "message"), [(100, "its mask is empty"), (255, "its mask is all white")])
+@pytest.mark.parametrize(
+    ("outside", "message"), [(100, "its mask is empty"), (255, "its mask is all white")]
+)
 def test_empty_and_full_masks_are_told_apart(outside: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_mask(np.full((5, 5), outside, np.uint8))
@@ -75,7 +96,9 @@ def test_inverted_masks_are_refused_but_not_tight_ones() -> None:
     check_mask(255 - inverted)
     assert mask_box(255 - inverted) == (10, 10, 40, 40)
     for cropped in (False, True):
-        with pytest.raises(ValueError, match=r"its mask covers 100% of the border; is the object black"):
+        with pytest.raises(
+            ValueError, match=r"its mask covers 100% of the border; is the object black"
+        ):
             check_mask(inverted, cropped=cropped)
     tight = np.full((50, 50), 255, np.uint8)
     tight[:8, :8] = 0  # a cabinet, cut out at its edges

@@ -27,7 +27,9 @@ def triangles_seen(plane: float | None, objects: int) -> ViewDataset:
     """Sets of random triangles at two places, with their mirror images if there is a plane, from Kato's 24 views."""
     rng = torch.Generator().manual_seed(3)
     images = np.zeros((objects, 24, 4, 64, 64), np.uint8)
-    empty = kato.from_arrays(images, np.zeros((objects, 32, 32, 32), bool), category="chair", split="train")
+    empty = kato.from_arrays(
+        images, np.zeros((objects, 32, 32, 32), bool), category="chair", split="train"
+    )
     cameras = empty.poses[torch.arange(24)].cameras()
     for i in range(objects):
         vertices = 0.25 * torch.rand(36, 3, generator=rng)
@@ -37,14 +39,18 @@ def triangles_seen(plane: float | None, objects: int) -> ViewDataset:
         if plane is not None:
             vertices = torch.cat([vertices, reflected(vertices, plane)])
             faces = torch.cat([faces, faces + 36])
-        masks = nmr.render_silhouette(vertices[None].expand(24, -1, -1), faces, cameras, image_size=64)
+        masks = nmr.render_silhouette(
+            vertices[None].expand(24, -1, -1), faces, cameras, image_size=64
+        )
         images[i, :, 3] = (255 * masks).byte().numpy()
     return dataclasses.replace(empty, images=images.reshape(-1, 4, 64, 64))
 
 
 def some_views(whole: ViewDataset, of_each: int) -> np.ndarray:
     rng = np.random.default_rng(1)
-    return np.concatenate([24 * k + rng.choice(24, of_each, False) for k in range(whole.num_objects)])
+    return np.concatenate(
+        [24 * k + rng.choice(24, of_each, False) for k in range(whole.num_objects)]
+    )
 
 
 @pytest.mark.parametrize(

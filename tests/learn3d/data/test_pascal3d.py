@@ -33,12 +33,16 @@ def rotation(*angles_deg: float) -> np.ndarray:
 
 def tetrahedra() -> tuple[torch.Tensor, torch.Tensor]:
     """A solid without any symmetry but z -> -z, within [-1, 1]: [V, 3], [F, 3]."""
-    corners = torch.tensor([[-0.9, -0.2, 0.0], [0.5, -0.5, 0.6], [0.5, -0.5, -0.6], [0.7, 0.1, 0.0], [0.1, 0.8, 0.0]])
+    corners = torch.tensor(
+        [[-0.9, -0.2, 0.0], [0.5, -0.5, 0.6], [0.5, -0.5, -0.6], [0.7, 0.1, 0.0], [0.1, 0.8, 0.0]]
+    )
     faces = torch.tensor([[0, 1, 2], [0, 1, 4], [0, 2, 4], [1, 3, 4], [2, 3, 4], [1, 2, 3]])
     return corners, faces
 
 
-def vpl_silhouette(vertices: torch.Tensor, faces: torch.Tensor, rotations: np.ndarray, size: int) -> torch.Tensor:
+def vpl_silhouette(
+    vertices: torch.Tensor, faces: torch.Tensor, rotations: np.ndarray, size: int
+) -> torch.Tensor:
     """The silhouettes of VPL's renderer, written out: u = R v, depth + 1 + 1e-5, an image that is in the end turned
     upside down (y up) and left-right (x to the left)."""
     u = vertices @ torch.from_numpy(rotations).float().transpose(1, 2)
@@ -46,10 +50,18 @@ def vpl_silhouette(vertices: torch.Tensor, faces: torch.Tensor, rotations: np.nd
     return nmr.render_silhouette(u, faces, None, image_size=size).flip(2)
 
 
-ANGLES = [(0.0, 10.0, 0.0), (50.0, -20.0, 10.0), (-100.0, 5.0, -15.0), (170.0, 30.0, 40.0), (30.0, 20.0, -130.0)]
+ANGLES = [
+    (0.0, 10.0, 0.0),
+    (50.0, -20.0, 10.0),
+    (-100.0, 5.0, -15.0),
+    (170.0, 30.0, 40.0),
+    (30.0, 20.0, -130.0),
+]
 
 
-def arrays(seed: int, angles: list[tuple[float, float, float]]) -> dict[str, np.ndarray | list[np.ndarray]]:
+def arrays(
+    seed: int, angles: list[tuple[float, float, float]]
+) -> dict[str, np.ndarray | list[np.ndarray]]:
     rng = np.random.default_rng(seed)
     count = len(angles)
     sizes = rng.integers(60, 120, (count, 2))
@@ -103,14 +115,20 @@ def test_training_is_train_and_imagenet(folder: Path, contents: dict[str, dict])
     assert not dataset.inverted and dataset.convention is conventions.PASCAL3D
     np.testing.assert_array_equal(dataset.voxels[3:], contents["imagenet"]["voxels"])
     assert dataset.num_views == 4 and sorted(set(dataset.view_ids)) == [0, 1, 2, 3]
-    np.testing.assert_array_equal(dataset.view_ids[[1, 2]], dataset.view_ids[[3, 4]])  # the same rotations
+    np.testing.assert_array_equal(
+        dataset.view_ids[[1, 2]], dataset.view_ids[[3, 4]]
+    )  # the same rotations
 
 
-def test_the_image_is_the_padded_clipped_stretched_box(folder: Path, contents: dict[str, dict]) -> None:
+def test_the_image_is_the_padded_clipped_stretched_box(
+    folder: Path, contents: dict[str, dict]
+) -> None:
     dataset = pascal3d.load(folder, "airplane", "train")
     train = contents["train"]
     # box 10, 20, 30.5, 25: padded by 15 % to 5.425 .. 45.075 and 16.25 .. 48.75, cut to whole pixels
-    cut = Image.fromarray(train["images"][1][16:48, 5:45]).resize((224, 224), Image.Resampling.BILINEAR)
+    cut = Image.fromarray(train["images"][1][16:48, 5:45]).resize(
+        (224, 224), Image.Resampling.BILINEAR
+    )
     np.testing.assert_array_equal(dataset.images[1, :3], np.asarray(cut).transpose(2, 0, 1))
     whole = Image.fromarray(train["images"][0]).resize((224, 224), Image.Resampling.BILINEAR)
     np.testing.assert_array_equal(dataset.images[0, :3], np.asarray(whole).transpose(2, 0, 1))
@@ -142,14 +160,18 @@ def test_nothing_is_cut_off_that_vpl_draws(z: float) -> None:
     vpl = vpl_silhouette(triangle, torch.tensor([[0, 1, 2]]), np.eye(3)[None], 32)
     assert (drawn >= vpl).all() and vpl.sum() > 100
     corner = torch.tensor([[-0.5, -0.5, -(3**0.5)], [0.5, -0.5, -(3**0.5)], [0.0, 0.5, -(3**0.5)]])
-    assert nmr.render_silhouette(corner, torch.tensor([[0, 1, 2]]), camera, image_size=32).sum() > 100
+    assert (
+        nmr.render_silhouette(corner, torch.tensor([[0, 1, 2]]), camera, image_size=32).sum() > 100
+    )
 
 
 def test_voxels_follow_vpls_rule() -> None:
     """(v + 1) / 2, last two axes exchanged, all three reversed."""
     vertices, faces = tetrahedra()
     grid = nmr.voxelize((vertices + 1) / 2, faces, size=32)
-    assert torch.equal(conventions.PASCAL3D.voxelize(vertices, faces), grid.transpose(2, 3).flip((1, 2, 3)))
+    assert torch.equal(
+        conventions.PASCAL3D.voxelize(vertices, faces), grid.transpose(2, 3).flip((1, 2, 3))
+    )
 
 
 def test_view_classes_of_val_are_those_of_training(folder: Path) -> None:
@@ -157,7 +179,10 @@ def test_view_classes_of_val_are_those_of_training(folder: Path) -> None:
     assert train.view_names == val.view_names
     # The first two share the cells of training views; the third is in a cell of its own and nearest to ANGLES[1].
     assert val.view_ids[:2].tolist() == train.view_ids[:2].tolist()
-    angles = [(Rotation.from_matrix(rotation(*ANGLES[4]).T @ rotation(*a))).magnitude() for a in ANGLES[:4]]
+    angles = [
+        (Rotation.from_matrix(rotation(*ANGLES[4]).T @ rotation(*a))).magnitude()
+        for a in ANGLES[:4]
+    ]
     assert val.view_ids[2] == train.view_ids[[0, 1, 2, 5][int(np.argmin(angles))]]
     test = pascal3d.load(folder, "aeroplane", "test")
     np.testing.assert_array_equal(test.images, val.images)
@@ -166,23 +191,40 @@ def test_view_classes_of_val_are_those_of_training(folder: Path) -> None:
 
 def test_rotation_cells_are_45_degrees_of_scipys_yzx_angles() -> None:
     angles = np.array(
-        [[-180, 0, 0], [-135.1, 0, 0], [-134.9, 0, 0], [0, -46, 0], [0, 0, 44.9], [0, 0, 45.1], [179, 0, 0]]
+        [
+            [-180, 0, 0],
+            [-135.1, 0, 0],
+            [-134.9, 0, 0],
+            [0, -46, 0],
+            [0, 0, 44.9],
+            [0, 0, 45.1],
+            [179, 0, 0],
+        ]
     )
     cells = pascal3d.rotation_cells(np.stack([rotation(*a) for a in angles]))
     wanted = [(0, 4, 4), (0, 4, 4), (1, 4, 4), (4, 2, 4), (4, 4, 4), (4, 4, 5), (7, 4, 4)]
     got = [(c // 64, c // 8 % 8, c % 8) for c in cells.tolist()]
-    assert got[1:] == wanted[1:] and got[0] in [(0, 4, 4), (7, 4, 4)]  # -180 and 180 are the same rotation
+    assert got[1:] == wanted[1:] and got[0] in [
+        (0, 4, 4),
+        (7, 4, 4),
+    ]  # -180 and 180 are the same rotation
     noise = np.random.default_rng(0).normal(0, 1e-7, (50, 3, 3))
     assert len(set(pascal3d.rotation_cells(np.eye(3) + noise))) == 1
     ids, names = pascal3d.view_classes(np.eye(3)[None], np.stack([np.eye(3), rotation(100, 0, 0)]))
-    assert ids.tolist() == [0] and names == ("y 22.5°, z 22.5°, x 22.5°", "y 112.5°, z 22.5°, x 22.5°")
+    assert ids.tolist() == [0] and names == (
+        "y 22.5°, z 22.5°, x 22.5°",
+        "y 112.5°, z 22.5°, x 22.5°",
+    )
 
 
-def test_crop_jitter_is_a_function_of_seed_and_step(folder: Path, contents: dict[str, dict]) -> None:
+def test_crop_jitter_is_a_function_of_seed_and_step(
+    folder: Path, contents: dict[str, dict]
+) -> None:
     dataset = pascal3d.load(folder, "aeroplane", "train")
     batch = dataset.batch(torch.tensor([1, 4, 1, 0]))
     one, same, other, seed = (
-        augment(batch, ["crop"], s, k, inverted=True).images for s, k in ((0, 7), (0, 7), (0, 8), (1, 7))
+        augment(batch, ["crop"], s, k, inverted=True).images
+        for s, k in ((0, 7), (0, 7), (0, 8), (1, 7))
     )
     assert torch.equal(one, same)
     assert all((one != x).any() for x in (other, seed, batch.images))
@@ -206,7 +248,9 @@ def test_flip_image_leaves_mask_and_pose(folder: Path) -> None:
     flipped = (changed.images[:, :3] == cropped.images[:, :3].flip(3)).flatten(1).all(1)
     same = (changed.images[:, :3] == cropped.images[:, :3]).flatten(1).all(1)
     assert (flipped ^ same).all() and flipped.any() and same.any()
-    assert torch.equal(changed.images[:, 3], batch.images[:, 3]) and torch.equal(changed.masks, batch.masks)
+    assert torch.equal(changed.images[:, 3], batch.images[:, 3]) and torch.equal(
+        changed.masks, batch.masks
+    )
     assert changed.poses is batch.poses
 
 
@@ -227,16 +271,28 @@ def test_crops_follow_selection_and_joining(folder: Path) -> None:
 
 
 DAMAGE = {
-    r"images_ref must be \[224, 224, 4\] for each of 3 images": {"images_ref": np.zeros((3, 64, 64, 4), np.uint8)},
-    "images_ref must be .*uint8 if images.*, got int8": {"images_ref": np.zeros((3, 224, 224, 4), np.int8)},
+    r"images_ref must be \[224, 224, 4\] for each of 3 images": {
+        "images_ref": np.zeros((3, 64, 64, 4), np.uint8)
+    },
+    "images_ref must be .*uint8 if images.*, got int8": {
+        "images_ref": np.zeros((3, 224, 224, 4), np.int8)
+    },
     r"voxels must be .* for each of 3 images .*, got bool \[2, 32, 32, 32\]": {
         "voxels": np.zeros((2, 32, 32, 32), bool)
     },
     "voxels.* must be numbers": {"voxels": [np.zeros(3, np.uint8)] * 3},
-    r"images\[0\] must be uint8 \[H, W, 3\], got uint8": {"images": [np.zeros((9, 9, 1), np.uint8)] * 3},
-    r"bounding_boxes\[0\] must be left, top, width, height": {"bounding_boxes": np.array([[0, 0, -1, 5]] * 3)},
-    r"rotation_matrices\[0\] is no rotation: \[\[-1": {"rotation_matrices": -np.stack([np.eye(3)] * 3)},
-    r"rotation_matrices\[0\] is no rotation: \[\[nan": {"rotation_matrices": np.full((3, 3, 3), np.nan)},
+    r"images\[0\] must be uint8 \[H, W, 3\], got uint8": {
+        "images": [np.zeros((9, 9, 1), np.uint8)] * 3
+    },
+    r"bounding_boxes\[0\] must be left, top, width, height": {
+        "bounding_boxes": np.array([[0, 0, -1, 5]] * 3)
+    },
+    r"rotation_matrices\[0\] is no rotation: \[\[-1": {
+        "rotation_matrices": -np.stack([np.eye(3)] * 3)
+    },
+    r"rotation_matrices\[0\] is no rotation: \[\[nan": {
+        "rotation_matrices": np.full((3, 3, 3), np.nan)
+    },
     "holds no images": None,
 }
 
@@ -250,17 +306,25 @@ def test_damaged_files_are_named(folder: Path, contents: dict[str, dict], messag
     assert problems("pascal3d", folder, "val", "aeroplane")[0].severity == "error"
 
 
-def test_a_damaged_training_file_is_named_by_val_too(folder: Path, contents: dict[str, dict]) -> None:
+def test_a_damaged_training_file_is_named_by_val_too(
+    folder: Path, contents: dict[str, dict]
+) -> None:
     write(folder / "aeroplane_imagenet.npz", {"rotation_matrices": np.zeros((3, 3, 3))})
-    with pytest.raises(ValueError, match=r"aeroplane_imagenet.npz: rotation_matrices\[0\] is no rotation"):
+    with pytest.raises(
+        ValueError, match=r"aeroplane_imagenet.npz: rotation_matrices\[0\] is no rotation"
+    ):
         pascal3d.load(folder, "aeroplane", "val")
     (folder / "aeroplane_imagenet.npz").unlink()
-    with pytest.raises(FileNotFoundError, match=r"aeroplane_imagenet.npz: is missing; expected an npz file"):
+    with pytest.raises(
+        FileNotFoundError, match=r"aeroplane_imagenet.npz: is missing; expected an npz file"
+    ):
         pascal3d.load(folder, "aeroplane", "train")
 
 
 def test_wrong_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="Pascal3D\\+ has the categories aeroplane, car, chair; got 'sofa'"):
+    with pytest.raises(
+        ValueError, match="Pascal3D\\+ has the categories aeroplane, car, chair; got 'sofa'"
+    ):
         pascal3d.load(tmp_path, "sofa", "train")
     with pytest.raises(ValueError, match="split must be one of train, val, test; got 'imagenet'"):
         pascal3d.load(tmp_path, "car", "imagenet")
@@ -275,7 +339,10 @@ def test_everything_wrong_is_found_in_one_walk(folder: Path, contents: dict[str,
     boxes = np.array([[0, 0, 0, 0], [10, 10, 5, 5], [900, 0, 5, 5]])
     change = {"images_ref": references, "voxels": voxels, "bounding_boxes": boxes}
     write(folder / "aeroplane_val.npz", contents["val"] | change)
-    found = [(p.severity, p.message.split(" ")[0]) for p in problems("pascal3d", folder, "val", "aeroplane")]
+    found = [
+        (p.severity, p.message.split(" ")[0])
+        for p in problems("pascal3d", folder, "val", "aeroplane")
+    ]
     assert found == [
         ("error", "bounding_boxes[0]"),
         ("error", "bounding_boxes[2]"),
@@ -288,7 +355,13 @@ def test_a_trained_model_does_without_the_pretrained_weights(folder: Path, tmp_p
     weights = tmp_path / "resnet18.pth"
     torch.save(ResNet18Encoder().state_dict(), weights)
     settings = dataclasses.replace(PRESETS["peng2020-pascal"].settings, pretrained=weights)
-    options = {"preset": "peng2020-pascal", "settings": settings, "iterations": 1, "batch_size": 2, "precision": "fp32"}
+    options = {
+        "preset": "peng2020-pascal",
+        "settings": settings,
+        "iterations": 1,
+        "batch_size": 2,
+        "precision": "fp32",
+    }
     config = configure(data=folder, category="aeroplane", output=tmp_path / "run", **options)
     assert train(config).finished
     weights.unlink()

@@ -37,11 +37,23 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_best_networks_are_those_with_the_best_silhouettes(made: Path, tmp_path: Path) -> None:
-    settings = PoseInvariantSettings(encoder="conv-small", generator="sphere-small", learning_rate=0.01)
-    about = {"data": made, "category": "chair", "layout": "photos", "settings": settings, "output": tmp_path / "run"}
+    settings = PoseInvariantSettings(
+        encoder="conv-small", generator="sphere-small", learning_rate=0.01
+    )
+    about = {
+        "data": made,
+        "category": "chair",
+        "layout": "photos",
+        "settings": settings,
+        "output": tmp_path / "run",
+    }
     about["preset"] = "peng2020-kato"
-    summary = train(configure(**about, iterations=3, batch_size=4, precision="fp32", validate_every=1))
-    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    summary = train(
+        configure(**about, iterations=3, batch_size=4, precision="fp32", validate_every=1)
+    )
+    lines = [
+        json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    ]
     measured = {line["step"]: line["silhouette_iou"] for line in lines if line["split"] == "val"}
     assert summary.progress.best_step == max(measured, key=measured.get)
     method, _, metadata = checkpoint.load_method(tmp_path / "run" / "best.safetensors")
@@ -73,7 +85,9 @@ def write_rows(folder: Path, rows: list[dict[str, str]]) -> None:
 
 def check(chairs: Path, severity: str) -> list[tuple[str, str]]:
     """(file, message) of all errors or warnings of the category."""
-    found = dict.fromkeys(p for split in check_folder("photos", chairs.parent) for p in split.problems)
+    found = dict.fromkeys(
+        p for split in check_folder("photos", chairs.parent) for p in split.problems
+    )
     return [(Path(p.path).name, p.message) for p in found if p.severity == severity]
 
 
@@ -87,9 +101,13 @@ def refused(chairs: Path, message: str, kind: type = ValueError, split: str = "t
 def test_the_examples_folder_is_read(made: Path) -> None:
     sets = {split: photos.load(made, "chair", split) for split in ("train", "val", "test")}
     assert [(len(s), s.num_objects) for s in sets.values()] == [(6, 2), (3, 1), (3, 1)]
-    assert len({name for s in sets.values() for name in s.object_names}) == 4  # no object is in two splits
+    assert (
+        len({name for s in sets.values() for name in s.object_names}) == 4
+    )  # no object is in two splits
     train = sets["train"]
-    assert train.voxels is None and train.masks is None and train.inverted and train.image_size == 64
+    assert (
+        train.voxels is None and train.masks is None and train.inverted and train.image_size == 64
+    )
     assert all(s.view_names == train.view_names for s in sets.values())
     assert sorted(set(train.view_ids)) == list(range(train.num_views))
     row = next(row for row in read_rows(made / "chair") if row["object"] == train.object_names[0])
@@ -122,8 +140,13 @@ def test_the_tables_own_splits_count(chairs: Path) -> None:
         row["split"] = "val" if row["object"] == rows[0]["object"] else "train"
     write_rows(chairs, rows)
     val = photos.load(chairs.parent, "chair", "val")
-    assert val.object_names == (rows[0]["object"],) and len(photos.load(chairs.parent, "chair", "train")) == 9
-    with pytest.raises(ValueError, match=r"poses.csv: has no photograph for test; it has: train, val"):
+    assert (
+        val.object_names == (rows[0]["object"],)
+        and len(photos.load(chairs.parent, "chair", "train")) == 9
+    )
+    with pytest.raises(
+        ValueError, match=r"poses.csv: has no photograph for test; it has: train, val"
+    ):
         photos.load(chairs.parent, "chair", "test")
 
 
@@ -138,7 +161,10 @@ def test_photos_without_objects_are_objects_of_their_own(chairs: Path) -> None:
 
 def test_the_split_of_an_object_is_a_matter_of_its_name(made: Path) -> None:
     table = made / "chair" / "poses.csv"
-    rows = [photos.Photo(k, Path(f"{k}.jpg"), None, f"object{k}", None, 0.0, 0.0, 3.0, 40.0) for k in range(200)]
+    rows = [
+        photos.Photo(k, Path(f"{k}.jpg"), None, f"object{k}", None, 0.0, 0.0, 3.0, 40.0)
+        for k in range(200)
+    ]
     one = split_objects(table, rows)
     assert [list(one.values()).count(split) for split in ("train", "val", "test")] == [140, 20, 40]
     assert split_objects(table, rows[::-1]) == one
@@ -160,12 +186,18 @@ def test_default_view_classes_suit_the_photos(elevations, azimuths, count, width
     poses = LookAtPoses(rng.uniform(*azimuths, count), rng.uniform(*elevations, count), 3.0, 20.0)
     bins = choose_bins(poses)
     assert bins.azimuth_width_deg == width and bins.shape[1] == rows
-    assert bins.elevation_low_deg <= elevations[0] + 1 and bins.elevation_high_deg >= elevations[1] - 1
+    assert (
+        bins.elevation_low_deg <= elevations[0] + 1 and bins.elevation_high_deg >= elevations[1] - 1
+    )
 
 
 def test_a_direction_without_training_photos_gets_the_nearest_class() -> None:
-    training = LookAtPoses(torch.tensor([0.0] * 8 + [100.0] * 8), torch.full((16,), 20.0), 3.0, 20.0)
-    other = LookAtPoses(torch.tensor([1.0, 140.0, -60.0, -100.0]), torch.full((4,), 20.0), 3.0, 20.0)
+    training = LookAtPoses(
+        torch.tensor([0.0] * 8 + [100.0] * 8), torch.full((16,), 20.0), 3.0, 20.0
+    )
+    other = LookAtPoses(
+        torch.tensor([1.0, 140.0, -60.0, -100.0]), torch.full((4,), 20.0), 3.0, 20.0
+    )
     ids, names = view_classes(other, training)
     assert len(names) == 2 and ids.tolist() == [0, 1, 0, 0]
 
@@ -202,18 +234,39 @@ def test_all_mistakes_are_listed(chairs: Path) -> None:
 
 def test_photographs_without_poses_learn_from_an_estimate(chairs: Path, tmp_path: Path) -> None:
     """A table without numbers keeps objects together; without any table each photograph is of another object."""
-    write_rows(chairs, [{"file": row["file"], "object": row["object"]} for row in read_rows(chairs)])
+    write_rows(
+        chairs, [{"file": row["file"], "object": row["object"]} for row in read_rows(chairs)]
+    )
     assert photos.load(chairs.parent, "chair", "train").num_objects == 2
     (chairs / "poses.csv").unlink()
     assert photos.load(chairs.parent, "chair", "train").poses is None
     assert {text.split(":")[0] for _, text in check(chairs, "warning")} == {"has no poses"}
-    table, options = tmp_path / "poses.npz", ["--steps", "2", "--restarts", "1", "--prototypes", "2"]
-    words = [str(chairs.parent), "--category", "chair", "--layout", "photos", "--output", str(table), *options]
+    table, options = (
+        tmp_path / "poses.npz",
+        ["--steps", "2", "--restarts", "1", "--prototypes", "2"],
+    )
+    words = [
+        str(chairs.parent),
+        "--category",
+        "chair",
+        "--layout",
+        "photos",
+        "--output",
+        str(table),
+        *options,
+    ]
     EstimatePoses.parse("estimate-poses", words).run()
     assert table.with_suffix(".png").is_file()
     settings = PoseInvariantSettings(encoder="conv-small", generator="sphere-small")
-    about = {"data": chairs.parent, "category": "chair", "layout": "photos", "preset": "peng2020-kato"}
-    config = configure(**about, settings=settings, output=tmp_path / "run", iterations=1, batch_size=4, poses=table)
+    about = {
+        "data": chairs.parent,
+        "category": "chair",
+        "layout": "photos",
+        "preset": "peng2020-kato",
+    }
+    config = configure(
+        **about, settings=settings, output=tmp_path / "run", iterations=1, batch_size=4, poses=table
+    )
     assert train(config).finished
     for path in (chairs / "images").iterdir():
         path.unlink()
@@ -223,18 +276,33 @@ def test_photographs_without_poses_learn_from_an_estimate(chairs: Path, tmp_path
 def test_other_files_than_tables_are_named(chairs: Path, tmp_path: Path) -> None:
     header = ",".join(COLUMNS)
     for content, message in [
-        (b"", "has the columns ; expected a table of photographs with the columns file, azimuth_deg"),
+        (
+            b"",
+            "has the columns ; expected a table of photographs with the columns file, azimuth_deg",
+        ),
         (header.encode(), "lists 0 objects; train, val and test need 3"),
-        (b"file,azimuth_deg,elevation_deg,distance\n", "has the columns file, .*, distance; expected"),
+        (
+            b"file,azimuth_deg,elevation_deg,distance\n",
+            "has the columns file, .*, distance; expected",
+        ),
         (f"{header},half_fov_deg\n".encode(), "has the columns .*, half_fov_deg; expected"),
         (f"{header},{'x' * 100_000}\n".encode(), "has the columns .{0,200}; expected"),
-        (f"{header}\na.jpg,1,2,3,40,5,6\n".encode(), "line 2: it has more or fewer values than there are columns"),
-        (f"{header}\na.jpg,1,2\n".encode(), "line 2: it has more or fewer values than there are columns"),
+        (
+            f"{header}\na.jpg,1,2,3,40,5,6\n".encode(),
+            "line 2: it has more or fewer values than there are columns",
+        ),
+        (
+            f"{header}\na.jpg,1,2\n".encode(),
+            "line 2: it has more or fewer values than there are columns",
+        ),
         (header.encode() + b"\nst\xfchle.jpg,1,2,3,4\n", "cannot be read \\(Unicode"),
     ]:
         (chairs / "poses.csv").write_bytes(content)
         refused(chairs, f"poses.csv: {message}")
-    with pytest.raises(FileNotFoundError, match=r"none/chair/poses.csv: is missing; expected a table of photographs"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"none/chair/poses.csv: is missing; expected a table of photographs",
+    ):
         photos.load(tmp_path / "none", "chair", "train")
 
 
@@ -244,7 +312,10 @@ def test_objects_must_be_in_one_split(chairs: Path) -> None:
     write_rows(chairs, rows)
     refused(chairs, r"poses.csv: object 'chair000' must be in one split, got None, val")
     write_rows(chairs, [{k: v for k, v in row.items() if k != "split"} for row in rows[1:6]])
-    refused(chairs, r"lists 2 objects; train, val and test need 3. Photograph more, or give every row a split")
+    refused(
+        chairs,
+        r"lists 2 objects; train, val and test need 3. Photograph more, or give every row a split",
+    )
 
 
 def test_damaged_photos_are_named_with_their_row(chairs: Path) -> None:
@@ -266,9 +337,27 @@ def test_damaged_photos_are_named_with_their_row(chairs: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "column", "factor", "severity", "message"),
     [
-        (slice(None), "distance", 12, "error", r"poses.csv: the objects are \d+ times as large .*distance must be in"),
-        (slice(None), "fov_deg", 0.5, "warning", r"poses.csv: the objects are 0.\d+ times as large .*the full angle"),
-        (slice(4, 5), "distance", 10, "warning", r"chair001_1.jpg: .* is the distance in line 6 right\?"),
+        (
+            slice(None),
+            "distance",
+            12,
+            "error",
+            r"poses.csv: the objects are \d+ times as large .*distance must be in",
+        ),
+        (
+            slice(None),
+            "fov_deg",
+            0.5,
+            "warning",
+            r"poses.csv: the objects are 0.\d+ times as large .*the full angle",
+        ),
+        (
+            slice(4, 5),
+            "distance",
+            10,
+            "warning",
+            r"chair001_1.jpg: .* is the distance in line 6 right\?",
+        ),
     ],
     ids=["centimetres", "half an angle", "a point forgotten"],
 )
@@ -296,8 +385,13 @@ def test_objects_that_are_cut_off_are_warned_of(chairs: Path) -> None:
     assert check(chairs, "warning") == [("chair002_0.jpg", message)]
 
 
-def test_masks_with_more_than_the_object_and_images_without_a_row_are_said(chairs: Path, capsys) -> None:
-    clean = {split: photos.load(chairs.parent, "chair", split).images for split in ("train", "val", "test")}
+def test_masks_with_more_than_the_object_and_images_without_a_row_are_said(
+    chairs: Path, capsys
+) -> None:
+    clean = {
+        split: photos.load(chairs.parent, "chair", split).images
+        for split in ("train", "val", "test")
+    }
     path = chairs / "masks" / "chair002_0.png"
     mask = np.array(Image.open(path))
     mask[4:20, 4:20] = 255

@@ -28,13 +28,18 @@ from learn3d.training import train
 
 def random_table(dataset: ViewDataset, candidates: int = 3) -> PoseTable:
     count, rng = len(dataset), np.random.default_rng(0)
-    angles = (rng.uniform(low, high, (count, candidates)).astype(np.float32) for low, high in ((-180, 180), (0, 40)))
+    angles = (
+        rng.uniform(low, high, (count, candidates)).astype(np.float32)
+        for low, high in ((-180, 180), (0, 40))
+    )
     weights = rng.dirichlet(np.ones(candidates), count).astype(np.float32)
     numbers = (np.full(count, value, np.float32) for value in (2.7, 15.0, 0.9))
     return PoseTable(fingerprints(dataset), *angles, weights, *numbers)
 
 
-def test_a_table_is_read_as_written_and_matched_by_image(tmp_path: Path, tiny_set: ViewDataset) -> None:
+def test_a_table_is_read_as_written_and_matched_by_image(
+    tmp_path: Path, tiny_set: ViewDataset
+) -> None:
     images = np.random.default_rng(0).integers(0, 256, tiny_set.images.shape, np.uint8)
     dataset = dataclasses.replace(tiny_set, images=images)
     random_table(dataset).write(tmp_path / "poses.npz")
@@ -43,7 +48,9 @@ def test_a_table_is_read_as_written_and_matched_by_image(tmp_path: Path, tiny_se
     part = table.apply(dataset.select(rows), "poses.npz")
     assert np.array_equal(part.poses.azimuth_deg, table.azimuth_deg[rows, 0])
     assert np.array_equal(part.candidates.weights, table.weights[rows])
-    with pytest.raises(ValueError, match=r"poses.npz has no pose for 72 of 72 test images .* of object 0000"):
+    with pytest.raises(
+        ValueError, match=r"poses.npz has no pose for 72 of 72 test images .* of object 0000"
+    ):
         table.apply(tiny_set, "poses.npz")
 
 
@@ -64,7 +71,9 @@ def test_a_table_is_read_as_written_and_matched_by_image(tmp_path: Path, tiny_se
 def test_a_hostile_table_is_refused(
     tmp_path: Path, tiny_set: ViewDataset, change: dict[str, np.ndarray | None], message: str
 ) -> None:
-    arrays = {name: a for name, a in (vars(random_table(tiny_set)) | change).items() if a is not None}
+    arrays = {
+        name: a for name, a in (vars(random_table(tiny_set)) | change).items() if a is not None
+    }
     np.savez(tmp_path / "poses.npz", **arrays)
     with pytest.raises(DamagedFile, match=rf"poses.npz: .*{message}"):
         PoseTable.read(tmp_path / "poses.npz")
@@ -83,21 +92,29 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
         assert np.array_equal(view_ids, drawn.azimuth_deg.long() % 24)
         second.append((drawn.azimuth_deg % 2).mean())
     assert abs(np.mean(second) - 0.25) < 0.02
-    options = configure(data=Path("."), category="x", output=Path("."), batch_size=8, iterations=2, augment=())
+    options = configure(
+        data=Path("."), category="x", output=Path("."), batch_size=8, iterations=2, augment=()
+    )
     assert all((b.poses.azimuth_deg % 2).sum() < 8 for b in batches(dataset, options))
 
 
 @pytest.fixture
 def table(tmp_path: Path, tiny_folder: Path) -> Path:
     """A random table for the splits of the tiny data set."""
-    tables = [random_table(load_dataset("kato", tiny_folder, "airplane", split)) for split in ("train", "val")]
+    tables = [
+        random_table(load_dataset("kato", tiny_folder, "airplane", split))
+        for split in ("train", "val")
+    ]
     columns = (np.concatenate([getattr(part, name) for part in tables]) for name in vars(tables[0]))
     PoseTable(*columns).write(tmp_path / "poses.npz")
     return tmp_path / "poses.npz"
 
 
 def test_weights_of_poses_survive_a_stop(
-    table: Path, tmp_path: Path, tiny_config: Callable[..., TrainConfig], monkeypatch: pytest.MonkeyPatch
+    table: Path,
+    tmp_path: Path,
+    tiny_config: Callable[..., TrainConfig],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Reweighted after the steps 1 and 3, stopped after step 4."""
     options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2}
@@ -113,7 +130,9 @@ def test_weights_of_poses_survive_a_stop(
         patch.setattr(training, "take_step", stop)
         assert not train(tiny_config(tmp_path / "stopped", **options)).finished
     assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
-    whole, stopped = (checkpoint.load(tmp_path / name / "last.safetensors")[0] for name in ("whole", "stopped"))
+    whole, stopped = (
+        checkpoint.load(tmp_path / name / "last.safetensors")[0] for name in ("whole", "stopped")
+    )
     assert whole.keys() == stopped.keys()
     assert all(torch.equal(whole[name], stopped[name]) for name in whole)
     weights = whole["poses.weights"]
@@ -121,7 +140,11 @@ def test_weights_of_poses_survive_a_stop(
 
 
 def test_a_run_is_measured_with_its_poses_on_its_own_data(
-    table: Path, run_folder: Path, tiny_folder: Path, tiny_config: Callable[..., TrainConfig], monkeypatch
+    table: Path,
+    run_folder: Path,
+    tiny_folder: Path,
+    tiny_config: Callable[..., TrainConfig],
+    monkeypatch,
 ) -> None:
     train(tiny_config(run_folder, preset="plus-kato", iterations=1, poses=table))
     measured = []
@@ -136,7 +159,9 @@ def test_a_run_is_measured_with_its_poses_on_its_own_data(
     assert measured == [True, False]
 
 
-@pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vanilla", "peng2020-kato-vpl"])
+@pytest.mark.parametrize(
+    "preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vanilla", "peng2020-kato-vpl"]
+)
 def test_methods_learn_from_a_table(
     preset: str, table: Path, run_folder: Path, tiny_config: Callable[..., TrainConfig]
 ) -> None:

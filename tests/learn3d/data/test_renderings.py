@@ -61,15 +61,26 @@ def test_renders_voxels_and_cameras_of_kar_agree_with_the_object(originals) -> N
     assert silhouette_iou(dataset, *mesh(0)).min() > 0.92
     vertices, faces = map(torch.from_numpy, mesh(0))
     truth = torch.from_numpy(dataset.voxels)
-    iou = {c.name: float(voxel_iou(c.voxelize(vertices, faces), truth)) for c in (KATO, KAR, PASCAL3D)}
+    iou = {
+        c.name: float(voxel_iou(c.voxelize(vertices, faces), truth)) for c in (KATO, KAR, PASCAL3D)
+    }
     assert iou.pop("kar") > 0.75 and max(iou.values()) < 0.4
     colors, mask = dataset.images[:, :3].transpose(0, 2, 3, 1), dataset.images[:, 3]
-    assert (colors[mask == 255] == COLOR).all() and (colors[mask == 0] == 255).all() and not dataset.inverted
+    assert (
+        (colors[mask == 255] == COLOR).all()
+        and (colors[mask == 0] == 255).all()
+        and not dataset.inverted
+    )
 
 
 def test_images_and_cameras_of_dvr_are_those_of_katos_files(originals) -> None:
     dataset = dvr.load(originals / "dvr", "chair", "train")
-    assert (len(dataset), dataset.object_names, dataset.voxels, dataset.inverted) == (24, ("b1",), None, True)
+    assert (len(dataset), dataset.object_names, dataset.voxels, dataset.inverted) == (
+        24,
+        ("b1",),
+        None,
+        True,
+    )
     inside = dataset.images[:, 3] == 255
     colors = dataset.images[:, :3].transpose(0, 2, 3, 1)
     np.testing.assert_array_equal(np.unique(colors[inside], axis=0), [[255 - c for c in COLOR]])
@@ -79,9 +90,13 @@ def test_images_and_cameras_of_dvr_are_those_of_katos_files(originals) -> None:
 
 
 @pytest.mark.parametrize("determinant", [1, -1])
-def test_any_world_of_cameras_and_points_is_brought_into_the_object_frame(tmp_path, determinant) -> None:
+def test_any_world_of_cameras_and_points_is_brought_into_the_object_frame(
+    tmp_path, determinant
+) -> None:
     world, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
-    write_dvr(tmp_path, {"test": ["a", "b"]}, world=world * np.sign(np.linalg.det(world)) * determinant)
+    write_dvr(
+        tmp_path, {"test": ["a", "b"]}, world=world * np.sign(np.linalg.det(world)) * determinant
+    )
     np.savez(tmp_path / CHAIR / "b" / "pointcloud.npz", points=np.zeros((400, 3)))
     points = dvr.load(tmp_path, CHAIR, "test").points
     assert points.shape == (2, 400, 3) and points.dtype == np.float32  # as many as every object has
@@ -100,7 +115,9 @@ def test_kar_has_the_protocol_of_the_published_code(copy) -> None:
     assert (len(train), len(kar.load(folder, "chair", "val"))) == (1, 20)  # render 0 alone, or all
     np.testing.assert_array_equal(train.images[0], everything.images[0])
     table = np.loadtxt(views(folder, "b1") / "view.txt")
-    np.testing.assert_array_equal(everything.view_ids, (table[:, 0] + 180) // 15 * 3 + (table[:, 1] + 20) // 20)
+    np.testing.assert_array_equal(
+        everything.view_ids, (table[:, 0] + 180) // 15 * 3 + (table[:, 1] + 20) // 20
+    )
     lists = json.loads((folder / "splits.json").read_text())
     lists[CHAIR]["test"] = [*sorted(kar.BROKEN), "a0"]
     (folder / "splits.json").write_text(json.dumps(lists))
@@ -155,12 +172,17 @@ def change_cameras(change):
 
 
 def change_matrix(k: int, change):
-    return change_cameras(lambda a: a.update({f"world_mat_{k}": change(a[f"world_mat_{k}"].copy())}))
+    return change_cameras(
+        lambda a: a.update({f"world_mat_{k}": change(a[f"world_mat_{k}"].copy())})
+    )
 
 
 def reverse_views(arrays) -> None:
     arrays.update(
-        {f"world_mat_{k}": matrix for k, matrix in enumerate([arrays[f"world_mat_{-k % 24}"] for k in range(24)])}
+        {
+            f"world_mat_{k}": matrix
+            for k, matrix in enumerate([arrays[f"world_mat_{-k % 24}"] for k in range(24)])
+        }
     )
 
 
@@ -198,14 +220,22 @@ FAULTS = {
     ("dvr", "neither rolled nor mirrored"): change_cameras(reverse_views),
     ("dvr", "pointcloud.npz: is missing"): lambda f: (views(f) / "pointcloud.npz").unlink(),
     ("dvr", "pointcloud.npz: has the shape [5, 4]"): save_points(points=np.zeros((5, 4))),
-    ("dvr", "pointcloud.npz: has coordinates up to nan"): save_points(points=np.full((5, 3), np.nan)),
+    ("dvr", "pointcloud.npz: has coordinates up to nan"): save_points(
+        points=np.full((5, 3), np.nan)
+    ),
     ("kar", "render_19.png: is missing"): lambda f: (views(f) / "render_19.png").unlink(),
     ("kar", "depth_5.png: cannot be read ("): lambda f: cut_short(views(f) / "depth_5.png"),
     ("kar", "view.txt: is missing"): lambda f: (views(f) / "view.txt").unlink(),
-    ("kar", "view.txt: cannot be read (19 rows of finite numbers, 20 are needed)"): rewrite_row(4, "1 nan 0 2"),
-    ("kar", "view.txt: row 4 has azimuth 1, elevation 95 and distance 2"): rewrite_row(4, "1 95 0 2"),
+    ("kar", "view.txt: cannot be read (19 rows of finite numbers, 20 are needed)"): rewrite_row(
+        4, "1 nan 0 2"
+    ),
+    ("kar", "view.txt: row 4 has azimuth 1, elevation 95 and distance 2"): rewrite_row(
+        4, "1 95 0 2"
+    ),
     ("kar", "a0.mat: is missing"): lambda f: grid(f).unlink(),
-    ("kar", "a0.mat: has float64 [16, 16, 16]"): lambda f: scipy.io.savemat(grid(f), {"Volume": np.ones((16,) * 3)}),
+    ("kar", "a0.mat: has float64 [16, 16, 16]"): lambda f: scipy.io.savemat(
+        grid(f), {"Volume": np.ones((16,) * 3)}
+    ),
 }
 
 
@@ -224,7 +254,13 @@ def test_impossible_poses_are_refused(pose) -> None:
 def test_oddities_of_an_object_are_warnings(copy) -> None:
     folder = copy("dvr")
     save(views(folder) / "mask" / "0004.png", np.ones((64, 64), np.uint8))
-    expect("dvr", folder, "test", "its mask is empty: the brightest of its values 0 .. 255 is 1", "warning")
+    expect(
+        "dvr",
+        folder,
+        "test",
+        "its mask is empty: the brightest of its values 0 .. 255 is 1",
+        "warning",
+    )
     folder = copy("kar")
     scipy.io.savemat(grid(folder), {"Volume": np.zeros((32, 32, 32), np.uint8)})
     expect("kar", folder, "test", "a0.mat: the grid is empty", "warning")
@@ -270,5 +306,12 @@ def test_everything_wrong_is_found_in_one_walk(copy) -> None:
     lists = {"name": "chair", **LISTS, "test": ["a0", "gone"], "val": ["c2", "b1"]}
     (folder / "splits.json").write_text(json.dumps({CHAIR: lists}))
     found = problems("kar", folder, "test")
-    assert [Path(p.path).name for p in found] == ["gone", "view.txt", "render_3.png", "render_4.png"]
-    assert [p.message for p in problems("kar", folder, "train")] == ["train shares 1 objects with val, such as b1"]
+    assert [Path(p.path).name for p in found] == [
+        "gone",
+        "view.txt",
+        "render_3.png",
+        "render_4.png",
+    ]
+    assert [p.message for p in problems("kar", folder, "train")] == [
+        "train shares 1 objects with val, such as b1"
+    ]

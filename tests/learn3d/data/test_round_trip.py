@@ -34,7 +34,9 @@ def made(request, sources, tmp_path_factory):
     """A data set of each layout."""
     output = tmp_path_factory.mktemp("data")
     settings = SETTINGS[request.param]
-    config = DatasetConfig(output=output, category="chair", source=sources, layout=request.param, **settings)
+    config = DatasetConfig(
+        output=output, category="chair", source=sources, layout=request.param, **settings
+    )
     make_dataset(config)
     card = json.loads((output / "03001627_card.json").read_text())
     return SimpleNamespace(layout=request.param, folder=output, sources=sources, card=card)
@@ -43,9 +45,13 @@ def made(request, sources, tmp_path_factory):
 def mesh_of(made, split, number, name, count):
     """The true mesh of an object in the layout's object frame, float32 [V, 3], and its faces."""
     files = made.card["splits"][split]
-    if made.layout == "kato" or (made.layout == "pascal3d" and split == "val"):  # whose readers have no names
+    if made.layout == "kato" or (
+        made.layout == "pascal3d" and split == "val"
+    ):  # whose readers have no names
         file = files[number * len(files) // count]
-    elif made.layout == "pascal3d":  # pictures of every object in chair_train, then others of them in chair_imagenet
+    elif (
+        made.layout == "pascal3d"
+    ):  # pictures of every object in chair_train, then others of them in chair_imagenet
         file = files[number % (count // 2) * len(files) // (count // 2)]
     else:
         (file,) = (f for f in files if f.removesuffix(".ply").replace(" ", "_") in name)
@@ -70,11 +76,15 @@ def test_masks_cameras_and_voxels(made):
         batch = dataset.batch(torch.arange(len(dataset)))
         for number in range(dataset.num_objects):
             samples = torch.from_numpy(np.flatnonzero(dataset.object_ids == number))
-            vertices, faces = mesh_of(made, split, number, dataset.object_names[number], dataset.num_objects)
+            vertices, faces = mesh_of(
+                made, split, number, dataset.object_names[number], dataset.num_objects
+            )
             cameras = batch.poses[samples].cameras()
             if made.layout == "pascal3d":  # every 3.5th pixel, as published
                 rows = torch.arange(64) * 224 // 64
-                wanted = nmr.render_silhouette(vertices, faces, cameras, image_size=224)[:, rows][:, :, rows]
+                wanted = nmr.render_silhouette(vertices, faces, cameras, image_size=224)[:, rows][
+                    :, :, rows
+                ]
             else:  # the covered share of each pixel
                 fine = nmr.render_silhouette(vertices, faces, cameras, image_size=256)
                 wanted = torch.nn.functional.avg_pool2d(fine[:, None], 4)[:, 0]
@@ -102,7 +112,9 @@ def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
     status, _, said = command("convert-dataset", *words)
     assert status == 0, said
     before = load_dataset(made.layout, made.folder, "chair", "train")
-    before = before.select(np.argsort(before.object_ids, kind="stable"))  # as they come in shards of one object
+    before = before.select(
+        np.argsort(before.object_ids, kind="stable")
+    )  # as they come in shards of one object
     after = load_dataset(made.layout, tmp_path, "chair", "train")
     assert isinstance(after.images, DiskArray) and after.info() == before.info()
     for name in ("view_names", "object_names", "convention", "image_size"):
@@ -118,5 +130,7 @@ def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
     if LAYOUTS[made.layout].angles:
         assert find_mirror_plane(after) == find_mirror_plane(before)
     else:
-        val, test = (load_dataset(made.layout, tmp_path, "chair", split) for split in ("val", "test"))
+        val, test = (
+            load_dataset(made.layout, tmp_path, "chair", split) for split in ("val", "test")
+        )
         assert val.digest() == test.digest()

@@ -46,11 +46,15 @@ def same_networks(folder, other) -> None:
 @pytest.fixture
 def stored(tiny_folder, tmp_path, command, small_shards):
     """The tiny data set in shards."""
-    assert command("convert-dataset", "--data", tiny_folder, "--output", tmp_path / "shards")[0] == 0
+    assert (
+        command("convert-dataset", "--data", tiny_folder, "--output", tmp_path / "shards")[0] == 0
+    )
     return tmp_path / "shards"
 
 
-@pytest.mark.parametrize("options", [{}, {"preset": "plus-kato", "augment": ("colors",), "views_per_object": 3}])
+@pytest.mark.parametrize(
+    "options", [{}, {"preset": "plus-kato", "augment": ("colors",), "views_per_object": 3}]
+)
 def test_training_has_the_same_bits(options, tiny_config, stored, tmp_path) -> None:
     config = tiny_config(tmp_path / "memory", **options)
     assert train(config).finished
@@ -58,7 +62,9 @@ def test_training_has_the_same_bits(options, tiny_config, stored, tmp_path) -> N
     same_networks(tmp_path / "memory", tmp_path / "disk")
     (tmp_path / "new").touch()
     modes = {path.stat().st_mode for path in tmp_path.rglob("*.safetensors")}
-    assert modes == {(tmp_path / "new").stat().st_mode}, "others may read shards and checkpoints as the umask says"
+    assert modes == {(tmp_path / "new").stat().st_mode}, (
+        "others may read shards and checkpoints as the umask says"
+    )
 
 
 def test_several_categories(stored, tiny_folder, tmp_path) -> None:
@@ -113,7 +119,9 @@ def test_shards_that_are_missing_or_too_many_are_refused(stored, tiny_folder, co
     with pytest.raises(ValueError, match="the split needs 3 shards, but has 4"):
         load_dataset("kato", stored, "airplane", "train")
     (mine := other.with_name("photograph.png")).write_bytes(b"mine")
-    (stored / "02691156" / "train" / shards.SET_FILE).unlink()  # as an unfinished conversion leaves it
+    (
+        stored / "02691156" / "train" / shards.SET_FILE
+    ).unlink()  # as an unfinished conversion leaves it
     assert command("convert-dataset", "--data", tiny_folder, "--output", stored)[0] == 0
     assert mine.read_bytes() == b"mine" and not other.exists(), "only shards are removed"
     assert load_dataset("kato", stored, "airplane", "train").num_objects == 3
@@ -130,9 +138,13 @@ def rewrite(stored: Path, **changes) -> Path:
     path = shard_file(stored)
     with safe_open(path, "np") as file:
         metadata = json.loads(file.metadata()["shard"])
-    arrays = {name: value for name, value in (load_file(path) | changes).items() if value is not None}
+    arrays = {
+        name: value for name, value in (load_file(path) | changes).items() if value is not None
+    }
     for name in {"images", "voxels"} & changes.keys() & arrays.keys():
-        arrays[f"{name}.checksums"] = np.array([zlib.crc32(row) for row in changes[name]], np.uint32)
+        arrays[f"{name}.checksums"] = np.array(
+            [zlib.crc32(row) for row in changes[name]], np.uint32
+        )
     tables = {name: arrays[name] for name in arrays if name not in ("images", "voxels")}
     metadata["crc"] = shards._crc(metadata["objects"], tables)
     save_file(arrays, path, {"shard": json.dumps(metadata)})
@@ -147,7 +159,10 @@ def rewrite(stored: Path, **changes) -> Path:
         ({"view_ids": np.full(24, 24, np.int32)}, r"view_ids must lie in 0 .. 23"),
         ({"object_ids": np.full(24, -1, np.int32)}, r"object_ids must lie in 0 .. 0"),
         ({"sides": None}, "KeyError: 'sides'"),
-        ({"azimuth_deg": np.zeros(23, np.float32)}, "poses of 24 images of 1 objects must be [24], got [23]"),
+        (
+            {"azimuth_deg": np.zeros(23, np.float32)},
+            "poses of 24 images of 1 objects must be [24], got [23]",
+        ),
         ({"images": np.zeros((24, 4, 32, 32), np.uint8)}, "images of 32 pixels need masks of 64"),
         ({"view_ids": np.zeros(24, np.float32)}, "view_ids is float32; expected int32"),
     ],
@@ -158,9 +173,13 @@ def test_impossible_tables_are_refused(stored, changes, message) -> None:
 
 def test_shards_of_other_arrays_are_refused(stored) -> None:
     rewrite(stored, voxels=None, **{"voxels.checksums": None})
-    with pytest.raises(DamagedFile, match=r"train: has shards that differ \(voxels of different kinds"):
+    with pytest.raises(
+        DamagedFile, match=r"train: has shards that differ \(voxels of different kinds"
+    ):
         load_dataset("kato", stored, "airplane", "train")
-    assert [p.path for p in problems("kato", stored, "train", "airplane")] == [str(shard_file(stored).parent)]
+    assert [p.path for p in problems("kato", stored, "train", "airplane")] == [
+        str(shard_file(stored).parent)
+    ]
 
 
 def test_bools_other_than_0_and_1_are_refused(stored) -> None:
@@ -206,12 +225,17 @@ def test_a_file_that_is_cut_short_later_is_an_error(stored) -> None:
     dataset = load_dataset("kato", stored, "airplane", "train")
     path = shard_file(stored)
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(DamagedFile, match=r"00000\.safetensors: cannot be used any more \(it ends early\)"):
+    with pytest.raises(
+        DamagedFile, match=r"00000\.safetensors: cannot be used any more \(it ends early\)"
+    ):
         dataset.batch(torch.tensor([0, 1]))
 
 
 def test_another_layout_or_set_file(stored) -> None:
-    with pytest.raises(ValueError, match="has images of 64 pixels in the layout 'kato', expected 64 pixels in 'kar'"):
+    with pytest.raises(
+        ValueError,
+        match="has images of 64 pixels in the layout 'kato', expected 64 pixels in 'kar'",
+    ):
         shards.load(stored, "airplane", "train", layout="kar")
     with pytest.raises(ValueError, match=r"expected 224 pixels in 'kato'; .* another --image-size"):
         shards.load(stored, "airplane", "train", layout="kato", image_size=224)
@@ -243,6 +267,8 @@ for step in range(100):
     assert (batch.images.min(), batch.images.max()) == (128, 131)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
-    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, cwd=tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path], capture_output=True, text=True, cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) < 60_000, f"{done.stdout} kB more"

@@ -29,7 +29,9 @@ DAMAGED = {  # what is cut short, and a preset of the layout
 
 
 def test_every_layout_is_tried():
-    message = "add the layout to DAMAGED here, and to FILES (and SETTINGS) of tests/data/fuzz_targets.py"
+    message = (
+        "add the layout to DAMAGED here, and to FILES (and SETTINGS) of tests/data/fuzz_targets.py"
+    )
     assert set(DAMAGED) == set(FILES) == {*SETTINGS, "dvr"} == set(LAYOUTS) - {"around"}, message
 
 
@@ -41,12 +43,16 @@ def test_a_damaged_file_ends_training_with_its_name_and_what_to_do(tmp_path: Pat
     for path in folder.glob(pattern):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     where = {"data": folder, "category": "chair", "output": tmp_path / "run"}
-    config = configure(**where, preset=preset, layout=layout, iterations=1, batch_size=2, val_split="test")
+    config = configure(
+        **where, preset=preset, layout=layout, iterations=1, batch_size=2, val_split="test"
+    )
     with pytest.raises(ValueError) as error:
         train(config)
     named, text = Path(str(error.value).split(": ", 1)[0]), str(error.value)
     assert named.is_file() and named.match(pattern)
-    assert text.endswith(f"faults of the data set, run: learn3d check-dataset '{folder}' --layout {layout}")
+    assert text.endswith(
+        f"faults of the data set, run: learn3d check-dataset '{folder}' --layout {layout}"
+    )
     assert text.count("cut short") == text.count("fetch it again") == 1
     assert not {path.name for path in (tmp_path / "run").glob("*")} - {".lock"}
     found = check_folder(layout, folder, ["chair"])
@@ -85,7 +91,9 @@ def attack(target: Target, seed: int) -> None:
     sound = {each: (target.folder / each).read_bytes() for each in target.damaged}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of Pillow and NumPy about odd values, of zipfile about doubled names
+            warnings.simplefilter(
+                "ignore"
+            )  # of Pillow and NumPy about odd values, of zipfile about doubled names
             (target.folder / name).write_bytes(target.damaged[name](rng, sound[name]))
             with bounded():
                 target.read(target.folder)
@@ -100,7 +108,9 @@ def attack(target: Target, seed: int) -> None:
 
 
 @pytest.mark.parametrize("kind", TARGETS)
-def test_damaged_files_are_read_or_refused(kind: str, tmp_path, request: pytest.FixtureRequest) -> None:
+def test_damaged_files_are_read_or_refused(
+    kind: str, tmp_path, request: pytest.FixtureRequest
+) -> None:
     target = TARGETS[kind](tmp_path)
     target.read(target.folder)  # sound files are read
     examples = request.config.getoption("--fuzz-examples")

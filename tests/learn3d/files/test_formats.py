@@ -21,18 +21,30 @@ from learn3d.data.framing import read_photo
 from learn3d.files import formats, limits, renderings, sandbox
 from learn3d.files.formats import read_mesh
 from learn3d.files.reading import DamagedFile
-from learn3d.files.renderings import PHOTOGRAPHS, RENDERINGS, open_image, read_table, shrink, split_alpha
+from learn3d.files.renderings import (
+    PHOTOGRAPHS,
+    RENDERINGS,
+    open_image,
+    read_table,
+    shrink,
+    split_alpha,
+)
 
 
 def png(width: int, height: int) -> bytes:
     """A grey PNG whose header promises so many pixels; its data hold none."""
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
-    body = (struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in chunks)
+    body = (
+        struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c))
+        for kind, c in chunks
+    )
     return b"\x89PNG\r\n\x1a\n" + b"".join(body)
 
 
-@pytest.mark.parametrize("size", [(60_000, 60_000), (10_001, 1), (9000, 9000), (2**31 - 1, 2**31 - 1)])
+@pytest.mark.parametrize(
+    "size", [(60_000, 60_000), (10_001, 1), (9000, 9000), (2**31 - 1, 2**31 - 1)]
+)
 def test_images_that_promise_too_many_pixels_are_not_decoded(tmp_path, size):
     (tmp_path / "a.png").write_bytes(png(*size))
     for read in (read_photo, lambda path: sandbox.read(renderings.read_with_alpha, path, 64)):
@@ -46,7 +58,10 @@ def test_decoders_of_other_formats_are_never_tried(tmp_path, kind):
     Image.new("RGB", (16, 16)).save(content, kind)
     (tmp_path / "a.png").write_bytes(content.getvalue())
     for kinds in (RENDERINGS, PHOTOGRAPHS):
-        with pytest.raises(ValueError, match=r"a\.png: cannot be read \(.*; expected an image in the format PNG, JPEG"):
+        with pytest.raises(
+            ValueError,
+            match=r"a\.png: cannot be read \(.*; expected an image in the format PNG, JPEG",
+        ):
             open_image(tmp_path / "a.png", kinds, 100)
 
 
@@ -59,7 +74,10 @@ def test_a_photograph_with_damaged_exif_data_is_read(tmp_path):
 
 def test_shrinking_takes_the_mean_over_each_pixels_area():
     rng = np.random.default_rng(0)
-    color, mask = rng.integers(0, 256, (128, 128, 3), np.uint8), rng.integers(0, 256, (128, 128), np.uint8)
+    color, mask = (
+        rng.integers(0, 256, (128, 128, 3), np.uint8),
+        rng.integers(0, 256, (128, 128), np.uint8),
+    )
     pixels = np.dstack([color, mask])
     image, small = shrink(pixels.transpose(2, 0, 1).astype(np.float32), 64)
     blocks = pixels.reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)
@@ -103,14 +121,23 @@ def test_images_without_transparency_have_no_alpha(tmp_path, mode):
 def test_rows_that_are_cut_short_are_damage(tmp_path):
     path = tmp_path / "view.txt"
     path.write_text("10 20 0 1.5\n33.2 20 0 1.5 9")
-    np.testing.assert_array_equal(read_table(path, 2, 4, "a table"), [[10, 20, 0, 1.5], [33.2, 20, 0, 1.5]])
-    for text in ("10 20 0 1.5\n33.2", "10 20 0 1.5\n", "10 20 0 1.5\n33.2 20 0 nan", "10 20 0 1.5\n33.2 20 x 1.5"):
+    np.testing.assert_array_equal(
+        read_table(path, 2, 4, "a table"), [[10, 20, 0, 1.5], [33.2, 20, 0, 1.5]]
+    )
+    for text in (
+        "10 20 0 1.5\n33.2",
+        "10 20 0 1.5\n",
+        "10 20 0 1.5\n33.2 20 0 nan",
+        "10 20 0 1.5\n33.2 20 x 1.5",
+    ):
         path.write_text(text)
         with pytest.raises(DamagedFile, match=r"view\.txt: cannot be read \(.*; expected a table"):
             sandbox.read(read_table, path, 2, 4, "a table", wanted="a table")
 
 
-TRIANGLE = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+TRIANGLE = (
+    "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+)
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n%%EOF\n"
 
 
@@ -133,7 +160,12 @@ def test_textures_run_no_programs(tmp_path, kind):
         path.write_bytes(content[:start] + EPS.ljust(length) + content[start + length :])
     texture.write_bytes(EPS)
     code = "import sys; from pathlib import Path; from learn3d.files.formats import read_mesh\n"
-    command = [sys.executable, "-c", code + "print(len(read_mesh(Path(sys.argv[1])).faces))", str(path)]
+    command = [
+        sys.executable,
+        "-c",
+        code + "print(len(read_mesh(Path(sys.argv[1])).faces))",
+        str(path),
+    ]
     environment = os.environ | {"PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}"}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     assert done.stdout == "1\n" and done.stderr == "" and not ran.exists()
@@ -160,7 +192,9 @@ def test_buffers_from_elsewhere_are_refused(tmp_path):
 @pytest.mark.parametrize("kind", ["obj", "off"])
 def test_comments_in_latin1_are_accepted(tmp_path, kind):
     content = trimesh.creation.box().export(file_type=kind).encode()
-    (tmp_path / f"a.{kind}").write_bytes(content.replace(b"\n", b"\n# " + "größe".encode("latin-1") + b"\n", 1))
+    (tmp_path / f"a.{kind}").write_bytes(
+        content.replace(b"\n", b"\n# " + "größe".encode("latin-1") + b"\n", 1)
+    )
     assert len(read_mesh(tmp_path / f"a.{kind}").faces) == 12
 
 

@@ -28,7 +28,9 @@ from learn3d.files import formats, npz, renderings, sandbox
 SECONDS, BYTES = 10.0, 700e6
 if sys.gettrace() is not None:  # the coverage of lines is measured, which slows Python down
     SECONDS *= 4
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is limited and measured on Linux only")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="memory is limited and measured on Linux only"
+)
 
 
 def _resident(pid: int | str) -> int:
@@ -56,7 +58,9 @@ def bounded() -> Iterator[None]:
         done.set()
         thread.join()
     used = time.process_time() - start
-    assert used < SECONDS, f"it took {used:.1f} s"  # of this process; a worker has its own limit, below that
+    assert used < SECONDS, (
+        f"it took {used:.1f} s"
+    )  # of this process; a worker has its own limit, below that
     assert most[0] < BYTES, f"it took {most[0] / 1e6:.0f} MB"
 
 
@@ -83,17 +87,26 @@ def mat(path: Path) -> bytes:
 
 def mat_of_gigabytes(path: Path) -> None:
     head = mat(path)[:128]
-    array = struct.pack("<IIIIII", 6, 8, 6, 0, 5, 12) + struct.pack("<iiiiII", 2**10, 2**10, 2**12, 0, 1, 6)
+    array = struct.pack("<IIIIII", 6, 8, 6, 0, 5, 12) + struct.pack(
+        "<iiiiII", 2**10, 2**10, 2**12, 0, 1, 6
+    )
     array += b"Volume\0\0" + struct.pack("<II", 9, 2**31)
     packer = zlib.compressobj()
-    content = packer.compress(struct.pack("<II", 14, 2**31 + len(array)) + array) + packer.flush(zlib.Z_FULL_FLUSH)
+    content = packer.compress(struct.pack("<II", 14, 2**31 + len(array)) + array) + packer.flush(
+        zlib.Z_FULL_FLUSH
+    )
     zeros = packer.compress(bytes(2**24)) + packer.flush(zlib.Z_FULL_FLUSH)
     content += 128 * zeros + packer.flush()
     path.write_bytes(head + struct.pack("<II", 15, len(content)) + content)
 
 
 def mat_of_cells_within_cells(path: Path) -> None:
-    name = struct.pack("<II", 5, 8) + struct.pack("<ii", 1, 1) + struct.pack("<II", 1, 6) + b"Volume\0\0"
+    name = (
+        struct.pack("<II", 5, 8)
+        + struct.pack("<ii", 1, 1)
+        + struct.pack("<II", 1, 6)
+        + b"Volume\0\0"
+    )
     heads, size = [], 0
     for _ in range(40_000):
         size += 16 + len(name)
@@ -124,8 +137,13 @@ def jpeg_of_thousands_of_scans(path: Path) -> None:
 
 def npz_bomb(path: Path) -> None:
     size = 2**28
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as file:
-        file.write(npy(b"", header=b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }" % size))
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("a.npy", "w") as file,
+    ):
+        file.write(
+            npy(b"", header=b"{'descr': '|u1', 'fortran_order': False, 'shape': (%d,), }" % size)
+        )
         for _ in range(size // 2**24):
             file.write(bytes(2**24))
 
@@ -159,7 +177,12 @@ def glb_of_a_great_array(path: Path) -> None:
     }
     text = json.dumps(scene).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", 4, 0x004E4942) + bytes(4)
+    chunks = (
+        struct.pack("<II", len(text), 0x4E4F534A)
+        + text
+        + struct.pack("<II", 4, 0x004E4942)
+        + bytes(4)
+    )
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
@@ -178,7 +201,11 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str
     "lists.npz": (pickle_of_many_lists, read_ragged, "memory|processor time"),
     "zips.npz": (zips_within_zips, read_npz, "no item"),
     "a.ply": (write_text(PLY), formats.read_mesh, "cannot be read"),
-    "a.off": (write_text("OFF\n2000000000 2000000000 0\n0 0 0\n"), formats.read_mesh, "cannot be read"),
+    "a.off": (
+        write_text("OFF\n2000000000 2000000000 0\n0 0 0\n"),
+        formats.read_mesh,
+        "cannot be read",
+    ),
     "a.glb": (glb_of_a_great_array, formats.read_mesh, "cannot be read"),
 }
 
@@ -201,7 +228,9 @@ def test_matlab_elements_of_wrong_types(tmp_path: Path) -> None:
     path = tmp_path / "a.mat"
     content = mat(path)
     for position in range(128, 200, 3):
-        path.write_bytes(content[:position] + bytes([content[position] ^ 4]) + content[position + 1 :])
+        path.write_bytes(
+            content[:position] + bytes([content[position] ^ 4]) + content[position + 1 :]
+        )
         with contextlib.suppress(ValueError):
             assert read_mat(path).shape == (32, 32, 32)
 

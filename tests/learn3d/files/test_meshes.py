@@ -35,7 +35,9 @@ def random_parts(rng: np.random.Generator, polygons: bool) -> Parts:
         for _ in range(rng.integers(1, 4) if polygons else 0):
             size, first = int(rng.integers(4, 10)), sum(map(len, vertices))
             turns = 2 * np.pi * (np.arange(size) + rng.uniform(0, 0.5, size)) / size
-            flat = rng.uniform(0.3, 1, (size, 1)) * np.stack([np.cos(turns), np.sin(turns), 0 * turns], axis=1)
+            flat = rng.uniform(0.3, 1, (size, 1)) * np.stack(
+                [np.cos(turns), np.sin(turns), 0 * turns], axis=1
+            )
             vertices.append(flat @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + rng.normal(size=3))
             faces.append(list(range(first, first + size)))
         order = rng.permutation(len(faces))
@@ -47,7 +49,9 @@ def random_parts(rng: np.random.Generator, polygons: bool) -> Parts:
 def joined(parts: Parts) -> tuple[np.ndarray, list[list[int]]]:
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
     polygons = [
-        [i + int(start) for i in one] for (_, faces), start in zip(parts, starts, strict=False) for one in faces
+        [i + int(start) for i in one]
+        for (_, faces), start in zip(parts, starts, strict=False)
+        for one in faces
     ]
     return np.concatenate([vertices for vertices, _ in parts]), polygons
 
@@ -60,9 +64,14 @@ def write_obj(path: Path, parts: Parts, rng: np.random.Generator) -> None:
         lines += ["v" + gap + gap.join(map(repr, row)) for row in vertices.tolist()]
         total += len(vertices)
         for one in polygons:
-            numbers = [i - len(vertices) if relative else i + 1 + total - len(vertices) for i in one]
+            numbers = [
+                i - len(vertices) if relative else i + 1 + total - len(vertices) for i in one
+            ]
             form = rng.choice(["{}", "{}//1", "{}//"])
-            lines.append(gap.join(["f", *(form.format(i) for i in numbers)]) + rng.choice(["", " # x", " \\\n"]))
+            lines.append(
+                gap.join(["f", *(form.format(i) for i in numbers)])
+                + rng.choice(["", " # x", " \\\n"])
+            )
     path.write_bytes(rng.choice(["\n", "\r\n"]).join(lines).encode())
 
 
@@ -77,12 +86,20 @@ def write_off(path: Path, parts: Parts, rng: np.random.Generator) -> None:
 
 def write_ply(path: Path, parts: Parts, rng: np.random.Generator) -> None:
     vertices, polygons = joined(parts)
-    kind, order = [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")][rng.integers(3)]
+    kind, order = [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")][
+        rng.integers(3)
+    ]
     count_type, count_code = [("uchar", "B"), ("int", "i"), ("ushort", "H")][rng.integers(3)]
     with_uv = rng.random() < 0.5
     head = f"ply\nformat {kind} 1.0\ncomment Größe\nelement vertex {len(vertices)}\nproperty uchar red\n"
-    head += "property double x\nproperty double y\nproperty double z\n" + f"element face {len(polygons)}\n"
-    head += "property list uchar float texcoord\n" * with_uv + f"property list {count_type} int vertex_indices\n"
+    head += (
+        "property double x\nproperty double y\nproperty double z\n"
+        + f"element face {len(polygons)}\n"
+    )
+    head += (
+        "property list uchar float texcoord\n" * with_uv
+        + f"property list {count_type} int vertex_indices\n"
+    )
     body = [[("B", 7), *(("d", x) for x in row)] for row in vertices.tolist()]
     for one in polygons:
         uv = [("B", 2 * len(one)), *[("f", 0.5)] * 2 * len(one)] if with_uv else []
@@ -99,7 +116,12 @@ def write_stl(path: Path, parts: Parts, rng: np.random.Generator) -> None:
     corners = vertices[np.array(triangles)].astype("<f4")
     if rng.random() < 0.5:
         rows = [np.zeros(3, "<f4").tobytes() + one.tobytes() + b"\0\0" for one in corners]
-        path.write_bytes(b"solid b".ljust(80) + struct.pack("<I", len(rows)) + b"".join(rows) + b"\n" * rng.integers(2))
+        path.write_bytes(
+            b"solid b".ljust(80)
+            + struct.pack("<I", len(rows))
+            + b"".join(rows)
+            + b"\n" * rng.integers(2)
+        )
     else:
         rows = ["vertex " + " ".join(f"{x:.9g}" for x in row) for one in corners for row in one]
         facets = [f"facet normal 0 0 0\nouter loop\n{chr(10).join(rows[i : i + 3])}\nendloop\nendfacet" for i in range(0, len(rows), 3)]  # fmt: skip # noqa: E501
@@ -124,7 +146,11 @@ def write_gltf(path: Path, parts: Parts, rng: np.random.Generator) -> None:
         view = {"buffer": 0, "byteOffset": len(blob), "byteLength": values.nbytes}
         blob += values.tobytes()
         tree["bufferViews"].append(view)
-        found = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": component, "count": len(values)}
+        found = {
+            "bufferView": len(tree["bufferViews"]) - 1,
+            "componentType": component,
+            "count": len(values),
+        }
         tree["accessors"].append(found | {"type": width})
         return len(tree["accessors"]) - 1
 
@@ -134,9 +160,15 @@ def write_gltf(path: Path, parts: Parts, rng: np.random.Generator) -> None:
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = 2 * turn, rng.normal(size=3)
-        local = ((vertices - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T + [1, 2, 3]) / [2, 1, -1]
+        local = ((vertices - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T + [1, 2, 3]) / [
+            2,
+            1,
+            -1,
+        ]
         scale, storage = np.abs(local).max(), rng.choice(["floats", "sparse", "quantized"])
-        if np.abs(joined(parts)[0]).max() < 5:  # 16 bits are too few for a small mesh that is moved so far
+        if (
+            np.abs(joined(parts)[0]).max() < 5
+        ):  # 16 bits are too few for a small mesh that is moved so far
             storage = "floats"
         if storage == "quantized":
             rows = np.zeros((len(local), 4), "<i2")
@@ -151,16 +183,29 @@ def write_gltf(path: Path, parts: Parts, rng: np.random.Generator) -> None:
             scale = 1.0
         if storage == "sparse":
             chosen = np.arange(len(rows))
-            sparse = {"indices": accessor(chosen.astype("<u2"), 5123, "SCALAR"), "values": accessor(rows, 5126, "VEC3")}
-            sparse = {key: {"bufferView": view, "componentType": 5123} for key, view in sparse.items()}
+            sparse = {
+                "indices": accessor(chosen.astype("<u2"), 5123, "SCALAR"),
+                "values": accessor(rows, 5126, "VEC3"),
+            }
+            sparse = {
+                key: {"bufferView": view, "componentType": 5123} for key, view in sparse.items()
+            }
             tree["accessors"][position]["sparse"] = {"count": len(chosen), **sparse}
         primitives = [
-            {"attributes": {"POSITION": position}, "indices": accessor(one.astype("<u2"), 5123, "SCALAR"), "mode": mode}
+            {
+                "attributes": {"POSITION": position},
+                "indices": accessor(one.astype("<u2"), 5123, "SCALAR"),
+                "mode": mode,
+            }
             for one in groups
         ]
-        tree["meshes"].append({"primitives": [{"attributes": {"POSITION": position}, "mode": 0}, *primitives]})
+        tree["meshes"].append(
+            {"primitives": [{"attributes": {"POSITION": position}, "mode": 0}, *primitives]}
+        )
         tree["scenes"][1]["nodes"].append(len(tree["nodes"]))
-        tree["nodes"].append({"matrix": matrix.T.ravel().tolist(), "children": [len(tree["nodes"]) + 1]})
+        tree["nodes"].append(
+            {"matrix": matrix.T.ravel().tolist(), "children": [len(tree["nodes"]) + 1]}
+        )
         node = {
             "mesh": len(tree["meshes"]) - 1,
             "translation": [-1, -2, -3],
@@ -169,12 +214,19 @@ def write_gltf(path: Path, parts: Parts, rng: np.random.Generator) -> None:
         tree["nodes"].append(node)
     tree["buffers"] = [{"byteLength": len(blob)}]
     if path.suffix == ".gltf":
-        tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+        tree["buffers"][0]["uri"] = (
+            "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+        )
         path.write_text(json.dumps(tree))
         return
     text, blob = json.dumps(tree).encode(), blob + b"\0" * (-len(blob) % 4)
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(blob), b"BIN\0")
+        + blob
+    )
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
@@ -209,10 +261,16 @@ def write_dae(path: Path, parts: Parts, rng: np.random.Generator) -> None:
         inputs = collada.source.InputList()
         inputs.addInput(0, "VERTEX", f"#v{k}")
         sizes = np.array([*map(len, polygons)])
-        geometry.primitives.append(geometry.createPolylist(np.concatenate(polygons), sizes, inputs, "m"))
+        geometry.primitives.append(
+            geometry.createPolylist(np.concatenate(polygons), sizes, inputs, "m")
+        )
         document.geometries.append(geometry)
         move = [collada.scene.TranslateTransform(*shift)]
-        nodes.append(collada.scene.Node(f"n{k}", children=[collada.scene.GeometryNode(geometry)], transforms=move))
+        nodes.append(
+            collada.scene.Node(
+                f"n{k}", children=[collada.scene.GeometryNode(geometry)], transforms=move
+            )
+        )
     document.scene = collada.scene.Scene("s", nodes)
     document.scenes.append(document.scene)
     document.write(str(path))
@@ -226,7 +284,10 @@ WRITERS = {  # name of the file: writer, whether it takes polygons
     "own.glb": (write_gltf, False),
     "own.gltf": (write_gltf, False),
     "collada.dae": (write_dae, True),
-    **{f"trimesh.{kind}": (write_trimesh, False) for kind in ("obj", "off", "ply", "stl", "glb", "gltf", "3mf")},
+    **{
+        f"trimesh.{kind}": (write_trimesh, False)
+        for kind in ("obj", "off", "ply", "stl", "glb", "gltf", "3mf")
+    },
 }
 
 
@@ -241,7 +302,9 @@ def compare(parts: Parts, corners: np.ndarray) -> None:
     assert len(corners) == sum(len(one) - 2 for one in polygons)
     for one in polygons:
         points = vertices[one]
-        distance = np.abs(corners[:, :, None] - points).max(axis=3).min(axis=2).max(axis=1)  # to its nearest corner
+        distance = (
+            np.abs(corners[:, :, None] - points).max(axis=3).min(axis=2).max(axis=1)
+        )  # to its nearest corner
         inside = np.flatnonzero((distance < 2e-4 * scale) & ~used)[: len(one) - 2]
         assert len(inside) == len(one) - 2
         used[inside] = True
@@ -269,12 +332,16 @@ def made(folder: Path, name: str) -> bytes:
     return (folder / name).read_bytes()
 
 
-@pytest.mark.parametrize("name", ["own.off", "own.ply", "own.stl", "own.glb", "own.gltf", "trimesh.ply", "trimesh.stl"])
+@pytest.mark.parametrize(
+    "name", ["own.off", "own.ply", "own.stl", "own.glb", "own.gltf", "trimesh.ply", "trimesh.stl"]
+)
 def test_files_that_are_cut_short_say_so(tmp_path: Path, name: str) -> None:
     content = made(tmp_path, name)
     for share in (0, 0.3, 0.6, 0.95):
         (tmp_path / name).write_bytes(content[: int(share * len(content))])
-        with pytest.raises(DamagedFile, match=rf"{name}: cannot be read \(.*; expected a mesh file. {FETCH_AGAIN}"):
+        with pytest.raises(
+            DamagedFile, match=rf"{name}: cannot be read \(.*; expected a mesh file. {FETCH_AGAIN}"
+        ):
             read_mesh(tmp_path / name)
 
 
@@ -293,23 +360,53 @@ PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float
 PLY += "property list uchar int vertex_indices\nend_header\n"
 BUFFER = {"buffer": 0, "byteLength": 36}
 REFUSED = {
-    "required.gltf": (gltf(extensionsRequired=["KHR_draco_mesh_compression"]), "needs the extension KHR_draco_mesh"),
-    "unknown.gltf": (gltf(extensionsRequired=["ACME_shapes"]), "needs the extension ACME_shapes, which is not"),
-    "packed.gltf": (gltf(bufferViews=[BUFFER | {"extensions": {"EXT_meshopt_compression": {}}}]), "EXT_meshopt_comp"),
-    "many.gltf": (gltf(nodes=[{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]), "EXT_mesh_gpu_instancing"),
+    "required.gltf": (
+        gltf(extensionsRequired=["KHR_draco_mesh_compression"]),
+        "needs the extension KHR_draco_mesh",
+    ),
+    "unknown.gltf": (
+        gltf(extensionsRequired=["ACME_shapes"]),
+        "needs the extension ACME_shapes, which is not",
+    ),
+    "packed.gltf": (
+        gltf(bufferViews=[BUFFER | {"extensions": {"EXT_meshopt_compression": {}}}]),
+        "EXT_meshopt_comp",
+    ),
+    "many.gltf": (
+        gltf(nodes=[{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]),
+        "EXT_mesh_gpu_instancing",
+    ),
     "old.gltf": (gltf(asset={"version": "1.0"}), "it is glTF 1.0"),
-    "loop.gltf": (gltf(nodes=[{"children": [1]}, {"children": [0]}], scenes=[{"nodes": [0]}]), "several parents"),
-    "lines.gltf": (gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]), "no faces"),
-    "short.gltf": (gltf(bufferViews=[BUFFER | {"byteOffset": 4}]), "an array of 3 elements exceeds its buffer"),
+    "loop.gltf": (
+        gltf(nodes=[{"children": [1]}, {"children": [0]}], scenes=[{"nodes": [0]}]),
+        "several parents",
+    ),
+    "lines.gltf": (
+        gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}]}]),
+        "no faces",
+    ),
+    "short.gltf": (
+        gltf(bufferViews=[BUFFER | {"byteOffset": 4}]),
+        "an array of 3 elements exceeds its buffer",
+    ),
     "nan.ply": (PLY + "0 0 0 1 0 nan 0 1 0 3 0 1 2", "1 of its corners are not finite"),
     "one.ply": (PLY + "1 2 3 1 2 3 1 2 3 3 0 1 2", "all its corners are at one place"),
     "far.ply": (PLY + "0 0 0 1 0 0 0 1 0 3 0 1 3", "missing vertex; there are 3"),
     "negative.ply": (PLY + "0 0 0 1 0 0 0 1 0 -3 0 1 2", "a list has a negative length"),
-    "strips.ply": (PLY.replace("face", "tristrips") + "0 0 0 1 0 0 0 1 0 3 0 1 2", "triangle strips"),
+    "strips.ply": (
+        PLY.replace("face", "tristrips") + "0 0 0 1 0 0 0 1 0 3 0 1 2",
+        "triangle strips",
+    ),
     "web.off": ("<html></html>", "does not begin with OFF"),
     "web.ply": ("<html></html>", "does not begin with the line `ply`"),
-    "corner.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n", "a face has fewer corners than it says"),
-    "corner.stl": ("solid\nfacet\nvertex 0 0 0\nvertex 1 0 0\nendfacet\nendsolid", "1 facets and 2 corners"),
+    "corner.off": (
+        "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n",
+        "a face has fewer corners than it says",
+    ),
+    "corner.stl": (
+        "solid\nfacet\nvertex 0 0 0\nvertex 1 0 0\nendfacet\nendsolid",
+        "1 facets and 2 corners",
+    ),
 }
 
 
@@ -353,11 +450,26 @@ def test_skins_and_morph_targets_move_corners(tmp_path: Path) -> None:
         kind = {3: "VEC3", 4: "VEC4", 16: "MAT4"}[values.shape[1]]
         component = 5121 if values.dtype == np.uint8 else 5126
         views.append({"buffer": 0, "byteOffset": len(content), "byteLength": values.nbytes})
-        accessors.append({"bufferView": len(accessors), "componentType": component, "count": len(values), "type": kind})
+        accessors.append(
+            {
+                "bufferView": len(accessors),
+                "componentType": component,
+                "count": len(values),
+                "type": kind,
+            }
+        )
         content += values.tobytes()
-    primitive = {"attributes": {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}, "targets": [{"POSITION": 3}]}
+    primitive = {
+        "attributes": {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2},
+        "targets": [{"POSITION": 3}],
+    }
     tree = {
-        "buffers": [{"byteLength": len(content), "uri": f"data:;base64,{base64.b64encode(content).decode()}"}],
+        "buffers": [
+            {
+                "byteLength": len(content),
+                "uri": f"data:;base64,{base64.b64encode(content).decode()}",
+            }
+        ],
         "bufferViews": views,
         "accessors": accessors,
         "meshes": [{"primitives": [primitive], "weights": [0.5]}],

@@ -50,8 +50,12 @@ def object_array(*items: object) -> np.ndarray:
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_what_numpy_writes_is_read_and_can_be_changed(tmp_path, dtype, order):
     for k, shape in enumerate(((), (0,), (2, 3, 4), (300, 20, 200))):
-        array = np.asarray(np.arange(np.prod(shape, dtype=int)).reshape(shape) % 2, dtype=dtype, order=order)
-        (np.savez_compressed if k % 2 else np.savez)(tmp_path / "a.npz", a=array)  # another file of the same name
+        array = np.asarray(
+            np.arange(np.prod(shape, dtype=int)).reshape(shape) % 2, dtype=dtype, order=order
+        )
+        (np.savez_compressed if k % 2 else np.savez)(
+            tmp_path / "a.npz", a=array
+        )  # another file of the same name
         found = read(tmp_path / "a.npz")
         np.testing.assert_array_equal(found, array)
         assert found.dtype == array.dtype and found.flags.writeable
@@ -61,7 +65,10 @@ def test_names_and_arrays_with_items(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, a=np.arange(6), images=object_array(*IMAGES), boxes=np.ones((2, 4)))
     assert npz.names(path, "arrays") == ["a", "images", "boxes"]
-    assert [array.shape for array in npz.read_several(path, ["boxes", "a"], "arrays")] == [(2, 4), (6,)]
+    assert [array.shape for array in npz.read_several(path, ["boxes", "a"], "arrays")] == [
+        (2, 4),
+        (6,),
+    ]
     same(sandbox.read(npz.read_ragged, path, "images", "images"), IMAGES)
 
 
@@ -95,7 +102,10 @@ def test_what_is_no_npz_file(tmp_path):
     refused(path, "not a zip file")
     np.savez(path, b=np.zeros(3))
     refused(path, "no item named 'a.npy'")
-    refused(write(path, npy(b"abcd", header=UINT8 % 4), zipfile.ZIP_BZIP2), "in a way that NumPy does not use")
+    refused(
+        write(path, npy(b"abcd", header=UINT8 % 4), zipfile.ZIP_BZIP2),
+        "in a way that NumPy does not use",
+    )
     for member in (b"", b"\x93NUMPY\x02\x00abcd", npy(b"", header=UINT8 % 4)):
         refused(write(path, member))
 
@@ -119,8 +129,14 @@ def same(arrays: list[np.ndarray], images: list[np.ndarray]) -> None:
 
 def test_python_2s_object_arrays_are_read(tmp_path):
     content = python2_pickle(IMAGES)
-    same(pickle.loads(content, encoding="latin1"), IMAGES)  # the bytes of this test are a pickle for Python, too
-    for header in (None, b"{'descr': '|O8', 'fortran_order': False, 'shape': (2,), }", HEADER.replace(b"%d", b"2L")):
+    same(
+        pickle.loads(content, encoding="latin1"), IMAGES
+    )  # the bytes of this test are a pickle for Python, too
+    for header in (
+        None,
+        b"{'descr': '|O8', 'fortran_order': False, 'shape': (2,), }",
+        HEADER.replace(b"%d", b"2L"),
+    ):
         same(ragged(tmp_path / "a.npz", npy(content, header=header)), IMAGES)
 
 
@@ -147,13 +163,19 @@ class Runs:
 
 HOSTILE = {
     "os.system": pickle.dumps(object_array(Runs(os.system, "touch ran"), IMAGES[0]), protocol=2),
-    "builtins.eval": pickle.dumps(object_array(Runs(eval, "open('ran', 'w')"), IMAGES[0]), protocol=4),
-    "getattr": b"\x80\x04" + b"cbuiltins\ngetattr\n" + b"cnumpy\nndarray\nX\x04\x00\x00\x00dump\x86R.",
+    "builtins.eval": pickle.dumps(
+        object_array(Runs(eval, "open('ran', 'w')"), IMAGES[0]), protocol=4
+    ),
+    "getattr": b"\x80\x04"
+    + b"cbuiltins\ngetattr\n"
+    + b"cnumpy\nndarray\nX\x04\x00\x00\x00dump\x86R.",
     "a dotted name": b"\x80\x04" + b"\x8c\x05numpy\x8c\x0ff2py.os.system_\x93.",
     "INST": b"\x80\x02(X\x09\x00\x00\x00touch ranios\nsystem\n.",
     "OBJ": b"\x80\x02(cos\nsystem\nX\x09\x00\x00\x00touch rano.",
     "protocol 0": b"cos\nsystem\n(S'true'\ntR.",
-    "nested object arrays": pickle.dumps(object_array(object_array(*IMAGES), IMAGES[0]), protocol=4),
+    "nested object arrays": pickle.dumps(
+        object_array(object_array(*IMAGES), IMAGES[0]), protocol=4
+    ),
     "items that are no arrays": pickle.dumps(object_array(1, "a"), protocol=4),
     "a plain array": pickle.dumps(IMAGES[0], protocol=4),
     "one array many times": pickle.dumps(object_array(*[IMAGES[1]] * 500), protocol=4),

@@ -50,7 +50,9 @@ def test_pipes_are_not_waited_for_and_devices_not_read(tmp_path: Path, kind: str
 
 
 def test_json(tmp_path):
-    assert parse_json(b'{"a": [1, 2.5, null, true, "]]]]\\"[["]}') == {"a": [1, 2.5, None, True, ']]]]"[[']}
+    assert parse_json(b'{"a": [1, 2.5, null, true, "]]]]\\"[["]}') == {
+        "a": [1, 2.5, None, True, ']]]]"[[']
+    }
     assert parse_json("[" * 32 + "]" * 32)
     cases = {
         "[" * 1_000_000: "nested too deeply",
@@ -62,7 +64,9 @@ def test_json(tmp_path):
         with pytest.raises(ValueError, match=message):
             parse_json(text)
     (tmp_path / "a.json").write_bytes(b'"\xff"')
-    with pytest.raises(ValueError, match=r"a\.json: cannot be read \(.*utf-8.*\); expected a list\. Perhaps"):
+    with pytest.raises(
+        ValueError, match=r"a\.json: cannot be read \(.*utf-8.*\); expected a list\. Perhaps"
+    ):
         read_json(tmp_path / "a.json", 8, "a list")
 
 
@@ -72,7 +76,9 @@ def test_files_are_replaced_whole(tmp_path) -> None:
     writing.write_json(path, {"name": [1, None]})
     assert json.loads(path.read_text()) == {"name": [1, None]}
     path.with_name("earlier").write_bytes(b"old")
-    (tmp_path / ".a.json.partial").hardlink_to(tmp_path / "earlier")  # left behind by a killed process
+    (tmp_path / ".a.json.partial").hardlink_to(
+        tmp_path / "earlier"
+    )  # left behind by a killed process
     writing.write_bytes(path, b"x")
     assert path.read_bytes() == b"x" and (tmp_path / "earlier").read_bytes() == b"old"
     assert {p.name for p in tmp_path.iterdir()} == {"a.json", "earlier"}
@@ -104,7 +110,9 @@ def test_sync_comes_before_the_new_name(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(os, "fsync", lambda number: calls.append("fsync"))
     monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b)))
     writing.write_bytes(tmp_path / "a", b"x", sync=True)
-    assert calls == ["fsync", "replace", "fsync"], "the content, the name, the folder that holds the name"
+    assert calls == ["fsync", "replace", "fsync"], (
+        "the content, the name, the folder that holds the name"
+    )
 
 
 def test_only_regular_files_are_replaced(tmp_path) -> None:

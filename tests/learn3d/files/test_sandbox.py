@@ -35,7 +35,9 @@ def path(tmp_path: Path) -> Path:
         (strange.spin, "processor time; expected a spoon. Make a smaller file"),
     ],
 )
-def test_what_goes_wrong_is_one_sentence_and_the_next_file_is_read(path: Path, function: object, said: str) -> None:
+def test_what_goes_wrong_is_one_sentence_and_the_next_file_is_read(
+    path: Path, function: object, said: str
+) -> None:
     with pytest.raises(DamagedFile, match=said) as caught:
         read(function, path, wanted="a spoon", seconds=1)
     assert str(caught.value).startswith(f"{path}: ")
@@ -72,11 +74,19 @@ def test_arrays_of_all_sizes_and_orders_come_back_and_can_be_changed(path: Path)
 
 
 def test_many_are_read_in_order_each_fault_in_its_place(path: Path) -> None:
-    calls = [Call(strange.size, path), Call(strange.crash, path), Call(strange.size, path.with_name("other"))]
+    calls = [
+        Call(strange.size, path),
+        Call(strange.crash, path),
+        Call(strange.size, path.with_name("other")),
+    ]
     others = [Call(strange.sleep, path, (0.001,)), Call(strange.size, path)]
     for k, found in enumerate(read_all(calls if k % 5 == 2 else others for k in range(20))):
         if k % 5 == 2:
-            assert found[0] == 5 and isinstance(found[1], DamagedFile) and isinstance(found[2], MissingFile)
+            assert (
+                found[0] == 5
+                and isinstance(found[1], DamagedFile)
+                and isinstance(found[2], MissingFile)
+            )
         else:
             assert found[1] == 5
 
@@ -90,7 +100,9 @@ def test_only_a_few_are_read_ahead(path: Path) -> None:
     assert read(strange.size, path) == 5
 
 
-def test_relative_paths_begin_at_the_folder_of_the_moment(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relative_paths_begin_at_the_folder_of_the_moment(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert read(strange.size, path) == 5  # by a worker that was started elsewhere
     monkeypatch.chdir(path.parent)
     assert read(strange.size, path.name) == 5
@@ -101,7 +113,12 @@ def _script(path: Path, code: str, **options: object) -> subprocess.Popen:
     start = f"import os, sys, strange_functions as s; from learn3d.files.sandbox import read; p = {str(path)!r}\n"
     start += "print(read(s.sleep, p, 0.0), flush=True)\n"
     paths = os.pathsep.join([str(Path(strange.__file__).parent), *sys.path])
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    pipes = {
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+        "start_new_session": True,
+    }
     command = [sys.executable, "-c", start + code]
     return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, **pipes, **options)
 
@@ -129,7 +146,9 @@ def test_no_worker_outlives_its_parent(path: Path, how: str) -> None:
 
 
 def test_copy_of_the_process_starts_its_own_workers(path: Path) -> None:
-    process = _script(path, "pid = os.fork(); print(read(s.sleep, p, 0.0), flush=True); pid and os.wait()")
+    process = _script(
+        path, "pid = os.fork(); print(read(s.sleep, p, 0.0), flush=True); pid and os.wait()"
+    )
     numbers = [process.stdout.readline() for _ in range(3)]
     process.communicate(timeout=20)
     assert len(set(numbers)) == 2
@@ -139,7 +158,9 @@ def test_copy_of_the_process_starts_its_own_workers(path: Path) -> None:
 def test_files_are_read_when_the_system_gives_no_more_threads(path: Path) -> None:
     limit = 1_200_000 * 1024
     process = _script(
-        path, "print(read(s.size, p))", preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        path,
+        "print(read(s.size, p))",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
     )
     output, errors = process.communicate(timeout=60)
     assert output.split()[1:] == ["5"] and not errors

@@ -19,7 +19,9 @@ from learn3d.training import load_data, train
 PAGE = Path(__file__).parents[3] / "docs" / "contributing.md"
 
 
-def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_method_of_the_page_works(
+    tiny_names, tiny_folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     section = PAGE.read_text().split("### A method")[1].split("\n### ")[0]
     module_text, preset_text = re.findall(r"```python\n(.*?)```", section, re.S)
     (tmp_path / "mirror_of_the_page.py").write_text(module_text)
@@ -30,9 +32,17 @@ def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, m
     for name, preset in eval("{" + preset_text + "}", names).items():
         monkeypatch.setitem(presets.PRESETS, name, dataclasses.replace(preset, preset=name))
 
-    settings = page.MirrorSettings(encoder="conv-small", generator="sphere-small", learning_rate=1e-3)
+    settings = page.MirrorSettings(
+        encoder="conv-small", generator="sphere-small", learning_rate=1e-3
+    )
     where = {"data": tiny_folder, "category": "airplane", "output": tmp_path / "run"}
-    options = {"preset": "mirror-kato", "settings": settings, "batch_size": 4, "max_val_images": 4, "log_every": 1}
+    options = {
+        "preset": "mirror-kato",
+        "settings": settings,
+        "batch_size": 4,
+        "max_val_images": 4,
+        "log_every": 1,
+    }
     train(configure(**where, **options, iterations=2))
     summary = train(configure(**where, **options, iterations=4), resume=True)
     assert summary.finished
@@ -40,14 +50,22 @@ def test_the_method_of_the_page_works(tiny_names, tiny_folder, tmp_path: Path, m
     assert type(method) is page.Mirror
     assert config.settings == settings
     assert evaluate(method, load_data(config, "val"), max_images=4).voxel_iou > 0
-    lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    ]
     assert lines[0].keys() >= {"projection", "smoothness", "mirror", "total"}
 
 
 @pytest.mark.parametrize("house", ["learn3d", "learn3d/studio"])
 def test_the_rooms_of_the_page_are_there(house: str) -> None:
     table = PAGE.read_text().split(f"| room of `{house}/` |")[1].split("\n\n")[0]
-    rooms = [name for line in table.splitlines() for name in re.findall(r"`([\w/.*]+)`", line.split("|")[1])]
-    missing = [name for name in rooms if "*" not in name and not (PAGE.parents[1] / house / name).exists()]
+    rooms = [
+        name
+        for line in table.splitlines()
+        for name in re.findall(r"`([\w/.*]+)`", line.split("|")[1])
+    ]
+    missing = [
+        name for name in rooms if "*" not in name and not (PAGE.parents[1] / house / name).exists()
+    ]
     assert not missing
     assert len(rooms) > 5

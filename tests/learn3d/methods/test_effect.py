@@ -31,7 +31,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> kato.ViewDataset:
     whole = kato.load(folder, "airplane", "train")
     part = whole.select(np.flatnonzero(np.isin(whole.view_ids, SIDES)))
     names = tuple(whole.view_names[view] for view in SIDES)
-    return dataclasses.replace(part, view_ids=np.searchsorted(SIDES, part.view_ids), view_names=names)
+    return dataclasses.replace(
+        part, view_ids=np.searchsorted(SIDES, part.view_ids), view_names=names
+    )
 
 
 def confusion(method: PoseInvariant, batch: Batch) -> float:
@@ -44,7 +46,9 @@ def confusion(method: PoseInvariant, batch: Batch) -> float:
 
 
 @pytest.mark.parametrize(("weight", "unsure"), [(1.0, True), (0.0, False)])
-def test_pose_confusion_takes_the_view_out_of_the_codes(dataset: kato.ViewDataset, weight: float, unsure: bool) -> None:
+def test_pose_confusion_takes_the_view_out_of_the_codes(
+    dataset: kato.ViewDataset, weight: float, unsure: bool
+) -> None:
     small = {"encoder": "conv-small", "generator": "sphere-small", "learning_rate": 1e-3}
     settings = dataclasses.replace(
         PRESETS["peng2020-kato"].settings, **small, lambda_adversarial=weight, lambda_prior=0.0
@@ -61,5 +65,7 @@ def test_pose_confusion_takes_the_view_out_of_the_codes(dataset: kato.ViewDatase
     assert loss.item() < 0.4 * np.log(len(SIDES))  # it has learnt to tell them apart
     sure = confusion(method, batch)
     for _ in range(30):
-        take_step(method, batch, 2)  # even steps train the encoder against the discriminator, which stays as it is
+        take_step(
+            method, batch, 2
+        )  # even steps train the encoder against the discriminator, which stays as it is
     assert (confusion(method, batch) < 0.1 * sure) == unsure

@@ -30,7 +30,11 @@ TINY_RUNS = {
     "plus": TINY | {"preset": "plus-kato", "bank_size": 8},
     "multi-view": TINY | {"preset": "multi-view-kato"},
     "many-views": TINY | {"preset": "many-views-kato", "batch_size": 10},
-    "vpl": {"preset": "peng2020-kato-vpl", "generator": "sphere-small", "discriminator_channels": 2},
+    "vpl": {
+        "preset": "peng2020-kato-vpl",
+        "generator": "sphere-small",
+        "discriminator_channels": 2,
+    },
     "prgan": {"preset": "gadelha2017-kato", "encoder_from_step": 3}
     | {"generator_channels": (2, 2, 2, 1), "discriminator_channels": (2, 2, 2, 2)},
 }
@@ -111,13 +115,20 @@ def test_schedules() -> None:
 
     assert factors() == [1, 1, 1, 1]
     assert factors(lr_schedule="linear") == [1, 0.75, 0.5, 0.25]
-    assert factors(lr_schedule="cosine") == pytest.approx([(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)])
+    assert factors(lr_schedule="cosine") == pytest.approx(
+        [(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)]
+    )
     assert factors(warmup_steps=2) == [0.5, 1, 1, 1]
     assert factors(warmup_steps=2, lr_schedule="linear") == [0.5, 1, 1, 0.5]
     for name in get_args(LRSchedule):
         TrainingSchedule(4, name)
     published = TrainingSchedule(200_000, "step")
-    assert [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)] == [1, 1, 0.1, 0.1]
+    assert [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)] == [
+        1,
+        1,
+        0.1,
+        0.1,
+    ]
     with pytest.raises(ValueError, match="the schedule 'cubic' has no branch"):
         factors(lr_schedule="cubic")
     with pytest.raises(ValueError, match="warmup_steps"):
@@ -146,7 +157,10 @@ def test_the_average_is_the_one_of_a_slow_reference() -> None:
     own = {name: value.clone() for name, value in network.state_dict().items()}
     averaged = {name: value.clone() for name, value in average.tensors.items()}
     with average.in_place():
-        assert all(torch.equal(averaged[f"net.{name}"], value) for name, value in network.state_dict().items())
+        assert all(
+            torch.equal(averaged[f"net.{name}"], value)
+            for name, value in network.state_dict().items()
+        )
     assert all(torch.equal(own[name], value) for name, value in network.state_dict().items())
     assert all(torch.equal(averaged[name], value) for name, value in average.tensors.items())
 
@@ -157,15 +171,24 @@ def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) 
     for average in (0.0, 0.9):
         schedule = TrainingSchedule(4, "linear", ema_decay=average)
         method = create_method(
-            settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0, schedule=schedule
+            settings,
+            DatasetInfo(24, inverted=False),
+            device="cpu",
+            precision="fp32",
+            seed=0,
+            schedule=schedule,
         )
         for step in (1, 2, 3):
             training.take_step(method, tiny_set.batch(torch.arange(4)), step)
-            assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [1e-3 * (1 - (step - 1) / 4)] * 3
+            assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [
+                1e-3 * (1 - (step - 1) / 4)
+            ] * 3
             with method.in_use():
                 method.encode(tiny_set.batch(torch.arange(2)).images)
         ends.append({name: network.state_dict() for name, network in method.networks.items()})
-    assert all(torch.equal(ends[0][n][key], value) for n in ends[0] for key, value in ends[1][n].items())
+    assert all(
+        torch.equal(ends[0][n][key], value) for n in ends[0] for key, value in ends[1][n].items()
+    )
 
 
 def stop_after(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
@@ -183,7 +206,9 @@ def stop_after(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
 
 def test_every_method_has_a_tiny_run() -> None:
     presets = {run.get("preset", "peng2020-kato") for run in TINY_RUNS.values()}
-    assert {type(PRESETS[name].settings) for name in presets} == set(_METHODS), "add a run to TINY_RUNS"
+    assert {type(PRESETS[name].settings) for name in presets} == set(_METHODS), (
+        "add a run to TINY_RUNS"
+    )
 
 
 @pytest.mark.parametrize("name", TINY_RUNS)
@@ -191,7 +216,12 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
     name: str, tiny_names, tiny_config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(ENCODERS, "conv", tiny_networks.TinyEncoder)
-    options = TINY_RUNS[name] | {"lr_schedule": "cosine", "warmup_steps": 1, "ema_decay": 0.8, "validate_every": 2}
+    options = TINY_RUNS[name] | {
+        "lr_schedule": "cosine",
+        "warmup_steps": 1,
+        "ema_decay": 0.8,
+        "validate_every": 2,
+    }
     train(tiny_config(tmp_path / "straight", **options))
     with monkeypatch.context() as patch:
         stop_after(patch, 2)
@@ -199,16 +229,25 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
     torch.manual_seed(99)
     assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
     for file in ("last", "best"):
-        ours, theirs = (checkpoint.load(tmp_path / run / f"{file}.safetensors")[0] for run in ("straight", "stopped"))
+        ours, theirs = (
+            checkpoint.load(tmp_path / run / f"{file}.safetensors")[0]
+            for run in ("straight", "stopped")
+        )
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-    assert (tmp_path / "straight/metrics.jsonl").read_text() == (tmp_path / "stopped/metrics.jsonl").read_text()
+    assert (tmp_path / "straight/metrics.jsonl").read_text() == (
+        tmp_path / "stopped/metrics.jsonl"
+    ).read_text()
 
 
-def test_what_a_run_is_evaluated_with_is_the_average(tiny_names, tiny_config, tmp_path: Path) -> None:
+def test_what_a_run_is_evaluated_with_is_the_average(
+    tiny_names, tiny_config, tmp_path: Path
+) -> None:
     train(tiny_config(tmp_path, **TINY, ema_decay=0.8, validate_every=4))
     last, best = (checkpoint.load(tmp_path / f"{file}.safetensors")[0] for file in ("last", "best"))
-    averages = {name.removeprefix("ema."): value for name, value in last.items() if name.startswith("ema.")}
+    averages = {
+        name.removeprefix("ema."): value for name, value in last.items() if name.startswith("ema.")
+    }
     assert averages
     loaded = checkpoint.load_method(tmp_path / "last.safetensors")[0]
     for name, network in loaded.networks.items():

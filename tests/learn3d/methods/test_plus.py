@@ -24,7 +24,9 @@ SMALL = PlusSettings(encoder="conv-small", generator="sphere-small", bank_size=4
 
 def make(plane: float | None = None, **settings: object) -> Plus:
     shape = DatasetInfo(24, inverted=False, mirror_plane_deg=plane)
-    return create_method(dataclasses.replace(SMALL, **settings), shape, device="cpu", precision="fp32", seed=0)
+    return create_method(
+        dataclasses.replace(SMALL, **settings), shape, device="cpu", precision="fp32", seed=0
+    )
 
 
 @pytest.fixture
@@ -47,13 +49,19 @@ def test_the_mask_bank_keeps_the_newest() -> None:
 
 @pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato"])
 def test_shapes_end_at_the_box_where_it_is_known(preset: str) -> None:
-    settings = dataclasses.replace(PRESETS[preset].settings, encoder="conv-small", generator="sphere-small")
+    settings = dataclasses.replace(
+        PRESETS[preset].settings, encoder="conv-small", generator="sphere-small"
+    )
     inside = preset == "plus-kato"
     codes = 100 * torch.randn(8, 512, generator=torch.Generator().manual_seed(0))
     shapes = {}
     for box in (None, 1.0):
         method = create_method(
-            settings, DatasetInfo(24, inverted=False, cube_side=box), device="cpu", precision="fp32", seed=0
+            settings,
+            DatasetInfo(24, inverted=False, cube_side=box),
+            device="cpu",
+            precision="fp32",
+            seed=0,
         )
         with torch.no_grad():
             shapes[box] = method.decode(codes).vertices
@@ -88,7 +96,12 @@ def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
 
 def test_the_weight_of_the_smoothness_falls_over_the_run(batch) -> None:
     settings = dataclasses.replace(SMALL, lambda_smooth=1e-2, lambda_smooth_end=1e-4)
-    options = {"device": "cpu", "precision": "fp32", "seed": 0, "schedule": TrainingSchedule(iterations=5)}
+    options = {
+        "device": "cpu",
+        "precision": "fp32",
+        "seed": 0,
+        "schedule": TrainingSchedule(iterations=5),
+    }
     method = create_method(settings, DatasetInfo(24, inverted=False), **options)
     weights = [method.losses(batch, step)["smoothness"][0] for step in (1, 3, 5, 6)]
     assert weights == pytest.approx([1e-2, 1e-3, 1e-4, 1e-4])
@@ -109,12 +122,16 @@ def test_the_loss_at_novel_views_moves_vertices_where_the_projection_does_not(ba
     method = make()
     method.novel_view_loss(0.5 * method.generator.sphere.expand(4, -1, -1), batch)
     vertices = (0.5 * method.generator.sphere).repeat(4, 1, 1).requires_grad_()
-    (gradient,) = torch.autograd.grad(method.novel_view_loss(vertices, batch)["novel_view"][1], vertices)
+    (gradient,) = torch.autograd.grad(
+        method.novel_view_loss(vertices, batch)["novel_view"][1], vertices
+    )
     assert torch.isfinite(gradient).all()
     assert gradient.abs().sum() > 0
 
 
-def test_every_second_image_is_flipped_to_a_view_of_its_own_if_shapes_are_symmetric(batch, monkeypatch) -> None:
+def test_every_second_image_is_flipped_to_a_view_of_its_own_if_shapes_are_symmetric(
+    batch, monkeypatch
+) -> None:
     seen, pictures, original = [], [], Plus.losses_on_codes
 
     def losses_on_codes(self, codes, views, step):
@@ -125,7 +142,9 @@ def test_every_second_image_is_flipped_to_a_view_of_its_own_if_shapes_are_symmet
     for plane, flipped, views in ((90.0, [1, 3], [0, 25, 0, 24]), (None, [], [0, 1, 0, 0])):
         method, images = make(plane), batch.images.clone()
         images[flipped] = images[flipped].flip(3)
-        method.predict = lambda given, predict=method.predict: pictures.append(given) or predict(given)
+        method.predict = lambda given, predict=method.predict: (
+            pictures.append(given) or predict(given)
+        )
         take_step(method, batch, 1)
         assert seen.pop().tolist() == views
         assert torch.equal(pictures.pop(), images)
@@ -134,7 +153,9 @@ def test_every_second_image_is_flipped_to_a_view_of_its_own_if_shapes_are_symmet
 def test_an_image_and_its_mirror_image_have_one_code(batch) -> None:
     free, symmetric = make(None), make(90.0)
     with torch.no_grad():
-        torch.testing.assert_close(symmetric.encode(batch.images), symmetric.encode(batch.images.flip(3)))
+        torch.testing.assert_close(
+            symmetric.encode(batch.images), symmetric.encode(batch.images.flip(3))
+        )
         assert not torch.equal(free.encode(batch.images), free.encode(batch.images.flip(3)))
 
 
@@ -156,14 +177,24 @@ def test_compact_objects_get_the_smooth_sphere_and_a_small_area(tiny_set) -> Non
     images[0, 3, 28:36, 4:60] = images[0, 3, 4:60, 28:36] = 255
     assert 0.3 < square.solidity() < 0.67
     settings = dataclasses.replace(SMALL, generator="auto")
-    cases = ((0.9, SmoothSphereGenerator, 0.03), (0.6, SphereGenerator, 0.0), (None, SphereGenerator, 0.0))
+    cases = (
+        (0.9, SmoothSphereGenerator, 0.03),
+        (0.6, SphereGenerator, 0.0),
+        (None, SphereGenerator, 0.0),
+    )
     for solidity, kind, weight in cases:
         method = create_method(
-            settings, DatasetInfo(24, inverted=False, solidity=solidity), device="cpu", precision="fp32", seed=0
+            settings,
+            DatasetInfo(24, inverted=False, solidity=solidity),
+            device="cpu",
+            precision="fp32",
+            seed=0,
         )
         assert type(method.generator) is kind and method.settings.lambda_area == weight
     settings = dataclasses.replace(settings, lambda_area=0.5)
-    method = create_method(settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
+    method = create_method(
+        settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0
+    )
     vertices = method.generator(torch.zeros(2, 512))
     weight, area = method.surface_losses(vertices, 1)["area"]
     assert weight == 0.5

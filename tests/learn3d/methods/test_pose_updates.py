@@ -24,9 +24,15 @@ def test_poses_are_found_again_from_the_models_shapes() -> None:
     dataset = dataclasses.replace(dataset, candidates=candidates)
     batches_of_shapes = iter(vertices.repeat_interleave(24, 0).split(128))
     decode = lambda codes: Meshes(next(batches_of_shapes), faces)  # noqa: E731
-    method = SimpleNamespace(in_use=contextlib.nullcontext, encode=torch.Tensor.float, decode=decode)
+    method = SimpleNamespace(
+        in_use=contextlib.nullcontext, encode=torch.Tensor.float, decode=decode
+    )
     changed = update_poses(method, dataset)
     found = torch.from_numpy(weights.argmax(1)) * 15.0
     assert ((found - dataset.poses.azimuth_deg + 180) % 360 - 180).abs().max() == 0
     assert np.allclose(weights.sum(1), 1) and changed == pytest.approx(1 - 1 / 24)
-    assert update_steps(1600, 3) == (200, 400, 800) and update_steps(2, 3) == (1,) and update_steps(9, 0) == ()
+    assert (
+        update_steps(1600, 3) == (200, 400, 800)
+        and update_steps(2, 3) == (1,)
+        and update_steps(9, 0) == ()
+    )

@@ -23,7 +23,9 @@ SMALL = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 4, 4,
 
 def small_prgan(**settings: object) -> PrGAN:
     torch.manual_seed(0)
-    return PrGAN(PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS, inverted=False), "cpu", "fp32")
+    return PrGAN(
+        PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS, inverted=False), "cpu", "fp32"
+    )
 
 
 def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None) -> Batch:
@@ -34,11 +36,22 @@ def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None)
     poses = poses or LookAtPoses(-360.0 / VIEWS * views, 30.0, 2.732, 15.0)
     images = torch.zeros(count, 4, 64, 64, dtype=torch.uint8)
     images[:, 3] = (255 * masks).to(torch.uint8)
-    return Batch(images, masks, poses, views, torch.arange(count), torch.zeros(count, dtype=torch.int64), None)
+    return Batch(
+        images,
+        masks,
+        poses,
+        views,
+        torch.arange(count),
+        torch.zeros(count, dtype=torch.int64),
+        None,
+    )
 
 
 def changed(method: PrGAN, before: dict[str, nn.Module]) -> set[str]:
-    pairs = {name: zip(before[name].parameters(), method.networks[name].parameters(), strict=True) for name in before}
+    pairs = {
+        name: zip(before[name].parameters(), method.networks[name].parameters(), strict=True)
+        for name in before
+    }
     return {name for name in before if any(not torch.equal(a, b) for a, b in pairs[name])}
 
 
@@ -46,10 +59,17 @@ def changed(method: PrGAN, before: dict[str, nn.Module]) -> set[str]:
 def test_doubling_is_torchs_transposed_convolution(channels: tuple[int, int]) -> None:
     torch.manual_seed(0)
     layer = DoublingConvolution(*channels)
-    x = torch.randn(2, channels[0], 3, 3, 3).to(memory_format=torch.channels_last_3d).requires_grad_()
+    x = (
+        torch.randn(2, channels[0], 3, 3, 3)
+        .to(memory_format=torch.channels_last_3d)
+        .requires_grad_()
+    )
     grad = torch.randn(2, channels[1], 6, 6, 6)
     results = []
-    for function in (layer, lambda y: F.conv_transpose3d(y, layer.weight, layer.bias, stride=2, padding=1)):
+    for function in (
+        layer,
+        lambda y: F.conv_transpose3d(y, layer.weight, layer.bias, stride=2, padding=1),
+    ):
         y = function(x)
         results.append([y, *torch.autograd.grad(y, (x, layer.weight, layer.bias), grad)])
     for ours, torchs in zip(*results, strict=True):
@@ -88,30 +108,43 @@ def test_each_step_changes_its_network_only(
     assert changed(method, before) == {network}
     if name == "encoder":  # the averages of the generator's batch norms stay, too
         state = before["generator"].state_dict()
-        assert all(torch.equal(state[key], value) for key, value in method.generator.state_dict().items())
+        assert all(
+            torch.equal(state[key], value) for key, value in method.generator.state_dict().items()
+        )
 
 
 def test_discriminator_rests_while_it_is_too_good(monkeypatch: pytest.MonkeyPatch) -> None:
     method = small_prgan()
     for accuracy, rests in ((0.81, True), (0.79, False)):
-        monkeypatch.setattr(method, "accuracy", lambda real, z, value=accuracy: torch.tensor(value).double())
+        monkeypatch.setattr(
+            method, "accuracy", lambda real, z, value=accuracy: torch.tensor(value).double()
+        )
         before = copy.deepcopy(method.networks)
         losses = take_step(method, make_batch(), 1)
         assert ("discriminator" in losses) is not rests
-        assert changed(method, before) == ({"generator"} if rests else {"generator", "discriminator"})
+        assert changed(method, before) == (
+            {"generator"} if rests else {"generator", "discriminator"}
+        )
 
 
 def test_accuracy_is_the_mean_probability_of_being_right(monkeypatch: pytest.MonkeyPatch) -> None:
     method, batch = small_prgan(), make_batch(4)
     monkeypatch.setattr(method, "generate", lambda z: torch.zeros(len(z), 64, 64))
-    monkeypatch.setattr(method, "discriminator", lambda images: 4 * images.amax((1, 2)) - 1)  # 3 and -1
+    monkeypatch.setattr(
+        method, "discriminator", lambda images: 4 * images.amax((1, 2)) - 1
+    )  # 3 and -1
     probability = torch.tensor([3.0, 1.0]).sigmoid().mean()
-    assert float(method.accuracy(batch.masks, method.sample_z(4))) == pytest.approx(float(probability))
+    assert float(method.accuracy(batch.masks, method.sample_z(4))) == pytest.approx(
+        float(probability)
+    )
 
 
 def test_statistics_are_means_and_variances_over_the_batch() -> None:
     real, fake = torch.tensor([[0.0, 1.0], [2.0, 1.0]]), torch.tensor([[0.0, 0.0], [0.0, 4.0]])
-    assert float(statistics_loss(real, fake)) == (1 - 0) ** 2 + (1 - 2) ** 2 + (1 - 0) ** 2 + (0 - 4) ** 2
+    assert (
+        float(statistics_loss(real, fake))
+        == (1 - 0) ** 2 + (1 - 2) ** 2 + (1 - 0) ** 2 + (0 - 4) ** 2
+    )
 
 
 def test_encoder_learns_to_invert_a_fixed_generator(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,7 +172,10 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
 
     class Fixed(nn.Module):
         def forward(self, codes: Tensor) -> Tensor:
-            return nmr.voxelize(vertices + 0.5, faces, size=64).float().expand(len(codes), -1, -1, -1) / TAU
+            return (
+                nmr.voxelize(vertices + 0.5, faces, size=64).float().expand(len(codes), -1, -1, -1)
+                / TAU
+            )
 
     method.generator = Fixed()
     grids = method.decode(torch.zeros(1, SHAPE_CODE))
@@ -153,11 +189,28 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
 @pytest.mark.parametrize(
     ("poses", "message"),
     [
-        (RotationPoses(torch.eye(3).expand(3, 3, 3)), r"view k at azimuth -90 k .*this data set gives rotations"),
-        (LookAtPoses(torch.tensor([0.0, -90.0, -171.0]), 30.0, 2.732, 15.0), "a camera of view 2 has azimuth -171"),
-        (LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), torch.tensor([30.0, 31.0, 30.0]), 2.732, 15.0), "elevation 31"),
-        (LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.0, 15.0), "view 0 has .*distance 2, "),
-        (LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.732, 25.0), "half field of view 25"),
+        (
+            RotationPoses(torch.eye(3).expand(3, 3, 3)),
+            r"view k at azimuth -90 k .*this data set gives rotations",
+        ),
+        (
+            LookAtPoses(torch.tensor([0.0, -90.0, -171.0]), 30.0, 2.732, 15.0),
+            "a camera of view 2 has azimuth -171",
+        ),
+        (
+            LookAtPoses(
+                torch.tensor([0.0, 270.0, 180.0]), torch.tensor([30.0, 31.0, 30.0]), 2.732, 15.0
+            ),
+            "elevation 31",
+        ),
+        (
+            LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.0, 15.0),
+            "view 0 has .*distance 2, ",
+        ),
+        (
+            LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.732, 25.0),
+            "half field of view 25",
+        ),
     ],
 )
 def test_other_cameras_are_refused(poses: LookAtPoses | RotationPoses, message: str) -> None:

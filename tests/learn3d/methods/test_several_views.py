@@ -10,7 +10,14 @@ import pytest
 import torch
 
 import nmr
-from learn3d.data.dataset import DEPTH_REACH, Batch, DatasetInfo, ViewDataset, depth_levels, depth_of_levels
+from learn3d.data.dataset import (
+    DEPTH_REACH,
+    Batch,
+    DatasetInfo,
+    ViewDataset,
+    depth_levels,
+    depth_of_levels,
+)
 from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices
@@ -26,13 +33,23 @@ from learn3d.training import take_step
 
 def make_batch(objects: list[int]) -> Batch:
     count = len(objects)
-    images = torch.randint(0, 256, (count, 4, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    images = torch.randint(
+        0, 256, (count, 4, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+    )
     masks = torch.zeros(count, 64, 64)
     for i in range(count):
         masks[i, 16 + 2 * i : 46, 20 : 40 + 2 * i] = 1
     views = torch.arange(count) * 5 % 24
     poses = LookAtPoses(-15.0 * views, 30.0, 2.732, 15.0)
-    return Batch(images, masks, poses, views, torch.tensor(objects), torch.zeros(count, dtype=torch.int64), None)
+    return Batch(
+        images,
+        masks,
+        poses,
+        views,
+        torch.tensor(objects),
+        torch.zeros(count, dtype=torch.int64),
+        None,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -52,15 +69,27 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
     with torch.no_grad():
         batch.images[:2] //= 8  # shapes that differ
         method.generator.layers[-1].weight *= 10
-        vertices, faces = method.decode(method.encode(batch.images)).vertices, method.generator.faces
+        vertices, faces = (
+            method.decode(method.encode(batch.images)).vertices,
+            method.generator.faces,
+        )
         losses = []
-        for shapes, views in (([0, 1], [0, 1]), ([2, 3], [0, 1]), ([0, 1], [2, 3]), ([2, 3], [2, 3])):
-            cameras = nmr.LookAt.from_angles(2.732, 30.0, batch.poses.azimuth_deg[views], half_fov_deg=15.0)
+        for shapes, views in (
+            ([0, 1], [0, 1]),
+            ([2, 3], [0, 1]),
+            ([0, 1], [2, 3]),
+            ([2, 3], [2, 3]),
+        ):
+            cameras = nmr.LookAt.from_angles(
+                2.732, 30.0, batch.poses.azimuth_deg[views], half_fov_deg=15.0
+            )
             silhouettes = nmr.render_silhouette(vertices[shapes], faces, cameras, image_size=64)
             losses.append(float(nmr.losses.soft_iou_loss(silhouettes, batch.masks[views])))
         smoothness = float(nmr.losses.smoothness_loss(vertices, method.generator.edges))
     assert len({round(loss, 4) for loss in losses}) == 4
-    before = {name: [p.detach().clone() for p in n.parameters()] for name, n in method.networks.items()}
+    before = {
+        name: [p.detach().clone() for p in n.parameters()] for name, n in method.networks.items()
+    }
     values = take_step(method, batch, 1)
     rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in method.optimizers.items()}
     assert rates == pytest.approx({"encoder": 1e-4, "generator": 1e-4})
@@ -68,7 +97,9 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
     assert values["smoothness"] == pytest.approx(smoothness, rel=1e-5)
     assert values["total"] == pytest.approx(values["projection"] + 0.001 * values["smoothness"])
     for name, network in method.networks.items():
-        assert all((p != q).any() for p, q in zip(network.parameters(), before[name], strict=True)), name
+        assert all(
+            (p != q).any() for p, q in zip(network.parameters(), before[name], strict=True)
+        ), name
 
 
 SMALL = {"encoder": "conv-small", "generator": "sphere-small"}
@@ -78,7 +109,14 @@ SMALL = {"encoder": "conv-small", "generator": "sphere-small"}
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> ViewDataset:
     """Six tables from seven sides each, read from shards."""
     folder = tmp_path_factory.mktemp("around")
-    options = {"category": "table", "layout": "around", "procedural": 8, "views": 7, "test": 1, "val": 1}
+    options = {
+        "category": "table",
+        "layout": "around",
+        "procedural": 8,
+        "views": 7,
+        "test": 1,
+        "val": 1,
+    }
     assert make_shards(DatasetConfig(output=folder, shards=True, **options)) == 0
     return load_dataset("around", folder, "table", "train")
 
@@ -112,11 +150,16 @@ def test_cameras_stand_all_around_and_see_the_whole_object(dataset: ViewDataset)
 def test_depth_is_that_of_the_renderer(dataset: ViewDataset) -> None:
     batch = dataset.batch(torch.arange(len(dataset)))
     inside, outside = batch.masks == 1, batch.masks == 0
-    assert ((batch.depth > 0) & outside).float().mean() < 1e-3 and (batch.depth[inside] > 0).float().mean() > 0.98
+    assert ((batch.depth > 0) & outside).float().mean() < 1e-3 and (
+        batch.depth[inside] > 0
+    ).float().mean() > 0.98
     depth = torch.tensor([[[1.2, 2.0, 2.85, 100.0]]])
     poses = LookAtPoses(*torch.tensor([[0.0], [0.0], [2.0], [15.0]]))
     back = depth_of_levels(depth_levels(depth, poses), poses)
-    assert torch.allclose(back[..., :3], depth[..., :3], atol=DEPTH_REACH / 254 + 1e-6) and back[..., 3] == 0
+    assert (
+        torch.allclose(back[..., :3], depth[..., :3], atol=DEPTH_REACH / 254 + 1e-6)
+        and back[..., 3] == 0
+    )
 
 
 def test_flipped_batches_have_flipped_depth(dataset: ViewDataset) -> None:
@@ -154,22 +197,30 @@ def test_losses_are_those_written_out(dataset: ViewDataset) -> None:
         both = (batch.depth[view] > 0) & (depth < 10)
         error = torch.where(both, depth - batch.depth[view], torch.nan)
         distances.append(error[both].abs())
-        slopes.append([(error - error.roll(2, axis)).narrow(axis, 2, 62).abs().flatten() for axis in (0, 1)])
+        slopes.append(
+            [(error - error.roll(2, axis)).narrow(axis, 2, 62).abs().flatten() for axis in (0, 1)]
+        )
     losses = take_step(method, batch, 1)
     assert losses["projection"] == pytest.approx(float(torch.stack(overlap).mean()), rel=1e-4)
     assert losses["depth"] == pytest.approx(float(torch.cat(distances).mean()), rel=0.02)
     slope = sum(float(torch.cat(part).nanmean()) for part in zip(*slopes, strict=True))
     assert losses["slope"] == pytest.approx(slope, rel=0.02)
     assert losses["prior"] == pytest.approx(float(codes.square().sum(1).mean()), rel=1e-4)
-    assert not {"depth", "slope"} & take_step(method, dataclasses.replace(batch, depth=None), 1).keys()
+    assert (
+        not {"depth", "slope"} & take_step(method, dataclasses.replace(batch, depth=None), 1).keys()
+    )
 
 
 def test_the_azimuth_is_learnt_from_the_pose(dataset: ViewDataset) -> None:
     """So a flipped image, whose pose is mirrored, teaches the right one."""
     batch = dataset.batch(sample_indices(dataset, "groups", 10, seed=0, step=1))
     unknown = dataclasses.replace(batch, view_ids=torch.zeros_like(batch.view_ids))
-    mirrored = dataclasses.replace(batch, poses=batch.poses.mirrored(torch.ones(10, dtype=torch.bool)))
-    first, same, other = (take_step(create(dataset), b, 1)["view"] for b in (batch, unknown, mirrored))
+    mirrored = dataclasses.replace(
+        batch, poses=batch.poses.mirrored(torch.ones(10, dtype=torch.bool))
+    )
+    first, same, other = (
+        take_step(create(dataset), b, 1)["view"] for b in (batch, unknown, mirrored)
+    )
     assert first == same != other
 
 

@@ -22,7 +22,9 @@ def test_surface_of_a_ball_is_where_the_ball_is() -> None:
     grid = nmr.voxelize(0.25 * sphere + centre + 0.5, faces, size=64)[0].float()
     vertices, found, *_ = grid_surface(grid)
     distance = (vertices - centre).norm(dim=1)
-    assert 0.24 < distance.min() < distance.max() < 0.28  # the cells that the surface touches count as inside
+    assert (
+        0.24 < distance.min() < distance.max() < 0.28
+    )  # the cells that the surface touches count as inside
     assert torch.allclose(vertices.mean(0), centre, atol=0.02)
     normals = nmr.face_normals(vertices, found)
     outwards = vertices[found].mean(1) - centre
@@ -40,9 +42,15 @@ def test_full_and_empty_grids() -> None:
 
 
 def make(plane: float | None):
-    settings = dataclasses.replace(PRESETS["plus-kato"].settings, encoder="conv-small", lambda_novel_view=0.0)
+    settings = dataclasses.replace(
+        PRESETS["plus-kato"].settings, encoder="conv-small", lambda_novel_view=0.0
+    )
     return create_method(
-        settings, DatasetInfo(24, inverted=False, mirror_plane_deg=plane), device="cpu", precision="fp32", seed=0
+        settings,
+        DatasetInfo(24, inverted=False, mirror_plane_deg=plane),
+        device="cpu",
+        precision="fp32",
+        seed=0,
     )
 
 
@@ -69,7 +77,11 @@ def test_the_silhouette_comes_closer(tiny_set, monkeypatch, steps: tuple[int, in
 def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set, monkeypatch) -> None:
     take_steps(monkeypatch, 1, 1)
     method = create_method(
-        PRESETS["kato2019-kar"].settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0
+        PRESETS["kato2019-kar"].settings,
+        DatasetInfo(24, inverted=False),
+        device="cpu",
+        precision="fp32",
+        seed=0,
     )
     batch = tiny_set.batch(torch.tensor([0]))
     images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
@@ -77,9 +89,14 @@ def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set, monkeypa
     assert shapes.vertices.shape == (1, 1352, 3) and shapes.vertices.isfinite().all()
 
 
-def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(tiny_set, monkeypatch) -> None:
+def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(
+    tiny_set, monkeypatch
+) -> None:
     take_steps(monkeypatch, 0, 5)
-    method, batches = make(37.5), [tiny_set.batch(torch.tensor(chosen)) for chosen in ([0, 30], [0])]
+    method, batches = (
+        make(37.5),
+        [tiny_set.batch(torch.tensor(chosen)) for chosen in ([0, 30], [0])],
+    )
     both, alone = (refine(method, b.images, b.masks, b.poses).vertices for b in batches)
     torch.testing.assert_close(both[:1], alone, atol=5e-5, rtol=0)
     torch.testing.assert_close(method.generator.symmetrized(both), both)
@@ -94,9 +111,13 @@ def test_shapes_of_a_data_set_are_refined(finished_run, tiny_folder, tmp_path) -
 
 def test_voxels_cannot_be_fitted(tiny_set) -> None:
     settings = dataclasses.replace(
-        PRESETS["gadelha2017-kato"].settings, generator_channels=(4, 4, 2, 1), discriminator_channels=(4, 8, 8, 8)
+        PRESETS["gadelha2017-kato"].settings,
+        generator_channels=(4, 4, 2, 1),
+        discriminator_channels=(4, 8, 8, 8),
     )
-    method = create_method(settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0)
+    method = create_method(
+        settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0
+    )
     batch = tiny_set.batch(torch.tensor([0]))
     with pytest.raises(ValueError, match="leave out --refine"):
         refine(method, batch.images, batch.masks, batch.poses)

@@ -24,11 +24,23 @@ from learn3d.presets import PRESETS
 from learn3d.training import take_step
 
 REIMPLEMENTED = VPLSettings(discriminator_channels=8, lambda_discriminator=0.1, learning_rate=1e-3)
-SMALL = {"image_size": 32, "silhouette_size": 64, "discriminator_channels": 8, "learning_rate": 2e-3}
+SMALL = {
+    "image_size": 32,
+    "silhouette_size": 64,
+    "discriminator_channels": 8,
+    "learning_rate": 2e-3,
+}
 SHAPENET = replace(PRESETS["kato2019-kar"].settings, **SMALL)
 SHAPENET_CLASS = replace(SHAPENET, class_conditional=True, lambda_discriminator=0.2)
-PASCAL = replace(PRESETS["kato2019-pascal"].settings, **SMALL, encoder="preact-resnet18", object_scale=0.6)
-FORMS = {"reimplemented": REIMPLEMENTED, "shapenet": SHAPENET, "class": SHAPENET_CLASS, "pascal": PASCAL}
+PASCAL = replace(
+    PRESETS["kato2019-pascal"].settings, **SMALL, encoder="preact-resnet18", object_scale=0.6
+)
+FORMS = {
+    "reimplemented": REIMPLEMENTED,
+    "shapenet": SHAPENET,
+    "class": SHAPENET_CLASS,
+    "pascal": PASCAL,
+}
 SHAPE = DatasetInfo(num_views=3, inverted=False, num_classes=2)
 
 
@@ -43,13 +55,18 @@ def narrow_networks(monkeypatch) -> None:
 def make_batch(image_size: int, count: int = 2, rotations: bool = False) -> Batch:
     """Boxy ellipsoids at two views, of two categories."""
     sphere, faces = nmr.icosphere(2)
-    sizes = torch.tensor([[0.4, 0.2, 0.2], [0.2, 0.4, 0.3], [0.3, 0.3, 0.3], [0.1, 0.3, 0.4]])[:count]
+    sizes = torch.tensor([[0.4, 0.2, 0.2], [0.2, 0.4, 0.3], [0.3, 0.3, 0.3], [0.1, 0.3, 0.4]])[
+        :count
+    ]
     if rotations:
-        poses = RotationPoses(torch.linalg.qr(torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0)))[0])
+        poses = RotationPoses(
+            torch.linalg.qr(torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0)))[0]
+        )
     else:
         poses = LookAtPoses(torch.tensor([30.0, 120.0, 30.0, 250.0])[:count], 30.0, 2.732, 15.0)
     images, masks = (
-        nmr.render_silhouette(sphere * sizes[:, None], faces, poses.cameras(), image_size=size) * 255
+        nmr.render_silhouette(sphere * sizes[:, None], faces, poses.cameras(), image_size=size)
+        * 255
         for size in (image_size, 64)
     )
     colors = images[:, None] * torch.tensor([0.3, 0.6, 0.9])[:, None, None]
@@ -116,31 +133,43 @@ def test_alternating_steps_train_one_side() -> None:
 
 
 def test_odd_steps_move_shapes_as_without_a_discriminator() -> None:
-    method, baseline = create(REIMPLEMENTED), create(replace(REIMPLEMENTED, lambda_discriminator=0.0))
+    method, baseline = (
+        create(REIMPLEMENTED),
+        create(replace(REIMPLEMENTED, lambda_discriminator=0.0)),
+    )
     assert "discriminator" not in baseline.networks
     batch = make_batch(64)
     losses, plain = backpropagate(method, batch, 1), backpropagate(baseline, batch, 1)
     assert plain.keys() == {"projection", "smoothness"}
     assert losses["projection"][1] == plain["projection"][1]
-    for own, other in zip(method.generator.parameters(), baseline.generator.parameters(), strict=True):
+    for own, other in zip(
+        method.generator.parameters(), baseline.generator.parameters(), strict=True
+    ):
         torch.testing.assert_close(own.grad, other.grad)
 
 
 def test_even_steps_pull_the_other_view_towards_real() -> None:
     """The gradient of an even step is that of projection + smoothness + lambda_D BCE(D(other view), 1)."""
     batch = make_batch(64)
-    baseline, method = create(replace(REIMPLEMENTED, lambda_discriminator=0.0)), create(REIMPLEMENTED)
+    baseline, method = (
+        create(replace(REIMPLEMENTED, lambda_discriminator=0.0)),
+        create(REIMPLEMENTED),
+    )
     backpropagate(baseline, batch, 2)
     weight, loss = backpropagate(method, batch, 2)["adversarial"]
     adversary = create(REIMPLEMENTED)
     vertices = adversary.generator(adversary.encoder(batch.images.float() / 255))
     others = torch.tensor([1, 0])  # the only other view of each
-    fake = nmr.render_silhouette(vertices, adversary.generator.faces, batch.poses[others].cameras(), image_size=64)
+    fake = nmr.render_silhouette(
+        vertices, adversary.generator.faces, batch.poses[others].cameras(), image_size=64
+    )
     logits = adversary.discriminator(fake, batch.view_ids[others])
     adversarial = F.binary_cross_entropy_with_logits(logits, torch.ones(2))
     assert weight == 0.1 and loss.item() == pytest.approx(adversarial.item(), rel=1e-4)
     (0.1 * adversarial).backward()
-    for full, plain, expected in zip(*(m.generator.parameters() for m in (method, baseline, adversary)), strict=True):
+    for full, plain, expected in zip(
+        *(m.generator.parameters() for m in (method, baseline, adversary)), strict=True
+    ):
         difference = (full.grad - plain.grad - expected.grad).norm()
         assert difference < 1e-3 * expected.grad.norm()
 
@@ -154,13 +183,22 @@ def test_reversal_gives_shapes_minus_lambda_times_and_the_discriminator_all() ->
     renderer = {"anti_aliasing": False, "gradient": "local"}
     views = (batch.poses, batch.poses[torch.tensor([1, 0])])
     silhouettes = [
-        nmr.render_silhouette(vertices, plain.generator.faces, poses.cameras(), image_size=64, **renderer)
+        nmr.render_silhouette(
+            vertices, plain.generator.faces, poses.cameras(), image_size=64, **renderer
+        )
         for poses in views
     ]
-    logits = [plain.discriminator(s, poses.features()) for s, poses in zip(silhouettes, views, strict=True)]
+    logits = [
+        plain.discriminator(s, poses.features())
+        for s, poses in zip(silhouettes, views, strict=True)
+    ]
     loss = F.softplus(-logits[0]).mean() + F.softplus(logits[1]).mean()
-    weights = [parameter for parameter in plain.discriminator.parameters() if parameter.requires_grad]
-    *of_weights, of_real, of_fake = torch.autograd.grad(loss, [*weights, *silhouettes], retain_graph=True)
+    weights = [
+        parameter for parameter in plain.discriminator.parameters() if parameter.requires_grad
+    ]
+    *of_weights, of_real, of_fake = torch.autograd.grad(
+        loss, [*weights, *silhouettes], retain_graph=True
+    )
     projection = silhouette_pyramid_loss(silhouettes[0], batch.masks)
     (of_projection,) = torch.autograd.grad(projection, silhouettes[0], retain_graph=True)
     pressure = 1e-4 * nmr.losses.inflation_loss(vertices, plain.generator.faces)
@@ -170,15 +208,24 @@ def test_reversal_gives_shapes_minus_lambda_times_and_the_discriminator_all() ->
         losses = backpropagate(method, batch, 1)
         assert losses.keys() == {"projection", "inflation", "discrimination"}
         assert losses["discrimination"][1].item() == pytest.approx(loss.item(), rel=1e-4)
-        own = [parameter.grad for parameter in method.discriminator.parameters() if parameter.requires_grad]
+        own = [
+            parameter.grad
+            for parameter in method.discriminator.parameters()
+            if parameter.requires_grad
+        ]
         for gradient, expected in zip(own, of_weights, strict=True):
             torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-5)
         # The renderer's gradient is not linear in that of the images (only pixels that lower the loss pull): sum first.
         of_images = [of_projection - factor * of_real, -factor * of_fake]
         expected = torch.autograd.grad(
-            [*silhouettes, pressure], [plain.generator.base], [*of_images, torch.ones(())], retain_graph=True
+            [*silhouettes, pressure],
+            [plain.generator.base],
+            [*of_images, torch.ones(())],
+            retain_graph=True,
         )[0]
-        torch.testing.assert_close(method.generator.base.grad, expected, rtol=1e-3, atol=1e-4 * expected.abs().max())
+        torch.testing.assert_close(
+            method.generator.base.grad, expected, rtol=1e-3, atol=1e-4 * expected.abs().max()
+        )
 
 
 def test_other_views_are_random_ones_of_another_class() -> None:
@@ -208,7 +255,9 @@ def test_input_mask_is_the_target_at_its_size() -> None:
     wrong = replace(batch, masks=torch.zeros(2, 64, 64))
     losses = [take_step(create(settings), b, 1)["projection"] for b in (batch, wrong)]
     assert losses[0] == losses[1]
-    faint = replace(batch, images=torch.where(batch.images == 0, 25, batch.images))  # 25 / 255 is below 0.1
+    faint = replace(
+        batch, images=torch.where(batch.images == 0, 25, batch.images)
+    )  # 25 / 255 is below 0.1
     method = create(settings)
     method.predict = lambda images: VPL.predict(method, batch.images)
     assert take_step(method, faint, 1)["projection"] == losses[0]
@@ -218,13 +267,24 @@ def test_input_mask_is_the_target_at_its_size() -> None:
     ("settings", "message"),
     [
         ({"image_size": 224}, "encoder 'conv' takes images of 64 pixels, got image_size 224"),
-        ({"encoder": "resnet18", "image_size": 100}, "must be a multiple of 32 for encoder 'resnet18', got 100"),
+        (
+            {"encoder": "resnet18", "image_size": 100},
+            "must be a multiple of 32 for encoder 'resnet18', got 100",
+        ),
         ({"silhouette_size": 128}, r"silhouette_size must be 64, .* or image_size \(64\), got 128"),
-        ({"pretrained": "weights.pth"}, "weights are for the encoder 'resnet18', got encoder 'conv'"),
-        ({"class_conditional": True}, "class_conditional needs discriminator 'spectral-patch', got 'dcgan'"),
+        (
+            {"pretrained": "weights.pth"},
+            "weights are for the encoder 'resnet18', got encoder 'conv'",
+        ),
+        (
+            {"class_conditional": True},
+            "class_conditional needs discriminator 'spectral-patch', got 'dcgan'",
+        ),
     ],
 )
-def test_settings_that_contradict_each_other_are_refused(settings: dict[str, object], message: str) -> None:
+def test_settings_that_contradict_each_other_are_refused(
+    settings: dict[str, object], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         VPLSettings(**settings)
 

@@ -34,7 +34,9 @@ def narrow(name: str, symmetry: Symmetry | None) -> MeshGenerator:
 def reflected(points: Tensor, azimuth_deg: float) -> Tensor:
     """Points mirrored at the plane through the y axis and the eye of a camera at this azimuth."""
     angle = math.radians(azimuth_deg)
-    normal = torch.tensor([math.cos(angle), 0.0, math.sin(angle)])  # across the eye's (sin a, 0, -cos a)
+    normal = torch.tensor(
+        [math.cos(angle), 0.0, math.sin(angle)]
+    )  # across the eye's (sin a, 0, -cos a)
     return points - 2 * (points @ normal)[..., None] * normal
 
 
@@ -81,18 +83,28 @@ def test_the_symmetric_sphere_is_the_published_one() -> None:
     assert not [name for name in generator.state_dict() if not name.startswith("layers")]
     # The faces are those of a mirrored mesh, too: as a set of triangles the surface is its own mirror image.
     faces, mirrored = (
-        set(map(tuple, f.sort(1).values.tolist())) for f in (generator.faces, generator.mirror[generator.faces])
+        set(map(tuple, f.sort(1).values.tolist()))
+        for f in (generator.faces, generator.mirror[generator.faces])
     )
     assert faces == mirrored
 
     outputs = torch.zeros(1, 979, requires_grad=True)
     generator.layers = nn.Identity()
     vertices = generator(outputs)
-    middle, right = (torch.nonzero(side)[:, 0] for side in (generator.sphere[:, 2] == 0, generator.sphere[:, 2] > 0))
+    middle, right = (
+        torch.nonzero(side)[:, 0]
+        for side in (generator.sphere[:, 2] == 0, generator.sphere[:, 2] > 0)
+    )
     assert len(middle) == int((vertices[0, :, 2] == 0).sum()) == 32
     opposite = generator.mirror[right[2]]
-    for vertex, coordinate, output, sign in ((middle[3], 1, 7, 1), (right[2], 2, 72, 1), (opposite, 2, 72, -1)):
-        (gradient,) = torch.autograd.grad(vertices[0, vertex, coordinate], outputs, retain_graph=True)
+    for vertex, coordinate, output, sign in (
+        (middle[3], 1, 7, 1),
+        (right[2], 2, 72, 1),
+        (opposite, 2, 72, -1),
+    ):
+        (gradient,) = torch.autograd.grad(
+            vertices[0, vertex, coordinate], outputs, retain_graph=True
+        )
         assert gradient.nonzero().tolist() == [[0, output]]
         assert gradient[0, output] == 0.5 * sign
 
@@ -114,12 +126,16 @@ def test_cube_is_closed_and_its_faces_look_outwards() -> None:
 @pytest.mark.parametrize("symmetry", [None, "z"])
 def test_rule_of_the_vertices(name: str, symmetry: Symmetry | None, monkeypatch) -> None:
     generator: CubeGenerator = narrow(name, symmetry).eval()
-    assert (generator.scale, generator.object_scale) == ((0.01, 0.5) if name == "cube-conv" else (0.1, 1.0))
+    assert (generator.scale, generator.object_scale) == (
+        (0.01, 0.5) if name == "cube-conv" else (0.1, 1.0)
+    )
     codes = torch.randn(2, 512)
     points = (generator.base + generator.scale * generator.bias(codes)).clone()
     if symmetry is not None:
         points[..., 2] = points[..., 2].abs()
-        points = torch.stack([(points[:, i] + points[:, j]) / 2 for i, j in enumerate(generator.mirror.tolist())], 1)
+        points = torch.stack(
+            [(points[:, i] + points[:, j]) / 2 for i, j in enumerate(generator.mirror.tolist())], 1
+        )
         points[..., 2] *= torch.where(cube_surface()[0][:, 2] < 8, -1, 1)
     torch.testing.assert_close(generator(codes), generator.object_scale * 1.2 * torch.tanh(points))
     monkeypatch.setattr(generator, "bias", lambda codes: torch.zeros(len(codes), 1352, 3))

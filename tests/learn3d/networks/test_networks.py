@@ -22,8 +22,20 @@ from learn3d.networks.discriminators import (
     SpectralPatchDiscriminator,
     pose_discriminator,
 )
-from learn3d.networks.encoders import CENTRED_SIZE, ENCODERS, EncoderName, PreactResNet18, centre, network_input
-from learn3d.networks.generators import GENERATORS, ConvCubeGenerator, LinearCubeGenerator, deform_sphere
+from learn3d.networks.encoders import (
+    CENTRED_SIZE,
+    ENCODERS,
+    EncoderName,
+    PreactResNet18,
+    centre,
+    network_input,
+)
+from learn3d.networks.generators import (
+    GENERATORS,
+    ConvCubeGenerator,
+    LinearCubeGenerator,
+    deform_sphere,
+)
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.networks.voxel_gan import InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
@@ -33,15 +45,27 @@ CONV = [(4, 64, 5, 2, 2), (64, 128, 5, 2, 2), (128, 256, 5, 2, 2)]
 SIDE = [(512, 256, 3, 2, 1), (256, 128, 3, 2, 1), (128, 64, 3, 2, 1), (64, 3, 3, 1, 1)]
 PREACT = [(3, 64, 7, 2, 3)] + [(64, 64, 3, 1, 1)] * 4
 for a in (64, 128, 256):
-    PREACT += [(a, 2 * a, 3, 2, 1), (2 * a, 2 * a, 3, 1, 1), (a, 2 * a, 1, 2, 0)] + [(2 * a, 2 * a, 3, 1, 1)] * 2
+    PREACT += [(a, 2 * a, 3, 2, 1), (2 * a, 2 * a, 3, 1, 1), (a, 2 * a, 1, 2, 0)] + [
+        (2 * a, 2 * a, 3, 1, 1)
+    ] * 2
 
 #: A published network, its linear layers (inputs, outputs), its convolutions (inputs, outputs, size, stride, padding)
 #: and the widths of its batch norms.
 PUBLISHED: dict[str, tuple[Callable[[], nn.Module], list, list, list]] = {
     "encoder": (ENCODERS["conv"], [(16384, 1024), (1024, 1024), (1024, 512)], CONV, []),
-    "preact": (PreactResNet18, [(25088, 512)], PREACT, [64] * 5 + [128] * 4 + [256] * 4 + [512] * 4),
+    "preact": (
+        PreactResNet18,
+        [(25088, 512)],
+        PREACT,
+        [64] * 5 + [128] * 4 + [256] * 4 + [512] * 4,
+    ),
     "generator": (GENERATORS["sphere"], [(512, 1024), (1024, 2048), (2048, 1926)], [], []),
-    "symmetric generator": (lambda: GENERATORS["sphere"]("z"), [(512, 1024), (1024, 2048), (2048, 979)], [], []),
+    "symmetric generator": (
+        lambda: GENERATORS["sphere"]("z"),
+        [(512, 1024), (1024, 2048), (2048, 979)],
+        [],
+        [],
+    ),
     "cube-conv": (ConvCubeGenerator, [(512, 2048)] * 6, SIDE * 6, [512, 256, 128, 64] * 6),
     "cube-fc": (LinearCubeGenerator, [(512, 4096), (4096, 4096), (4096, 4056)], [], []),
     "discriminator": (lambda: pose_discriminator(24), [(512, 256), (256, 128), (128, 24)], [], []),
@@ -54,13 +78,19 @@ PUBLISHED: dict[str, tuple[Callable[[], nn.Module], list, list, list]] = {
     "spectral-patch": (
         lambda: SpectralPatchDiscriminator(3),
         [(3, 32)],
-        [(a, b, 5, 2, 2) for a, b in ((1, 32), (64, 64), (64, 128), (128, 256), (256, 256), (256, 1))],
+        [
+            (a, b, 5, 2, 2)
+            for a, b in ((1, 32), (64, 64), (64, 128), (128, 256), (256, 256), (256, 1))
+        ],
         [32, 32, 64, 128, 256, 256],
     ),
     "patch": (
         lambda: PatchDiscriminator(9),
         [(9, 64)],
-        [(a, b, 4, s, 2) for a, b, s in ((1, 64, 2), (128, 128, 2), (128, 256, 2), (256, 512, 1), (512, 1, 1))],
+        [
+            (a, b, 4, s, 2)
+            for a, b, s in ((1, 64, 2), (128, 128, 2), (128, 256, 2), (256, 512, 1), (512, 1, 1))
+        ],
         [],
     ),
     "voxels": (
@@ -89,13 +119,17 @@ def test_layers_are_the_published_ones(name: str) -> None:
     network = create()
     found = layers(network, nn.Conv2d, nn.ConvTranspose2d, nn.ConvTranspose3d)
     assert [(m.in_features, m.out_features) for m in layers(network, nn.Linear)] == linear
-    shapes = [(m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0], m.padding[0]) for m in found]
+    shapes = [
+        (m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0], m.padding[0]) for m in found
+    ]
     assert shapes == convolutions
     batch_norms = layers(network, nn.modules.batchnorm._BatchNorm)
     assert sorted(m.num_features for m in batch_norms) == sorted(norms)
     assert {m.negative_slope for m in layers(network, nn.LeakyReLU)} <= {0.2}
     if name in ("voxels", "silhouettes", "inverse encoder"):
-        assert all(abs(float(m.weight.detach().std()) - 0.1) < 0.01 for m in layers(network, nn.Linear))
+        assert all(
+            abs(float(m.weight.detach().std()) - 0.1) < 0.01 for m in layers(network, nn.Linear)
+        )
         assert all(m.momentum == 0.1 for m in batch_norms)
     if name == "spectral-patch":  # a gain would undo the normalisation
         assert all(not m.weight.requires_grad and m.bias.requires_grad for m in batch_norms)
@@ -109,16 +143,34 @@ def narrow_encoder(name: str) -> nn.Module:
 
 #: A network of small width, the shapes of its inputs (an integer: classes below it), and of its output.
 SMALL: dict[str, tuple[Callable[[], nn.Module], list, tuple[int, ...]]] = {
-    **{name: (lambda name=name: narrow_encoder(name), [(2, 4, 64, 64)], (2, 512)) for name in ENCODERS},
-    **{name: (lambda name=name: narrow_encoder(name), [(2, 4, 96, 96)], (2, 512)) for name in ("preact", "flat")},
-    **{name: (GENERATORS[name], [(2, 512)], (2, 642, 3)) for name in GENERATORS if not name.startswith("cube")},
+    **{
+        name: (lambda name=name: narrow_encoder(name), [(2, 4, 64, 64)], (2, 512))
+        for name in ENCODERS
+    },
+    **{
+        name: (lambda name=name: narrow_encoder(name), [(2, 4, 96, 96)], (2, 512))
+        for name in ("preact", "flat")
+    },
+    **{
+        name: (GENERATORS[name], [(2, 512)], (2, 642, 3))
+        for name in GENERATORS
+        if not name.startswith("cube")
+    },
     "symmetric": (lambda: GENERATORS["sphere-small"](30.0), [(2, 512)], (2, 642, 3)),
     "cube-conv": (lambda: ConvCubeGenerator(channels=16), [(2, 512)], (2, 1352, 3)),
     "cube-fc": (lambda: LinearCubeGenerator("z", channels=32), [(2, 512)], (2, 1352, 3)),
     "discriminator": (lambda: pose_discriminator(24), [(2, 512)], (2, 24)),
     "dcgan": (lambda: OneHotViewDiscriminator(5, channels=4), [(2, 64, 64), 5], (2,)),
-    "spectral-patch": (lambda: SpectralPatchDiscriminator(3, channels=4), [(2, 224, 224), (2, 3)], (2, 4, 4)),
-    "classes": (lambda: SpectralPatchDiscriminator(3, 4, num_classes=3), [(2, 224, 224), (2, 3), 3], (2, 4, 4)),
+    "spectral-patch": (
+        lambda: SpectralPatchDiscriminator(3, channels=4),
+        [(2, 224, 224), (2, 3)],
+        (2, 4, 4),
+    ),
+    "classes": (
+        lambda: SpectralPatchDiscriminator(3, 4, num_classes=3),
+        [(2, 224, 224), (2, 3), 3],
+        (2, 4, 4),
+    ),
     "patch": (lambda: PatchDiscriminator(9, channels=4), [(2, 224, 224), (2, 9)], (2, 31, 31)),
     "voxels": (lambda: VoxelGenerator((4, 4, 2, 1)), [(2, 200)], (2, 64, 64, 64)),
     "silhouettes": (lambda: SilhouetteDiscriminator((4, 4, 4, 8)), [(2, 64, 64)], (2,)),
@@ -132,7 +184,10 @@ def test_shapes_and_gradients_of_all_networks(name: str) -> None:
     create, wanted, shape = SMALL[name]
     torch.manual_seed(0)
     network = create()
-    inputs = [torch.tensor([0, s - 1]) if isinstance(s, int) else torch.rand(s).requires_grad_() for s in wanted]
+    inputs = [
+        torch.tensor([0, s - 1]) if isinstance(s, int) else torch.rand(s).requires_grad_()
+        for s in wanted
+    ]
     output = network(*inputs)
     assert output.shape == shape
     assert output.dtype == torch.float32
@@ -140,7 +195,9 @@ def test_shapes_and_gradients_of_all_networks(name: str) -> None:
         assert (output < 0).any() == (name != "resnet18")
     (output * torch.randn(shape)).sum().backward()
     assert all(x.grad.abs().sum() > 0 for x in inputs if x.is_floating_point())
-    trained = {parameter_name: p for parameter_name, p in network.named_parameters() if p.requires_grad}
+    trained = {
+        parameter_name: p for parameter_name, p in network.named_parameters() if p.requires_grad
+    }
     assert [n for n, p in trained.items() if p.grad is None or not p.grad.isfinite().all()] == []
     assert [n for n, p in trained.items() if not p.grad.abs().sum() > 0] == []
 
@@ -153,7 +210,9 @@ def test_every_weight_of_spectral_patch_has_spectral_norm_1() -> None:
     normalised = layers(network.eval(), nn.Conv2d, nn.Linear)
     assert len(normalised) == 8
     for layer in normalised:
-        assert float(torch.linalg.matrix_norm(layer.weight.detach().flatten(1), 2)) == pytest.approx(1, abs=0.05)
+        assert float(
+            torch.linalg.matrix_norm(layer.weight.detach().flatten(1), 2)
+        ) == pytest.approx(1, abs=0.05)
 
 
 def test_dcgan_sees_silhouette_and_view() -> None:
@@ -185,12 +244,18 @@ def test_gradient_reversal_has_sign_and_scale() -> None:
 
 
 def test_generator_rule_vectors() -> None:
-    case = {key: torch.from_numpy(value) for key, value in load_vector("generator_rule").items() if value.ndim}
+    case = {
+        key: torch.from_numpy(value)
+        for key, value in load_vector("generator_rule").items()
+        if value.ndim
+    }
     assert torch.equal(deform_sphere(case["base"], case["bias"]), case["vertices"])
 
 
 def test_background_of_preact_is_grey() -> None:
-    images = torch.tensor([[0.0, 1.0, 0.5, 0.0], [0.0, 1.0, 0.5, 1.0]])[:, :, None, None].expand(2, 4, 32, 32)
+    images = torch.tensor([[0.0, 1.0, 0.5, 0.0], [0.0, 1.0, 0.5, 1.0]])[:, :, None, None].expand(
+        2, 4, 32, 32
+    )
     network, seen = PreactResNet18(32, channels=4), []
     network.layers[0].register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
     network(images)
@@ -198,7 +263,9 @@ def test_background_of_preact_is_grey() -> None:
 
 
 @pytest.mark.parametrize("memory_format", [torch.channels_last, torch.contiguous_format])
-def test_network_input_scales_bytes_to_the_unit_interval(memory_format: torch.memory_format) -> None:
+def test_network_input_scales_bytes_to_the_unit_interval(
+    memory_format: torch.memory_format,
+) -> None:
     noise = torch.randint(0, 256, (3, 4, 64, 64), dtype=torch.uint8)
     result = network_input(noise, "cpu", memory_format=memory_format)
     assert torch.equal(result, noise.float() / 255)
@@ -211,7 +278,9 @@ def test_network_input_scales_bytes_to_the_unit_interval(memory_format: torch.me
 def test_encoders_with_he_weights_tell_images_apart_from_the_start(name: EncoderName) -> None:
     """Codes vary with the image by a good part of their size. A white background is as good as a black one."""
     images = torch.zeros(16, 4, 64, 64)
-    for k, (height, width) in enumerate(torch.randint(4, 60, (16, 2), generator=torch.Generator().manual_seed(0))):
+    for k, (height, width) in enumerate(
+        torch.randint(4, 60, (16, 2), generator=torch.Generator().manual_seed(0))
+    ):
         images[k, :, :height, :width] = 1
     natural = torch.cat([1 - images[:, :3], images[:, 3:]], dim=1)
     for seed in range(3):
@@ -242,12 +311,17 @@ def test_centred_objects_take_the_same_part_of_the_image() -> None:
     extent = round(64 * CENTRED_SIZE)
     first = (64 - extent) // 2
     for image in centred:
-        assert np.abs(np.subtract(box(image), (first, first, first + extent, first + extent))).max() <= 1
+        assert (
+            np.abs(np.subtract(box(image), (first, first, first + extent, first + extent))).max()
+            <= 1
+        )
     assert (centred[1:] - centred[:1]).abs().mean() < 0.02
     torch.manual_seed(0)
     encoder = ENCODERS["conv-centred"](inverted=False)
     with torch.no_grad():
-        small, large, other = encoder(torch.cat([wedge(30, 3, 30), wedge(60, 2, 2), wedge(60, 2, 2).flip(2)]))
+        small, large, other = encoder(
+            torch.cat([wedge(30, 3, 30), wedge(60, 2, 2), wedge(60, 2, 2).flip(2)])
+        )
     assert (small - large).norm() < 0.2 * (large - other).norm()
 
 
@@ -267,11 +341,16 @@ def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> Non
 
 def create(preset: str, seed: int = 0, device: str = "cpu", precision: str = "fp32") -> Method:
     info = DatasetInfo(24, inverted=False)
-    return create_method(PRESETS[preset].settings, info, device=device, precision=precision, seed=seed)
+    return create_method(
+        PRESETS[preset].settings, info, device=device, precision=precision, seed=seed
+    )
 
 
 def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
-    with_d, without = create("peng2020-kato", seed=3).networks, create("peng2020-kato-vanilla", seed=3).networks
+    with_d, without = (
+        create("peng2020-kato", seed=3).networks,
+        create("peng2020-kato-vanilla", seed=3).networks,
+    )
     other = create("peng2020-kato-vanilla", seed=4).networks
     assert "discriminator" not in without
     for name in ("encoder", "generator"):
@@ -280,7 +359,9 @@ def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
     assert not torch.equal(other["encoder"].layers[0].weight, without["encoder"].layers[0].weight)
 
 
-@pytest.mark.parametrize(("flags", "wanted"), [("fpu avx512_bf16", "bf16"), ("amx_bf16", "bf16"), ("avx2", "fp32")])
+@pytest.mark.parametrize(
+    ("flags", "wanted"), [("fpu avx512_bf16", "bf16"), ("amx_bf16", "bf16"), ("avx2", "fp32")]
+)
 def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, flags: str, wanted: str) -> None:
     cpuinfo = tmp_path / "cpuinfo"
     cpuinfo.write_text(f"model name : x\nflags\t\t: {flags}\n")
@@ -294,7 +375,10 @@ def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, flags: str, wante
 def test_bf16_changes_results_little() -> None:
     images = torch.randint(256, (1, 4, 64, 64), dtype=torch.uint8)
     with torch.no_grad():
-        exact, rough = (create("peng2020-kato-vanilla", precision=p).predict(images)[1] for p in ("fp32", "bf16"))
+        exact, rough = (
+            create("peng2020-kato-vanilla", precision=p).predict(images)[1]
+            for p in ("fp32", "bf16")
+        )
     assert rough.dtype == torch.float32
     assert 0 < (rough - exact).abs().max() < 0.005
 

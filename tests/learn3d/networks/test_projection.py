@@ -21,7 +21,11 @@ def test_samples_lie_on_the_rays_of_the_pixels(views: ViewCircle) -> None:
     azimuth, width = float(views.azimuth_deg(torch.tensor(1))), views.half_width
     points = views.sample_points(azimuth, SIZE).double()
     eye = nmr.cameras.points_from_angles(views.distance, views.elevation_deg, [azimuth])
-    seen = nmr.Orthographic(eye, scale=1 / width).transform(points.reshape(1, -1, 3)).reshape(points.shape)
+    seen = (
+        nmr.Orthographic(eye, scale=1 / width)
+        .transform(points.reshape(1, -1, 3))
+        .reshape(points.shape)
+    )
     centres = (torch.arange(SIZE, dtype=torch.float64) + 0.5) / SIZE * 2 - 1
     assert torch.allclose(seen[..., 0], centres[None, :, None].expand(points.shape[:3]), atol=1e-5)
     assert torch.allclose(seen[..., 1], -centres[:, None, None].expand(points.shape[:3]), atol=1e-5)
@@ -34,7 +38,9 @@ def test_samples_lie_on_the_rays_of_the_pixels(views: ViewCircle) -> None:
 @pytest.mark.parametrize("views", [ViewCircle(), ViewCircle(count=3)])
 def test_projection_and_gradient_are_those_of_grid_sample(views: ViewCircle) -> None:
     ids = torch.tensor([23, 6, 0, 13, 6]) % views.count
-    density = (0.3 * torch.rand(5, SIZE, SIZE, SIZE, generator=torch.Generator().manual_seed(1))).requires_grad_()
+    density = (
+        0.3 * torch.rand(5, SIZE, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+    ).requires_grad_()
     points = torch.stack([views.sample_points(float(views.azimuth_deg(k)), SIZE) for k in ids])
     samples = F.grid_sample(density[:, None], 2 * points.flip(-1), align_corners=False)[:, 0]
     wanted = 1 - torch.exp(-TAU * samples.sum(3) * 2 * views.half_width)
@@ -56,16 +62,23 @@ BOXES = (  # low and high corners; no two views of the three together are alike,
 
 def mesh_of_boxes() -> tuple[torch.Tensor, torch.Tensor]:
     corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
-    sides = torch.tensor([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    sides = torch.tensor(
+        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
     faces = torch.cat([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
-    vertices = [torch.where(corners == 0, torch.tensor(low), torch.tensor(high)) for low, high in BOXES]
+    vertices = [
+        torch.where(corners == 0, torch.tensor(low), torch.tensor(high)) for low, high in BOXES
+    ]
     return torch.cat(vertices), torch.cat([faces + 8 * i for i in range(len(BOXES))])
 
 
 def grid_of_boxes(size: int) -> torch.Tensor:
     """Cells whose centres lie in a box, float32 [size, size, size], axes (x, y, z)."""
     centres = (torch.cartesian_prod(*[torch.arange(size)] * 3) + 0.5) / size - 0.5
-    inside = [((centres >= torch.tensor(low)) & (centres <= torch.tensor(high))).all(1) for low, high in BOXES]
+    inside = [
+        ((centres >= torch.tensor(low)) & (centres <= torch.tensor(high))).all(1)
+        for low, high in BOXES
+    ]
     return torch.stack(inside).any(0).float().reshape(size, size, size)
 
 
@@ -78,11 +91,17 @@ def test_views_are_those_of_katos_cameras() -> None:
     vertices, faces = mesh_of_boxes()
     ids, views = torch.tensor([1, 7, 13, 19, 20]), ViewCircle()
     cameras = nmr.LookAt.from_angles(2.732, 30.0, -15.0 * ids, half_fov_deg=15.0)
-    parallel = nmr.Orthographic(nmr.cameras.points_from_angles(2.732, 30.0, -15.0 * ids), scale=1 / views.half_width)
-    masks, exact = (nmr.render_silhouette(vertices, faces, c, image_size=64) for c in (cameras, parallel))
+    parallel = nmr.Orthographic(
+        nmr.cameras.points_from_angles(2.732, 30.0, -15.0 * ids), scale=1 / views.half_width
+    )
+    masks, exact = (
+        nmr.render_silhouette(vertices, faces, c, image_size=64) for c in (cameras, parallel)
+    )
     density = grid_of_boxes(64).expand(5, -1, -1, -1) / TAU
     image = project(density, ids, views, TAU)
     assert iou(image, exact).min() > 0.95
     assert iou(image, masks).min() > 0.75
-    assert iou(project(density, (24 - ids) % 24, views, TAU), masks).max() < 0.72  # azimuths of the other sign
+    assert (
+        iou(project(density, (24 - ids) % 24, views, TAU), masks).max() < 0.72
+    )  # azimuths of the other sign
     assert iou(image.flip(1), masks).max() < 0.6

@@ -21,15 +21,24 @@ def torchvision_names() -> dict[str, tuple[int, ...]]:
     """Entries and shapes of torchvision's resnet18, the classification layer included."""
 
     def norm(name: str, width: int) -> dict[str, tuple[int, ...]]:
-        vectors = {f"{name}.{part}": (width,) for part in ("weight", "bias", "running_mean", "running_var")}
+        vectors = {
+            f"{name}.{part}": (width,) for part in ("weight", "bias", "running_mean", "running_var")
+        }
         return vectors | {f"{name}.num_batches_tracked": ()}
 
-    names = {"conv1.weight": (64, 3, 7, 7)} | norm("bn1", 64) | {"fc.weight": (1000, 512), "fc.bias": (1000,)}
+    names = (
+        {"conv1.weight": (64, 3, 7, 7)}
+        | norm("bn1", 64)
+        | {"fc.weight": (1000, 512), "fc.bias": (1000,)}
+    )
     inputs = 64
     for layer, width in enumerate((64, 128, 256, 512), 1):
         for block in (0, 1):
             prefix = f"layer{layer}.{block}"
-            names |= {f"{prefix}.conv1.weight": (width, inputs, 3, 3), f"{prefix}.conv2.weight": (width, width, 3, 3)}
+            names |= {
+                f"{prefix}.conv1.weight": (width, inputs, 3, 3),
+                f"{prefix}.conv2.weight": (width, width, 3, 3),
+            }
             names |= norm(f"{prefix}.bn1", width) | norm(f"{prefix}.bn2", width)
             if inputs != width:
                 names |= {f"{prefix}.downsample.0.weight": (width, inputs, 1, 1)} | norm(
@@ -48,7 +57,11 @@ def random_weights(seed: int = 0, counters: bool = True) -> dict[str, Tensor]:
         elif name.endswith("running_var"):
             weights[name] = torch.rand(shape, generator=generator) + 0.5
         else:
-            scale = (2 / max(1, torch.tensor(shape[1:]).prod().item())) ** 0.5 if len(shape) > 1 else 0.2
+            scale = (
+                (2 / max(1, torch.tensor(shape[1:]).prod().item())) ** 0.5
+                if len(shape) > 1
+                else 0.2
+            )
             weights[name] = scale * torch.randn(shape, generator=generator)
     return weights
 
@@ -58,7 +71,8 @@ def slow_resnet(images: Tensor, w: dict[str, Tensor]) -> Tensor:
 
     def norm(x: Tensor, name: str) -> Tensor:
         mean, var, weight, bias = (
-            w[f"{name}.{part}"][:, None, None] for part in ("running_mean", "running_var", "weight", "bias")
+            w[f"{name}.{part}"][:, None, None]
+            for part in ("running_mean", "running_var", "weight", "bias")
         )
         return (x - mean) / (var + 1e-5).sqrt() * weight + bias
 
@@ -69,17 +83,23 @@ def slow_resnet(images: Tensor, w: dict[str, Tensor]) -> Tensor:
     for layer in range(1, 5):
         for block in (0, 1):
             name, stride = f"layer{layer}.{block}", 2 if layer > 1 and block == 0 else 1
-            y = norm(F.conv2d(x, w[f"{name}.conv1.weight"], stride=stride, padding=1), f"{name}.bn1").clamp(min=0)
+            y = norm(
+                F.conv2d(x, w[f"{name}.conv1.weight"], stride=stride, padding=1), f"{name}.bn1"
+            ).clamp(min=0)
             y = norm(F.conv2d(y, w[f"{name}.conv2.weight"], padding=1), f"{name}.bn2")
             if stride == 2:
-                x = norm(F.conv2d(x, w[f"{name}.downsample.0.weight"], stride=2), f"{name}.downsample.1")
+                x = norm(
+                    F.conv2d(x, w[f"{name}.downsample.0.weight"], stride=2), f"{name}.downsample.1"
+                )
             x = (x + y).clamp(min=0)
     return x.flatten(2).mean(2)
 
 
 def test_names_and_shapes_are_torchvisions() -> None:
     own = {name: tuple(value.shape) for name, value in ResNet18Encoder().state_dict().items()}
-    assert own == {name: shape for name, shape in torchvision_names().items() if not name.startswith("fc.")}
+    assert own == {
+        name: shape for name, shape in torchvision_names().items() if not name.startswith("fc.")
+    }
 
 
 @pytest.mark.parametrize("form", ["pth", "pt, without counters", "safetensors"])
@@ -124,12 +144,17 @@ def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> N
 def test_a_method_starts_from_pretrained_weights(tmp_path: Path) -> None:
     weights = random_weights()
     torch.save(weights, tmp_path / "weights.pth")
-    settings = PoseInvariantSettings(encoder="resnet18", symmetry="z", pretrained=str(tmp_path / "weights.pth"))
+    settings = PoseInvariantSettings(
+        encoder="resnet18", symmetry="z", pretrained=str(tmp_path / "weights.pth")
+    )
     assert settings.pretrained == tmp_path / "weights.pth"
     method = PoseInvariant(settings, DatasetInfo(3, inverted=False, pose_features=9), "cpu", "fp32")
     method.start_from_pretrained()
     assert torch.equal(method.encoder.conv1.weight, weights["conv1.weight"])
-    with pytest.raises(ValueError, match=r"for the encoder 'resnet18', got encoder 'conv-small'; choose that encoder"):
+    with pytest.raises(
+        ValueError,
+        match=r"for the encoder 'resnet18', got encoder 'conv-small'; choose that encoder",
+    ):
         PoseInvariantSettings(encoder="conv-small", pretrained=tmp_path / "weights.pth")
 
 
@@ -148,8 +173,14 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             load_pretrained(encoder, path)
 
     hint = "must be a state dict of torchvision's resnet18"
-    refused({k: v for k, v in weights.items() if "layer4" not in k}, f"w.pth {hint}: .*Missing key.*layer4")
-    refused(weights | {"layer4.2.conv1.weight": torch.ones(1)}, f"{hint}: .*Unexpected key.*layer4.2.conv1.weight")
+    refused(
+        {k: v for k, v in weights.items() if "layer4" not in k},
+        f"w.pth {hint}: .*Missing key.*layer4",
+    )
+    refused(
+        weights | {"layer4.2.conv1.weight": torch.ones(1)},
+        f"{hint}: .*Unexpected key.*layer4.2.conv1.weight",
+    )
     refused(weights | {"bn1.bias": torch.ones(3)}, rf"{hint}: .*bn1.bias: .*\[3\]\).*\[64\]\)")
     for value in (float("nan"), 1e300):
         bias = torch.full((64,), value, dtype=torch.float64)
@@ -174,7 +205,9 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         load_pretrained(encoder, path)
 
 
-def test_flat_resnet_is_linear_in_the_features_and_keeps_pretrained_batch_norms(tmp_path: Path) -> None:
+def test_flat_resnet_is_linear_in_the_features_and_keeps_pretrained_batch_norms(
+    tmp_path: Path,
+) -> None:
     torch.save(random_weights(), tmp_path / "w.pth")
     network, plain = ResNet18Encoder(flat_size=64, frozen_norms=True), ResNet18Encoder().eval()
     load_pretrained(network, tmp_path / "w.pth")
@@ -183,12 +216,16 @@ def test_flat_resnet_is_linear_in_the_features_and_keeps_pretrained_batch_norms(
     network.layer4.register_forward_hook(lambda _, __, output: features.append(output))
     codes = network.train()(images)
     torch.testing.assert_close(features[0].mean((2, 3)), plain(images))
-    torch.testing.assert_close(codes, features[0].flatten(1) @ network.code.weight.T + network.code.bias)
+    torch.testing.assert_close(
+        codes, features[0].flatten(1) @ network.code.weight.T + network.code.bias
+    )
     assert network.code.in_features == 512 * 2 * 2
 
     before = {name: value.clone() for name, value in network.state_dict().items()}
     codes.square().sum().backward()
     torch.optim.SGD([p for p in network.parameters() if p.requires_grad], lr=0.1).step()
-    changed = {name for name, value in network.state_dict().items() if not torch.equal(before[name], value)}
+    changed = {
+        name for name, value in network.state_dict().items() if not torch.equal(before[name], value)
+    }
     assert "conv1.weight" in changed
     assert not [name for name in changed if "bn" in name or "downsample.1" in name]

@@ -25,7 +25,14 @@ from learn3d.pictures.sheets import (
     save_png,
     tile,
 )
-from learn3d.pictures.surfaces import Surface, azimuths_deg, common_zoom, draw_surface, orbit, turntable
+from learn3d.pictures.surfaces import (
+    Surface,
+    azimuths_deg,
+    common_zoom,
+    draw_surface,
+    orbit,
+    turntable,
+)
 
 WHITE = np.ones(3, np.float32)
 FRONT = nmr.LookAt.from_angles(2.732, 0.0, 0.0, half_fov_deg=15.0)
@@ -68,12 +75,18 @@ def test_alpha_equals_the_antialiased_silhouette(egg) -> None:
 def test_colour_is_lambert_on_either_side(square, winding, orthographic) -> None:
     camera = nmr.LookAt.from_angles(2.732, 0.0, [0.0, 180.0], half_fov_deg=15.0)
     if orthographic:
-        camera = RotationPoses(torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, 1.0, -1.0]))])).cameras()
+        camera = RotationPoses(
+            torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, 1.0, -1.0]))])
+        ).cameras()
     color = np.array([0.8, 0.4, 0.2], np.float32)
     lights = studio_lights((0.0, 3.0, -4.0))  # 4/5 of it along -z, towards the camera of azimuth 0
-    rgb, _ = photograph(square[0], square[1][:, list(winding)], color, camera, image_size=32, lights=lights)
+    rgb, _ = photograph(
+        square[0], square[1][:, list(winding)], color, camera, image_size=32, lights=lights
+    )
     np.testing.assert_array_equal(rgb[0, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8)))
-    np.testing.assert_array_equal(rgb[1, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8 * BACK_LIGHT)))
+    np.testing.assert_array_equal(
+        rgb[1, 16, 16], np.rint(255 * color * (0.5 + 0.5 * 0.8 * BACK_LIGHT))
+    )
     np.testing.assert_array_equal(rgb[:, 0, 0], 255)
 
 
@@ -92,24 +105,42 @@ def test_each_face_keeps_its_own_colour(square) -> None:
 @pytest.mark.parametrize("kind", ["look-at", "rotation"])
 def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
     vertices, faces = egg.vertices + torch.tensor([0.15, 0.1, 0.05]), egg.faces
-    poses = LookAtPoses(torch.tensor([-75.0, -40.0, 100.0]), torch.tensor([30.0, 30.0, -10.0]), 2.732, 15.0)
-    if kind == "rotation":  # the same cameras without perspective, the last one rolled by 25 degrees
-        poses = RotationPoses(torch.stack([rotation(-75, 30), rotation(-40, 30), rotation(100, -10, roll_deg=25)]))
+    poses = LookAtPoses(
+        torch.tensor([-75.0, -40.0, 100.0]), torch.tensor([30.0, 30.0, -10.0]), 2.732, 15.0
+    )
+    if (
+        kind == "rotation"
+    ):  # the same cameras without perspective, the last one rolled by 25 degrees
+        poses = RotationPoses(
+            torch.stack([rotation(-75, 30), rotation(-40, 30), rotation(100, -10, roll_deg=25)])
+        )
     assert azimuths_deg(poses).tolist() == pytest.approx([-75, -40, 100], abs=1e-4)
-    silhouettes = nmr.render_silhouette(vertices[None].expand(3, -1, -1), faces, poses.cameras(), image_size=256) > 0.5
-    cameras = [*orbit(poses[torch.tensor([0])], [0, 35, -35]), *orbit(poses[torch.tensor([2])], [0])]
+    silhouettes = (
+        nmr.render_silhouette(
+            vertices[None].expand(3, -1, -1), faces, poses.cameras(), image_size=256
+        )
+        > 0.5
+    )
+    cameras = [
+        *orbit(poses[torch.tensor([0])], [0, 35, -35]),
+        *orbit(poses[torch.tensor([2])], [0]),
+    ]
     shaded = (draw_surface(Surface(vertices, faces), cameras, image_size=256) < 205).any(axis=3)
 
     def overlap(drawn: int, pose: int) -> float:
         a, b = shaded[drawn], silhouettes[pose].numpy()
         return float((a & b).sum() / (a | b).sum())
 
-    assert min(overlap(0, 0), overlap(1, 1), overlap(3, 2)) > 0.97  # the second pose is 35 degrees on
+    assert (
+        min(overlap(0, 0), overlap(1, 1), overlap(3, 2)) > 0.97
+    )  # the second pose is 35 degrees on
     assert overlap(2, 1) < 0.8
 
 
 def test_figures_need_poses() -> None:
-    assert azimuths_deg(LookAtPoses(torch.tensor([190.0]), 30.0, 2.7, 15.0)).tolist() == pytest.approx([-170], abs=1e-4)
+    assert azimuths_deg(
+        LookAtPoses(torch.tensor([190.0]), 30.0, 2.7, 15.0)
+    ).tolist() == pytest.approx([-170], abs=1e-4)
     with pytest.raises(ValueError, match="needs camera poses, and these data have none"):
         azimuths_deg(None)
 
@@ -145,7 +176,9 @@ def test_common_zoom_fills_the_picture_with_the_largest_shape_or_mask(egg) -> No
     zoom = common_zoom([(egg, cameras), (small, cameras)], no_masks)
     picture = draw_surface(egg, orbit(pose, turns, zoom=zoom), image_size=100)[0]
     columns = np.flatnonzero((picture < 250).any(axis=(0, 2)))
-    assert 1 <= columns[0] <= 4 and columns[-1] == 99 - columns[0]  # 5 % of the half side are left free
+    assert (
+        1 <= columns[0] <= 4 and columns[-1] == 99 - columns[0]
+    )  # 5 % of the half side are left free
     masks = no_masks.clone()
     masks[0, 16:48, 20:56] = 1.0  # reaches 24 / 32 of the half side
     assert common_zoom([(small, cameras)], masks) == pytest.approx(0.95 / (23.5 / 32), rel=1e-6)
@@ -182,7 +215,13 @@ def test_a_sheet_has_titles_free_places_and_rules() -> None:
     assert plain.shape == (2 * step + MARGIN, 2 * step + MARGIN, 3)
     assert plain[MARGIN + 5, MARGIN + 5].tolist() == [0, 0, 0]
     assert (plain[: step - 1, step + MARGIN :] == 255).all()  # the free place
-    titled = tile([[black, None], [black, black]], ["a", "b"], tile_size=20, row_titles=["one", "two"], rules=[1])
+    titled = tile(
+        [[black, None], [black, black]],
+        ["a", "b"],
+        tile_size=20,
+        row_titles=["one", "two"],
+        rules=[1],
+    )
     left = titled.shape[1] - plain.shape[1]
     assert left > 10 and titled.shape[0] == plain.shape[0] + HEADER
     assert (titled[:HEADER] < 128).any() and (titled[HEADER:, :left] < 128).any()
@@ -196,7 +235,12 @@ def test_png_and_gif_can_be_read_back(tmp_path, egg) -> None:
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), frames[0])
     save_gif(tmp_path / "a.gif", frames, frames_per_second=10)
     with Image.open(tmp_path / "a.gif") as image:
-        assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (3, (32, 32), 100, 0)
+        assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (
+            3,
+            (32, 32),
+            100,
+            0,
+        )
         assert np.abs(np.asarray(image.convert("RGB")).astype(int) - frames[0]).max() <= 16
 
 
@@ -213,6 +257,10 @@ def test_contact_sheets_name_their_columns_and_splits() -> None:
 
 
 def test_voxels_of_a_contact_sheet_do_not_touch_those_of_the_next_row() -> None:
-    row = make_row(np.full((1, 64, 64, 3), 255, np.uint8), np.zeros((1, 64, 64), np.uint8), np.ones((32, 32, 32), bool))
+    row = make_row(
+        np.full((1, 64, 64, 3), 255, np.uint8),
+        np.zeros((1, 64, 64), np.uint8),
+        np.ones((32, 32, 32), bool),
+    )
     column = draw_sheet({"train": [row, row]}, 1)[22:, -36]
     assert (column[:64] == 0).all() and (column[64:68] > 0).all() and (column[68:132] == 0).all()

@@ -39,8 +39,12 @@ def test_load_method_opens_a_run_for_use(finished_run) -> None:
     method, config, about = checkpoint.load_method(finished_run, "last")
     assert torch.equal(torch.get_rng_state(), random)
     tensors, _ = checkpoint.load(finished_run / "last.safetensors")
-    assert torch.equal(method.networks["encoder"].layers[0].weight, tensors["network.encoder.layers.0.weight"])
-    assert not any(p.requires_grad for network in method.networks.values() for p in network.parameters())
+    assert torch.equal(
+        method.networks["encoder"].layers[0].weight, tensors["network.encoder.layers.0.weight"]
+    )
+    assert not any(
+        p.requires_grad for network in method.networks.values() for p in network.parameters()
+    )
     assert not method.networks.training
     assert (config.category, about.progress.step) == ("airplane", 4)
     assert about.versions["torch"] == torch.__version__
@@ -65,7 +69,9 @@ def test_a_flipped_bit_in_any_byte_is_found(tmp_path) -> None:
     content = path.read_bytes()
     for position in range(len(content)):
         bit = 1 << position % 8
-        path.write_bytes(content[:position] + bytes([content[position] ^ bit]) + content[position + 1 :])
+        path.write_bytes(
+            content[:position] + bytes([content[position] ^ bit]) + content[position + 1 :]
+        )
         with pytest.raises(DamagedFile):
             checkpoint.load(path)
 
@@ -90,7 +96,9 @@ def test_metadata_of_another_form(tmp_path, change, message: str) -> None:
     header = {"learn3d": text, "crc32": f"{zlib.crc32(text.encode()):08x}"}
     save_file({}, tmp_path / "a.safetensors", metadata=header)
     for read in (checkpoint.load, checkpoint.load_metadata):
-        with pytest.raises(ValueError, match=f"a.safetensors is no checkpoint of this version.*{message}"):
+        with pytest.raises(
+            ValueError, match=f"a.safetensors is no checkpoint of this version.*{message}"
+        ):
             read(tmp_path / "a.safetensors")
 
 
@@ -105,7 +113,8 @@ class StandIn:
 
 
 @pytest.mark.parametrize(
-    "change", [{"network.encoder.weight": torch.zeros(3, 2)}, {"network.encoder.more": torch.zeros(1)}]
+    "change",
+    [{"network.encoder.weight": torch.zeros(3, 2)}, {"network.encoder.more": torch.zeros(1)}],
 )
 def test_weights_that_do_not_fit(change: dict[str, torch.Tensor]) -> None:
     tensors = checkpoint.network_tensors(StandIn()) | change
@@ -151,7 +160,9 @@ def test_any_optimizer_goes_on_as_if_it_had_not_been_saved(tmp_path, make) -> No
             optimizer.step()
         return [p.detach().clone() for p in network.parameters()]
 
-    network, other = (torch.nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last) for _ in range(2))
+    network, other = (
+        torch.nn.Conv2d(3, 4, 3).to(memory_format=torch.channels_last) for _ in range(2)
+    )
     optimizer, resumed = make(network.parameters()), make(other.parameters())
     steps(network, optimizer)
     tensors = checkpoint.optimizer_tensors("encoder", optimizer)
@@ -159,7 +170,10 @@ def test_any_optimizer_goes_on_as_if_it_had_not_been_saved(tmp_path, make) -> No
     loaded, _ = checkpoint.load(tmp_path / "a.safetensors")
     other.load_state_dict(network.state_dict())
     checkpoint.restore_optimizer("encoder", resumed, loaded, tmp_path)
-    assert all(torch.equal(a, b) for a, b in zip(steps(network, optimizer), steps(other, resumed), strict=True))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(steps(network, optimizer), steps(other, resumed), strict=True)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -197,20 +211,29 @@ def contents(folder: Path) -> dict[Path, bytes]:
         (lambda path: path.write_bytes(b""), "is damaged or was cut short"),
         (lambda path: torch.save({"x": torch.zeros(1)}, path), "is damaged or was cut short"),
         (flip, "has changed since it was written (another CRC-32)"),
-        (lambda path: save_file({"x": torch.zeros(1)}, path), "is a safetensors file, but not a checkpoint of learn3d"),
+        (
+            lambda path: save_file({"x": torch.zeros(1)}, path),
+            "is a safetensors file, but not a checkpoint of learn3d",
+        ),
         (Path.unlink, "going on from the checkpoint before it"),
     ],
 )
-def test_the_checkpoint_before_is_used(tiny_run, undisturbed, stopped, run_folder, capsys, damage, said: str) -> None:
+def test_the_checkpoint_before_is_used(
+    tiny_run, undisturbed, stopped, run_folder, capsys, damage, said: str
+) -> None:
     shutil.copytree(stopped, run_folder)
     damage(run_folder / "last.safetensors")
     assert train(tiny_run(run_folder), resume=True).finished
     shown = capsys.readouterr().err
-    assert all(text in shown for text in (said, "the steps since then are repeated", "resuming at step 2"))
+    assert all(
+        text in shown for text in (said, "the steps since then are repeated", "resuming at step 2")
+    )
     check_same(run_folder, undisturbed)
 
 
-def test_a_checkpoint_that_cannot_be_reached_is_no_damage(tiny_run, stopped, run_folder, monkeypatch) -> None:
+def test_a_checkpoint_that_cannot_be_reached_is_no_damage(
+    tiny_run, stopped, run_folder, monkeypatch
+) -> None:
     def away(*_, **__):
         raise OSError(errno.ESTALE, "Stale file handle")
 
@@ -221,30 +244,43 @@ def test_a_checkpoint_that_cannot_be_reached_is_no_damage(tiny_run, stopped, run
     assert contents(run_folder) == before
 
 
-def test_when_none_is_whole_the_run_says_so_and_leaves_all_as_it_is(tiny_run, stopped, run_folder) -> None:
+def test_when_none_is_whole_the_run_says_so_and_leaves_all_as_it_is(
+    tiny_run, stopped, run_folder
+) -> None:
     for path in shutil.copytree(stopped, run_folder).glob("*.safetensors"):
         cut(path)
     before = contents(run_folder)
-    with pytest.raises(ValueError, match=r"last.safetensors: is damaged .*previous.safetensors: is .*no checkpoint is"):
+    with pytest.raises(
+        ValueError,
+        match=r"last.safetensors: is damaged .*previous.safetensors: is .*no checkpoint is",
+    ):
         train(tiny_run(run_folder), resume=True)
     assert contents(run_folder) == before
 
 
 @pytest.mark.parametrize("kind", ["weights", "moments"])
-def test_values_that_are_not_finite_are_not_saved(tiny_run, stopped, run_folder, monkeypatch, kind: str) -> None:
+def test_values_that_are_not_finite_are_not_saved(
+    tiny_run, stopped, run_folder, monkeypatch, kind: str
+) -> None:
     """Adam's second moment overflows long before a weight does: its square is 1e42 for a gradient of 1e21."""
     before = (shutil.copytree(stopped, run_folder) / "last.safetensors").read_bytes()
     real = training.take_step
 
     def explode(method, batch, step):
         losses, parameter = real(method, batch, step), next(method.encoder.parameters())
-        target = parameter.data if kind == "weights" else method.optimizers["encoder"].state[parameter]["exp_avg_sq"]
+        target = (
+            parameter.data
+            if kind == "weights"
+            else method.optimizers["encoder"].state[parameter]["exp_avg_sq"]
+        )
         if step == 6:
             target.fill_(math.inf)
         return losses
 
     monkeypatch.setattr(training, "take_step", explode)
-    with pytest.raises(FloatingPointError, match=r"encoder.* not finite.*the last good checkpoint is"):
+    with pytest.raises(
+        FloatingPointError, match=r"encoder.* not finite.*the last good checkpoint is"
+    ):
         train(tiny_run(run_folder, validate_every=100), resume=True)
     assert (run_folder / "last.safetensors").read_bytes() == before
     monkeypatch.undo()

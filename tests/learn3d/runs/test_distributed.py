@@ -22,7 +22,11 @@ from learn3d.runs import checkpoint, distributed
 SMALL = {"encoder": "conv-small", "generator": "sphere-small"}
 RUNS = {  # for each: its preset, options, and the bound of relative differences of losses and weights
     "proposed": ("peng2020-kato", SMALL, 1e-5),
-    "long": ("peng2020-kato", SMALL | {"iterations": 200, "validate_every": 100, "checkpoint_every": 100}, 1e-5),
+    "long": (
+        "peng2020-kato",
+        SMALL | {"iterations": 200, "validate_every": 100, "checkpoint_every": 100},
+        1e-5,
+    ),
     "plus": ("plus-kato", SMALL | {"symmetry": "x", "bank_size": 16, "lambda_view": 0.1}, 1e-5),
     "pairs": ("multi-view-kato", SMALL, 1e-5),
     "groups": ("many-views-kato", SMALL | {"symmetry": "x", "batch_size": 20}, 1e-5),
@@ -40,7 +44,11 @@ RUNS = {  # for each: its preset, options, and the bound of relative differences
     ),
     "prgan": (
         "gadelha2017-kato",
-        {"encoder_from_step": 3, "generator_channels": (2, 2, 2, 1), "discriminator_channels": (2, 2, 2, 2)},
+        {
+            "encoder_from_step": 3,
+            "generator_channels": (2, 2, 2, 1),
+            "discriminator_channels": (2, 2, 2, 2),
+        },
         1e-3,
     ),
 }
@@ -50,7 +58,11 @@ OFTEN = {"log_every": 1, "validate_every": 2, "checkpoint_every": 2, "pictures_e
 def run(tasks: list[dict], path: Path, ranks: int = 1) -> subprocess.CompletedProcess:
     """Run tasks of `train_ranks` in one process or in several ranks."""
     path.write_text(json.dumps(tasks))
-    torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"] if ranks > 1 else []
+    torchrun = (
+        ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
+        if ranks > 1
+        else []
+    )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *torchrun, train_ranks.__file__, path]
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
@@ -63,7 +75,10 @@ def task(config: TrainConfig, output: Path, **how: object) -> dict:
 def losses(metrics: list[dict]) -> dict[int, dict[str, float]]:
     """The losses of each step."""
     lines = [dict(line) for line in metrics if line["split"] == "train"]
-    return {line.pop("step"): {name: value for name, value in line.items() if name != "split"} for line in lines}
+    return {
+        line.pop("step"): {name: value for name, value in line.items() if name != "split"}
+        for line in lines
+    }
 
 
 def difference(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> float:
@@ -81,7 +96,9 @@ def folders(tiny_config, tmp_path_factory) -> tuple[Path, Path]:
         tasks = []
         for name, (preset, options, _) in RUNS.items():
             config = tiny_config(root, **{"preset": preset, "batch_size": 8} | OFTEN | options)
-            tasks.append(task(config, root / str(ranks) / name, rate=1e-4 if name == "long" else 3e-3))
+            tasks.append(
+                task(config, root / str(ranks) / name, rate=1e-4 if name == "long" else 3e-3)
+            )
         ended = run(tasks, root / f"{ranks}.json", ranks)
         assert ended.returncode == 0, ended.stderr
     return root / "1", root / "2"
@@ -101,22 +118,30 @@ def test_two_ranks_learn_what_one_process_learns(folders, read_metrics, name) ->
         assert two[step] == pytest.approx(values, rel=bound, abs=bound), step
     saved = [checkpoint.load(folder / name / "last.safetensors")[0] for folder in folders]
     assert difference(*saved) < bound
-    assert torch.equal(*(tensors["random.cpu"] for tensors in saved)), "random numbers do not depend on the ranks"
+    assert torch.equal(*(tensors["random.cpu"] for tensors in saved)), (
+        "random numbers do not depend on the ranks"
+    )
     files = [sorted(path.name for path in (folder / name).iterdir()) for folder in folders]
     assert files[0] == files[1]
 
 
-def test_a_run_continues_with_another_number_of_ranks(folders, tiny_config, tmp_path, read_metrics) -> None:
+def test_a_run_continues_with_another_number_of_ranks(
+    folders, tiny_config, tmp_path, read_metrics
+) -> None:
     config = tiny_config(tmp_path, **SMALL | OFTEN, batch_size=8, iterations=6)
     half = dataclasses.replace(config, iterations=4)
     for first, then in ((1, 2), (2, 1)):
         output = tmp_path / str(first)
         for ranks, steps, resume in ((first, half, False), (then, config, True)):
-            ended = run([task(steps, output, rate=3e-3, resume=resume)], tmp_path / "tasks.json", ranks)
+            ended = run(
+                [task(steps, output, rate=3e-3, resume=resume)], tmp_path / "tasks.json", ranks
+            )
             assert ended.returncode == 0, ended.stderr
     one, two = (losses(read_metrics(tmp_path / name)) for name in "12")
     assert list(one) == list(two) == [1, 2, 3, 4, 5, 6]
-    assert all(two[step] == pytest.approx(values, rel=1e-5, abs=1e-5) for step, values in one.items())
+    assert all(
+        two[step] == pytest.approx(values, rel=1e-5, abs=1e-5) for step, values in one.items()
+    )
 
 
 def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp_path) -> None:
@@ -129,7 +154,9 @@ def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp
         tasks = [task(config, tmp_path / "killed", kill=kill, resume=resume)]
         ended = run(tasks, tmp_path / "tasks.json", 2)
         assert ended.returncode == 1 and time.monotonic() - started < 60
-        assert f"rank {1 - kill[0]}: another rank ended or does not answer" in ended.stderr, ended.stderr
+        assert f"rank {1 - kill[0]}: another rank ended or does not answer" in ended.stderr, (
+            ended.stderr
+        )
         assert "--resume" in ended.stderr
         resume = (tmp_path / "killed" / "config.json").exists()
     ended = run([task(config, tmp_path / "killed", resume=resume)], tmp_path / "tasks.json", 2)

@@ -42,7 +42,9 @@ def full(*_: object, **__: object) -> None:
 
 
 @pytest.mark.parametrize("saves", [0, 1, 3])
-def test_full_disk_while_a_checkpoint_is_written(tiny_run, undisturbed, run_folder, monkeypatch, saves: int) -> None:
+def test_full_disk_while_a_checkpoint_is_written(
+    tiny_run, undisturbed, run_folder, monkeypatch, saves: int
+) -> None:
     save_file, done = checkpoint.save_file, []
 
     def fill(tensors, path, metadata) -> None:
@@ -58,7 +60,12 @@ def test_full_disk_while_a_checkpoint_is_written(tiny_run, undisturbed, run_fold
             train(tiny_run(run_folder))
     last = run_folder / "last.safetensors"
     good = f"the last good checkpoint is {last}" if last.exists() else "there is no checkpoint yet"
-    for part in ("No space left on device", " MB free", f"learn3d train --output {run_folder} --resume", good):
+    for part in (
+        "No space left on device",
+        " MB free",
+        f"learn3d train --output {run_folder} --resume",
+        good,
+    ):
         assert part in str(stop.value)
     assert not list(run_folder.rglob(".*"))
     if last.exists():
@@ -71,10 +78,16 @@ def test_full_disk_while_a_checkpoint_is_written(tiny_run, undisturbed, run_fold
 def test_a_disk_that_fails_stops_the_run_and_it_goes_on(
     tiny_run, undisturbed, run_folder, monkeypatch, what: str
 ) -> None:
-    broken = {"metrics": (log.json, "dumps"), "pictures": (training, "save_png"), "sync": (os, "fsync")}[what]
+    broken = {
+        "metrics": (log.json, "dumps"),
+        "pictures": (training, "save_png"),
+        "sync": (os, "fsync"),
+    }[what]
     with monkeypatch.context() as patch:
         before_step(patch, 4, lambda: patch.setattr(*broken, full))
-        with pytest.raises(OSError, match=r"No space left on device .*last good checkpoint is .*last.safetensors"):
+        with pytest.raises(
+            OSError, match=r"No space left on device .*last good checkpoint is .*last.safetensors"
+        ):
             train(tiny_run(run_folder))
     assert checkpoint.load(run_folder / "last.safetensors")[1].progress.step == 2
     assert train(tiny_run(run_folder), resume=True).finished
@@ -110,10 +123,15 @@ def test_a_disk_that_is_really_full(tiny_run, undisturbed, tmp_path) -> None:
 
 def test_places_that_cannot_be_written_to(tiny_run, tmp_path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=r"output folder .* cannot be written to \(Not a directory\); choose another"):
+    with pytest.raises(
+        OSError, match=r"output folder .* cannot be written to \(Not a directory\); choose another"
+    ):
         train(tiny_run(tmp_path / "file" / "run"))
     with small_disk(tmp_path / "disk", "1m", options=",ro") as disk:
-        with pytest.raises(OSError, match=r"cannot be written to \(Read-only file system\); choose another --output"):
+        with pytest.raises(
+            OSError,
+            match=r"cannot be written to \(Read-only file system\); choose another --output",
+        ):
             train(tiny_run(disk / "run"))
 
 
@@ -134,7 +152,9 @@ def test_a_clock_that_jumps(tiny_run, undisturbed, run_folder, monkeypatch) -> N
     for resume in (False, True):
         assert train(tiny_run(run_folder), resume=resume).finished == resume
         seconds.append(checkpoint.load_metadata(run_folder).progress.seconds)
-    assert 0 < seconds[0] < seconds[1] < time.monotonic() - started, "both parts count, and nothing else"
+    assert 0 < seconds[0] < seconds[1] < time.monotonic() - started, (
+        "both parts count, and nothing else"
+    )
     check_same(run_folder, undisturbed)
 
 
@@ -159,7 +179,9 @@ def test_a_closed_terminal_stops_the_run_in_good_order_but_under_nohup(
 
 
 @pytest.mark.parametrize("stream", [None, io.StringIO()])
-def test_without_a_terminal_at_all(tiny_run, run_folder, monkeypatch, stream: io.StringIO | None) -> None:
+def test_without_a_terminal_at_all(
+    tiny_run, run_folder, monkeypatch, stream: io.StringIO | None
+) -> None:
     if stream is not None:
         stream.close()
     monkeypatch.setattr(training, "draw", lambda *arguments: None)
@@ -167,7 +189,9 @@ def test_without_a_terminal_at_all(tiny_run, run_folder, monkeypatch, stream: io
     assert train(tiny_run(run_folder, iterations=2)).finished
 
 
-def test_tensorboard_that_cannot_be_loaded(tiny_run, undisturbed, run_folder, monkeypatch, capsys) -> None:
+def test_tensorboard_that_cannot_be_loaded(
+    tiny_run, undisturbed, run_folder, monkeypatch, capsys
+) -> None:
     import torch.utils.tensorboard
 
     def fail(*_: object, **__: object) -> None:
@@ -175,11 +199,16 @@ def test_tensorboard_that_cannot_be_loaded(tiny_run, undisturbed, run_folder, mo
 
     monkeypatch.setattr(torch.utils.tensorboard, "SummaryWriter", fail)
     assert train(tiny_run(run_folder)).finished
-    assert "warning: tensorboard does not work (Descriptors cannot be created directly)" in capsys.readouterr().err
+    assert (
+        "warning: tensorboard does not work (Descriptors cannot be created directly)"
+        in capsys.readouterr().err
+    )
     check_same(run_folder, undisturbed)
 
 
-def test_tensorboard_shows_every_step_once_after_a_kill(tiny_run, undisturbed, run_folder, monkeypatch) -> None:
+def test_tensorboard_shows_every_step_once_after_a_kill(
+    tiny_run, undisturbed, run_folder, monkeypatch
+) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     class Killed(BaseException):
@@ -188,7 +217,9 @@ def test_tensorboard_shows_every_step_once_after_a_kill(tiny_run, undisturbed, r
     def kill() -> None:
         raise Killed
 
-    monkeypatch.setattr(log.RunLog, "__exit__", lambda *arguments: None)  # a killed process closes nothing
+    monkeypatch.setattr(
+        log.RunLog, "__exit__", lambda *arguments: None
+    )  # a killed process closes nothing
     before_step(monkeypatch, 6, kill)
     with pytest.raises(Killed):
         train(tiny_run(run_folder))
@@ -202,14 +233,22 @@ def test_tensorboard_shows_every_step_once_after_a_kill(tiny_run, undisturbed, r
         assert [event.step for event in events.Scalars("val/voxel_iou")] == [2, 4, 6]
 
 
-def test_resuming_before_the_first_checkpoint_starts_anew(tiny_run, undisturbed, run_folder, monkeypatch) -> None:
+def test_resuming_before_the_first_checkpoint_starts_anew(
+    tiny_run, undisturbed, run_folder, monkeypatch
+) -> None:
     before_step(monkeypatch, 2, full)
     with pytest.raises(OSError, match="there is no checkpoint yet"):
         train(tiny_run(run_folder))
     assert json.loads((run_folder / "metrics.jsonl").read_text().splitlines()[0])["step"] == 1
-    with pytest.raises(ValueError, match=r"cannot resume with different options .*batch_size: 2 in the run, 4 asked"):
+    with pytest.raises(
+        ValueError,
+        match=r"cannot resume with different options .*batch_size: 2 in the run, 4 asked",
+    ):
         train(tiny_run(run_folder, batch_size=4), resume=True)
-    for name in (".best.safetensors.partial", "pictures/.x.partial"):  # half written when a run was killed
+    for name in (
+        ".best.safetensors.partial",
+        "pictures/.x.partial",
+    ):  # half written when a run was killed
         (run_folder / name).parent.mkdir(exist_ok=True)
         (run_folder / name).write_text("half")
     assert train(tiny_run(run_folder), resume=True).finished

@@ -37,7 +37,9 @@ def test_a_folder_in_use_is_refused_and_a_killed_process_does_not_hold_it(tmp_pa
     command = [sys.executable, "-c", HOLDER, str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=tmp_path) as holder:
         assert holder.stdout.readline() == b"mine\n"
-        with pytest.raises(OSError, match=r"another process works in .*run; wait for it, or stop it"):
+        with pytest.raises(
+            OSError, match=r"another process works in .*run; wait for it, or stop it"
+        ):
             with run_folder.lock_folder(folder):
                 pass
         holder.send_signal(signal.SIGKILL)
@@ -63,7 +65,13 @@ def test_the_last_two_checkpoints_are_kept(tiny_run, tmp_path, monkeypatch, link
 
 def make_run(folder: Path, config: bool = True) -> Path:
     """The files of a run, and one of the user's."""
-    for name in ("last.safetensors", "metrics.jsonl", "pictures/000010.png", "pictures/holiday.jpg", ".x.partial"):
+    for name in (
+        "last.safetensors",
+        "metrics.jsonl",
+        "pictures/000010.png",
+        "pictures/holiday.jpg",
+        ".x.partial",
+    ):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(name)
     if config:
@@ -84,7 +92,9 @@ def test_a_run_is_replaced_only_when_asked_and_other_files_stay(tmp_path) -> Non
         run_folder.remove_old_run(tmp_path, overwrite=False)
     run_folder.remove_old_run(tmp_path, overwrite=True)
     assert files(tmp_path) == ["pictures/holiday.jpg"]
-    with pytest.raises(ValueError, match="is not empty; choose another folder, or add the run to the files there"):
+    with pytest.raises(
+        ValueError, match="is not empty; choose another folder, or add the run to the files there"
+    ):
         run_folder.remove_old_run(tmp_path, overwrite=False)
     run_folder.remove_old_run(tmp_path, overwrite=True)
     shutil.rmtree(tmp_path / "pictures")
@@ -96,13 +106,18 @@ def test_a_run_is_replaced_only_when_asked_and_other_files_stay(tmp_path) -> Non
 @pytest.mark.parametrize("overwrite", [True, False])
 def test_what_is_not_a_run_is_not_replaced(tmp_path, overwrite: bool) -> None:
     before = files(make_run(tmp_path, config=False))
-    with pytest.raises(ValueError, match=r"has last.safetensors, but no run that it could belong to; choose another"):
+    with pytest.raises(
+        ValueError,
+        match=r"has last.safetensors, but no run that it could belong to; choose another",
+    ):
         run_folder.remove_old_run(tmp_path, overwrite)
     assert files(tmp_path) == before
 
 
 @pytest.mark.parametrize("removals", range(4))
-def test_a_kill_while_a_run_is_replaced_leaves_a_run_that_begins_anew(tmp_path, monkeypatch, removals: int) -> None:
+def test_a_kill_while_a_run_is_replaced_leaves_a_run_that_begins_anew(
+    tmp_path, monkeypatch, removals: int
+) -> None:
     make_run(tmp_path)
     unlink, removed = Path.unlink, []
 
@@ -126,7 +141,9 @@ def test_a_kill_while_a_run_is_replaced_leaves_a_run_that_begins_anew(tmp_path, 
     ("started", "program"),
     [("tools/train.py", ["python", "tools/train.py"]), ("/usr/bin/learn3d", ["learn3d", "train"])],
 )
-def test_the_command_to_continue_is_the_one_that_ran(tmp_path, monkeypatch, started: str, program: list[str]) -> None:
+def test_the_command_to_continue_is_the_one_that_ran(
+    tmp_path, monkeypatch, started: str, program: list[str]
+) -> None:
     monkeypatch.setattr(sys, "argv", [started])
     words = shlex.split(run_folder.resume_command(tmp_path / "my runs" / "it's"))
     assert words == [*program, "--output", str(tmp_path / "my runs" / "it's"), "--resume"]
@@ -147,10 +164,17 @@ def test_a_link_is_replaced_and_a_pipe_refused(tmp_path, tiny_config) -> None:
         RunLog(tiny_config(path.parent, iterations=10), start=0)
 
 
-def test_elsewhere_it_prints_few_lines_with_means_of_losses_that_take_turns(tmp_path, tiny_config, capsys) -> None:
+def test_elsewhere_it_prints_few_lines_with_means_of_losses_that_take_turns(
+    tmp_path, tiny_config, capsys
+) -> None:
     with RunLog(tiny_config(tmp_path, iterations=100), start=4) as log:
         for step in range(5, 101):
-            log.step(step, {"total": 3.0, "classification": 2.0} if step % 2 else {"total": 1.0, "confusion": 1.0})
+            log.step(
+                step,
+                {"total": 3.0, "classification": 2.0}
+                if step % 2
+                else {"total": 1.0, "confusion": 1.0},
+            )
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
     assert lines[0].startswith("step 5/100  total 3  classification 2")
@@ -171,12 +195,18 @@ def test_metrics_can_be_read_back_and_later_or_damaged_ones_are_dropped(
             file.write(damaged)
     with RunLog(tiny_config(tmp_path, iterations=9), start=3):
         pass
-    assert [(m["step"], m["split"]) for m in read_metrics(tmp_path)] == [(1, "train"), (2, "train"), (3, "val")]
+    assert [(m["step"], m["split"]) for m in read_metrics(tmp_path)] == [
+        (1, "train"),
+        (2, "train"),
+        (3, "val"),
+    ]
     assert read_metrics(tmp_path)[1]["total"] == 1.5
 
 
 @pytest.mark.usefixtures("tiny_names")
-def test_wandb_is_one_run_with_the_options_numbers_and_pictures(tiny_run, run_folder, monkeypatch) -> None:
+def test_wandb_is_one_run_with_the_options_numbers_and_pictures(
+    tiny_run, run_folder, monkeypatch
+) -> None:
     started, shown, finished = [], [], []
     run = types.SimpleNamespace(
         log=lambda values, step: shown.append((step, values)), finish=lambda: finished.append(1)
@@ -188,17 +218,30 @@ def test_wandb_is_one_run_with_the_options_numbers_and_pictures(tiny_run, run_fo
     monkeypatch.setitem(sys.modules, "wandb", fake)
     for steps in (2, 4):
         assert train(tiny_run(run_folder, log="wandb", iterations=steps), resume=steps > 2).finished
-    assert len(finished) == 2 and started[0]["id"] == started[1]["id"] and started[1]["resume"] == "allow"
+    assert (
+        len(finished) == 2
+        and started[0]["id"] == started[1]["id"]
+        and started[1]["resume"] == "allow"
+    )
     assert started[0]["config"]["batch_size"] == 2 and started[0]["name"] == "run"
     assert [step for step, values in shown if "train/total" in values] == [1, 2, 3, 4]
-    assert [(step, values["val"][2]) for step, values in shown if "val" in values] == [(2, 3), (4, 3)]
+    assert [(step, values["val"][2]) for step, values in shown if "val" in values] == [
+        (2, 3),
+        (4, 3),
+    ]
     fake.init = lambda **options: (_ for _ in ()).throw(RuntimeError("no API key"))
-    with pytest.raises(ValueError, match=r"log 'wandb' cannot begin a run \(no API key\); call `wandb login`, or"):
+    with pytest.raises(
+        ValueError, match=r"log 'wandb' cannot begin a run \(no API key\); call `wandb login`, or"
+    ):
         train(tiny_run(run_folder, log="wandb", iterations=6), resume=True)
 
 
-def test_wandb_that_is_not_installed_is_an_error_before_anything_is_written(tiny_run, run_folder, monkeypatch) -> None:
+def test_wandb_that_is_not_installed_is_an_error_before_anything_is_written(
+    tiny_run, run_folder, monkeypatch
+) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(ValueError, match="log 'wandb' needs the package wandb: pip install wandb, or choose"):
+    with pytest.raises(
+        ValueError, match="log 'wandb' needs the package wandb: pip install wandb, or choose"
+    ):
         train(tiny_run(run_folder, log="wandb"))
     assert not run_folder.exists()

@@ -55,7 +55,9 @@ def uninterrupted(server, tiny_folder, tmp_path_factory) -> tuple[TrainConfig, f
     where = {"data": folder, "category": "airplane", "preset": "peng2020-kato"}
     for seed in range(40):
         output = folder / f"seed{seed}"
-        config = configure(**where, output=output, settings=settings, iterations=10, seed=seed, **fixed, **often)
+        config = configure(
+            **where, output=output, settings=settings, iterations=10, seed=seed, **fixed, **often
+        )
         started = time.monotonic()
         answer = server(config)
         assert answer["status"] == 0, output.with_suffix(".log").read_text()
@@ -81,14 +83,20 @@ def test_killed_at_any_place(server, uninterrupted, wanted: int) -> None:
     assert things > 60
     while kills < wanted:
         chain += 1
-        config = dataclasses.replace(killed, output=killed.output.with_name(f"chain{wanted}-{chain}"))
-        first = 1 + (chain - 1) * things * 3 // wanted % things  # from the start again where chains were shorter
+        config = dataclasses.replace(
+            killed, output=killed.output.with_name(f"chain{wanted}-{chain}")
+        )
+        first = (
+            1 + (chain - 1) * things * 3 // wanted % things
+        )  # from the start again where chains were shorter
         for place in (first, rng.randint(1, things // 2), rng.randint(1, things)):
             resume = (config.output / "config.json").exists()
             answer = server(config, resume=resume, kill_at=place, half=rng.random() < 0.5)
             if answer["status"] == 0:  # it had less to do
                 break
-            assert answer["status"] == -signal.SIGKILL, config.output.with_suffix(".log").read_text()
+            assert answer["status"] == -signal.SIGKILL, config.output.with_suffix(
+                ".log"
+            ).read_text()
             kills += 1
             check_whole(config.output)
         answer = server(config, resume=(config.output / "config.json").exists())
@@ -121,7 +129,10 @@ def test_signals_at_any_time(server, uninterrupted) -> None:
         status = server(config, resume=(config.output / "config.json").exists(), **stop)["status"]
         check_whole(config.output)
         if status > 0:  # Python's own answer to SIGINT before the loop begins
-            assert number == signal.SIGINT and "KeyboardInterrupt" in config.output.with_suffix(".log").read_text()
+            assert (
+                number == signal.SIGINT
+                and "KeyboardInterrupt" in config.output.with_suffix(".log").read_text()
+            )
         else:
             assert status in (0, -number)
     assert server(config, resume=(config.output / "config.json").exists())["status"] == 0
@@ -131,8 +142,12 @@ def test_signals_at_any_time(server, uninterrupted) -> None:
 @pytest.mark.slow
 def test_the_command_killed_at_any_time(uninterrupted, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(training, "PICTURE_ROWS", 8)  # as the command draws them
-    gentle = dataclasses.replace(uninterrupted[0].settings, learning_rate=1e-4)  # networks of the usual size
-    reference = dataclasses.replace(uninterrupted[0], settings=gentle, output=tmp_path / "uninterrupted")
+    gentle = dataclasses.replace(
+        uninterrupted[0].settings, learning_rate=1e-4
+    )  # networks of the usual size
+    reference = dataclasses.replace(
+        uninterrupted[0], settings=gentle, output=tmp_path / "uninterrupted"
+    )
     train(reference)
     names = ("iterations", "seed", "batch_size", "precision", "threads", "max_val_images")
     names += ("log_every", "validate_every", "checkpoint_every", "pictures_every")
@@ -140,13 +155,22 @@ def test_the_command_killed_at_any_time(uninterrupted, tmp_path, monkeypatch) ->
     options += ["--encoder=conv-small", "--generator=sphere", "--learning-rate=1e-4"]
     options += [f"--data={reference.data}", "--category=airplane", "--preset=peng2020-kato"]
     run = tmp_path / "run"
-    script = [sys.executable, str(Path(__file__).parents[3] / "tools" / "train.py"), f"--output={run}"]
-    packages = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    script = [
+        sys.executable,
+        str(Path(__file__).parents[3] / "tools" / "train.py"),
+        f"--output={run}",
+    ]
+    packages = [
+        str(Path(learn3d.__file__).parents[1]),
+        *filter(None, [os.environ.get("PYTHONPATH")]),
+    ]
     environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
     rng = random.Random(SEED)
     for lines in (0, 4, 9, None):  # metrics.jsonl has 15
         command = [*script, "--resume"] if (run / "config.json").exists() else [*script, *options]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, env=environment, text=True) as process:
+        with subprocess.Popen(
+            command, stderr=subprocess.PIPE, env=environment, text=True
+        ) as process:
             deadline = time.monotonic() + 600
             while lines is not None and process.poll() is None and time.monotonic() < deadline:
                 metrics = run / "metrics.jsonl"

@@ -26,7 +26,9 @@ pytestmark = [
 ]
 
 STEPS, EVERY = 10_000, 100
-MEMORY_GROWTH = 1e6  # bytes between the middles of the first and the last third; a leaked scalar per step: 3e6
+MEMORY_GROWTH = (
+    1e6  # bytes between the middles of the first and the last third; a leaked scalar per step: 3e6
+)
 TIME_GROWTH = 1.3
 
 
@@ -34,9 +36,17 @@ def soak(tiny_run, tiny_folder: Path, folder: Path) -> list[dict[str, float]]:
     for path in tiny_folder.iterdir():
         with np.load(path) as archive:
             np.savez(folder / path.name, archive["arr_0"])
-    often = {"log_every": 10, "validate_every": 500, "checkpoint_every": 500, "pictures_every": 1000}
+    often = {
+        "log_every": 10,
+        "validate_every": 500,
+        "checkpoint_every": 500,
+        "pictures_every": 1000,
+    }
     config = tiny_run(folder / "run", data=folder, iterations=STEPS, **often)
-    packages = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    packages = [
+        str(Path(learn3d.__file__).parents[1]),
+        *filter(None, [os.environ.get("PYTHONPATH")]),
+    ]
     environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
     script = Path(__file__).parents[2] / "data" / "soak.py"
     command = [sys.executable, str(script), json.dumps(config_to_dict(config)), str(EVERY)]
@@ -62,11 +72,15 @@ def test_nothing_grows(tiny_run, tiny_folder, tmp_path) -> None:
         files = thirds(median, [sample["files"] for sample in samples])
         threads = thirds(median, [sample["threads"] for sample in samples])
         cpu = thirds(min, [sample["cpu"] for sample in samples])
-        print(f"resident {resident}, files {files}, threads {threads}, CPU seconds of {EVERY} steps {cpu}")
+        print(
+            f"resident {resident}, files {files}, threads {threads}, CPU seconds of {EVERY} steps {cpu}"
+        )
         assert files[0] == files[1] == samples[-1]["files"]
         assert threads[0] == threads[1]
         assert resident[1] - resident[0] < MEMORY_GROWTH
         assert len(list((folder / "run").rglob("*.safetensors"))) == 3
         if cpu[1] < TIME_GROWTH * cpu[0]:
             return
-    raise AssertionError(f"{EVERY} steps took {cpu[0]:.3f} s of CPU time in the first third, {cpu[1]:.3f} in the last")
+    raise AssertionError(
+        f"{EVERY} steps took {cpu[0]:.3f} s of CPU time in the first third, {cpu[1]:.3f} in the last"
+    )

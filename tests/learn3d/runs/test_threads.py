@@ -47,7 +47,11 @@ def test_the_faster_of_one_and_all_is_taken(many_cores, seconds, chosen: int, li
     assert (str(tuner), tuner.chosen) == ("16 threads or 1, whichever is faster", None)
     run(tuner, 1, lambda count: 60.0)  # the first step, which prepares everything, does not count
     assert run(tuner, 2 * TRIAL - 1, seconds) == [line]
-    assert (tuner.threads, tuner.chosen, str(tuner)) == (chosen, chosen, {1: "1 thread", 16: "16 threads"}[chosen])
+    assert (tuner.threads, tuner.chosen, str(tuner)) == (
+        chosen,
+        chosen,
+        {1: "1 thread", 16: "16 threads"}[chosen],
+    )
     assert run(tuner, 500, seconds) == [], "steps as fast as before change nothing"
 
 

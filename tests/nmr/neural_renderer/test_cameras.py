@@ -19,7 +19,9 @@ CASES = {
     "perspective_30": lambda vertices: nr.perspective(vertices),
     "perspective_15": lambda vertices: nr.perspective(vertices, 15),
     "perspective_14.9314": lambda vertices: nr.perspective(vertices, angle=14.9314),
-    "projection": lambda **arguments: nr.projection(**arguments, orig_size=float(V["projection_orig_size"])),
+    "projection": lambda **arguments: nr.projection(
+        **arguments, orig_size=float(V["projection_orig_size"])
+    ),
 }
 
 
@@ -62,6 +64,8 @@ def test_projection_takes_matrices_of_every_shape():
     torch.testing.assert_close(expected, by_hand)
     for shape in [(1, 3), (2, 3), (1, 1, 3), (2, 1, 3)]:
         given = np.broadcast_to(t, shape).copy()
-        torch.testing.assert_close(nr.projection(vertices, K[None], R[None], given, [[0] * 5], 256), expected)
+        torch.testing.assert_close(
+            nr.projection(vertices, K[None], R[None], given, [[0] * 5], 256), expected
+        )
     sizes = torch.tensor([256.0, 512.0])
     torch.testing.assert_close(nr.projection(vertices, K, R, t, [0] * 5, sizes)[0], expected[0])

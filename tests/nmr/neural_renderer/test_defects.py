@@ -12,7 +12,9 @@ from nmr.neural_renderer.load_obj import bake_textures
 def scene(batch=2, ts=2, dtype=torch.float32):
     vertices, faces = nmr.icosphere(1)
     generator = torch.Generator().manual_seed(0)
-    vertices = vertices.to(dtype) * (0.8 + 0.2 * torch.rand(batch, len(vertices), 1, generator=generator, dtype=dtype))
+    vertices = vertices.to(dtype) * (
+        0.8 + 0.2 * torch.rand(batch, len(vertices), 1, generator=generator, dtype=dtype)
+    )
     textures = torch.rand(batch, len(faces), ts, ts, ts, 3, generator=generator, dtype=dtype)
     return vertices, faces.expand(batch, -1, -1), textures
 
@@ -28,7 +30,9 @@ def test_light_on_three_faces():
     together = nr.lighting(faces, textures, direction=(0.3, 0.5, 0.8))
     for b in range(3):
         one = slice(b, b + 1)
-        torch.testing.assert_close(together[one], nr.lighting(faces[one], textures[one], direction=(0.3, 0.5, 0.8)))
+        torch.testing.assert_close(
+            together[one], nr.lighting(faces[one], textures[one], direction=(0.3, 0.5, 0.8))
+        )
 
 
 @pytest.mark.parametrize("fill_back", [True, False])
@@ -57,7 +61,8 @@ def test_texture_coordinates_of_exactly_0_and_1(wrapping):
     if wrapping == "REPEAT":
         odd = np.array([[[1, 1], [2, 1], [2, 2]]], dtype=np.float32)
         assert np.array_equal(
-            bake_textures(image, odd, 4, wrapping, True), bake_textures(image, odd - 1, 4, wrapping, True)
+            bake_textures(image, odd, 4, wrapping, True),
+            bake_textures(image, odd - 1, 4, wrapping, True),
         )
 
 

@@ -10,7 +10,13 @@ import nmr.neural_renderer as nr
 
 
 def settings_of(v):
-    names = ("intensity_ambient", "intensity_directional", "color_ambient", "color_directional", "direction")
+    names = (
+        "intensity_ambient",
+        "intensity_directional",
+        "color_ambient",
+        "color_directional",
+        "direction",
+    )
     return {name: v[name].tolist() for name in names}
 
 
@@ -21,7 +27,9 @@ def test_values_and_gradients():
     torch.testing.assert_close(out, torch.from_numpy(v["out"]), rtol=0, atol=1e-6)
     out.backward(torch.from_numpy(v["upstream"]))
     torch.testing.assert_close(faces.grad, torch.from_numpy(v["grad_faces"]), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(textures.grad, torch.from_numpy(v["grad_textures"]), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        textures.grad, torch.from_numpy(v["grad_textures"]), rtol=1e-5, atol=1e-6
+    )
 
 
 def test_colours_and_direction_per_image_in_any_container():
@@ -59,7 +67,11 @@ def test_fromobj(tmp_path):
 def test_batches_share_memory_and_gradients():
     mesh = nr.Mesh(*nmr.icosphere(0), texture_size=2)
     vertices, faces, textures = mesh.get_batch(3)
-    assert vertices.shape == (3, 12, 3) and faces.shape == (3, 20, 3) and textures.shape == (3, 20, 2, 2, 2, 3)
+    assert (
+        vertices.shape == (3, 12, 3)
+        and faces.shape == (3, 20, 3)
+        and textures.shape == (3, 20, 2, 2, 2, 3)
+    )
     textures.sum().backward()
     assert torch.all(mesh.textures.grad > 0)
 

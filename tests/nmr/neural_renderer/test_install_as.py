@@ -61,7 +61,10 @@ def test_code_of_others_runs_unchanged(tmp_path):
     nr.install_as("neural_renderer")
     train = importlib.import_module("body.train")
     vertices, faces = nmr.icosphere(1)
-    assert 0.05 < train.mask(0.5 * vertices[None], faces[None]).mean() < 0.9 and train.load_obj is nr.load_obj
+    assert (
+        0.05 < train.mask(0.5 * vertices[None], faces[None]).mean() < 0.9
+        and train.load_obj is nr.load_obj
+    )
 
 
 def test_a_script_runs_untouched(tmp_path):
@@ -103,12 +106,19 @@ def test_other_names_and_second_calls():
 
 
 def test_a_copy_inside_of_a_package(tmp_path):
-    package(tmp_path, "body", **{"__init__.py": "", "fit.py": "from .external.neural_renderer import projection\n"})
+    package(
+        tmp_path,
+        "body",
+        **{"__init__.py": "", "fit.py": "from .external.neural_renderer import projection\n"},
+    )
     package(tmp_path / "body", "external", **{"__init__.py": ""})
     nr.install_as("body.external.neural_renderer")
     assert importlib.import_module("body.fit").projection is nr.projection
     namespace = {}
-    exec("import body.external.neural_renderer as nr\nfrom body.external import neural_renderer as same", namespace)
+    exec(
+        "import body.external.neural_renderer as nr\nfrom body.external import neural_renderer as same",
+        namespace,
+    )
     assert namespace["nr"] is namespace["same"] is nr
 
 
@@ -116,7 +126,10 @@ def test_a_copy_inside_of_a_package(tmp_path):
 def test_a_copy_inside_of_a_package_that_does_not_exist(parent):
     nr.install_as(f"{parent}.neural_renderer")
     namespace = {}
-    exec(f"import {parent}.neural_renderer as nr\nfrom {parent} import neural_renderer as same", namespace)
+    exec(
+        f"import {parent}.neural_renderer as nr\nfrom {parent} import neural_renderer as same",
+        namespace,
+    )
     assert namespace["nr"] is namespace["same"] is nr
     assert importlib.import_module(f"{parent}.neural_renderer.look").look is nr.look
 
@@ -125,18 +138,28 @@ def test_an_alias_by_hand_has_its_modules():
     sys.modules["nmr_alias"] = nr
     vertices, faces = nmr.icosphere(1)
     rasterize = importlib.import_module("nmr_alias.rasterize").rasterize_silhouettes
-    corners = importlib.import_module("nmr_alias.vertices_to_faces").vertices_to_faces(vertices[None], faces[None])
+    corners = importlib.import_module("nmr_alias.vertices_to_faces").vertices_to_faces(
+        vertices[None], faces[None]
+    )
     assert rasterize(corners, image_size=16).any()
-    assert callable(nr.rasterize) and callable(nr.vertices_to_faces), "the functions of these names are not replaced"
+    assert callable(nr.rasterize) and callable(nr.vertices_to_faces), (
+        "the functions of these names are not replaced"
+    )
 
 
 @pytest.mark.parametrize("imported", [False, True])
 def test_another_package_is_not_shadowed_in_silence(tmp_path, imported):
-    package(tmp_path, "neural_renderer", **{"__init__.py": "from .look import answer", "look.py": "answer = 42"})
+    package(
+        tmp_path,
+        "neural_renderer",
+        **{"__init__.py": "from .look import answer", "look.py": "answer = 42"},
+    )
     if imported:
         importlib.import_module("neural_renderer")
     message = "already imported from" if imported else "neural_renderer, .*__init__"
-    with pytest.raises(ImportError, match=rf"{message}.*pip uninstall neural_renderer_pytorch.*replace=True"):
+    with pytest.raises(
+        ImportError, match=rf"{message}.*pip uninstall neural_renderer_pytorch.*replace=True"
+    ):
         nr.install_as()
     other = importlib.import_module("neural_renderer")
     assert other is not nr and other.answer == 42

@@ -12,7 +12,12 @@ from vectors import load_vector, vector_names
 import nmr
 import nmr.neural_renderer as nr
 from nmr.neural_renderer._images import read_image
-from nmr.neural_renderer.load_obj import bake_textures, load_mtl, load_textures, texture_wrapping_dict
+from nmr.neural_renderer.load_obj import (
+    bake_textures,
+    load_mtl,
+    load_textures,
+    texture_wrapping_dict,
+)
 from nmr.neural_renderer.save_obj import create_texture_image
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -29,7 +34,9 @@ def test_vertices_and_faces(tmp_path):
     path = write(tmp_path, a_obj=str(v["text"]))
     vertices, faces = nr.load_obj(path, normalization=False)
     assert vertices.dtype == torch.float32 and faces.dtype == torch.int32
-    assert np.array_equal(vertices.numpy(), v["vertices_raw"]) and np.array_equal(faces.numpy(), v["faces"])
+    assert np.array_equal(vertices.numpy(), v["vertices_raw"]) and np.array_equal(
+        faces.numpy(), v["faces"]
+    )
     vertices, _ = nr.load_obj(path)
     np.testing.assert_allclose(vertices.numpy(), v["vertices_normalized"], atol=1e-6)
 
@@ -38,7 +45,9 @@ def test_vertices_and_faces(tmp_path):
 def test_bake_textures(name):
     v = load_vector(name)
     # The vectors' image starts at the bottom, as the kernel gets it.
-    baked = bake_textures(v["image"][::-1], v["uv"], int(v["texture_size"]), str(v["wrapping"]), bool(v["bilinear"]))
+    baked = bake_textures(
+        v["image"][::-1], v["uv"], int(v["texture_size"]), str(v["wrapping"]), bool(v["bilinear"])
+    )
     chosen = v["is_update"] == 1
     np.testing.assert_allclose(baked[chosen], v["textures"][chosen], atol=1e-5)
 
@@ -79,7 +88,10 @@ def test_lines_that_the_published_function_accepts(tmp_path, lines):
         (TRIANGLE + "f\n", "a face needs corners"),
         (TRIANGLE + "f a b c\n", "line 4.*cannot be read"),
         (TRIANGLE + "f 1 1 " + "9" * 400 + "\n", "cannot be read"),
-        (TRIANGLE + "vt 0 0\nf 1/1 2/1 3/3\n", "line 5: .* refers to texture coordinate 3, but there are 1"),
+        (
+            TRIANGLE + "vt 0 0\nf 1/1 2/1 3/3\n",
+            "line 5: .* refers to texture coordinate 3, but there are 1",
+        ),
         ((TRIANGLE + "f 1 2 3\n").encode("utf-16").decode("latin-1"), "UTF-16"),
         (TRIANGLE + "vt\nf 1 2 3\n", "line 4.*2 numbers are needed"),
         (TRIANGLE + "f 1 2 3\n", "names no .mtl file"),
@@ -109,10 +121,16 @@ def materials(tmp_path):
 def test_textures_of_materials(tmp_path):
     path, pixels = materials(tmp_path)
     _, faces, textures = nr.load_obj(path, texture_size=2, load_texture=True)
-    assert faces.shape == (4, 3) and textures.shape == (4, 2, 2, 2, 3) and textures.dtype == torch.float32
+    assert (
+        faces.shape == (4, 3)
+        and textures.shape == (4, 2, 2, 2, 3)
+        and textures.dtype == torch.float32
+    )
     assert torch.all(textures[0] == 0.5)
     assert torch.all(textures[1] == torch.tensor([1, 0, 0.25]))
-    for index, pixel in zip([(1, 0, 0), (0, 1, 0), (0, 0, 1)], [(7, 0), (7, 7), (0, 7)], strict=True):
+    for index, pixel in zip(
+        [(1, 0, 0), (0, 1, 0), (0, 0, 1)], [(7, 0), (7, 7), (0, 7)], strict=True
+    ):
         np.testing.assert_allclose(textures[2][index].numpy(), pixels[pixel] / 255, atol=1e-5)
     assert torch.all(textures[3] == torch.tensor([0, 0, 1.0]))
 
@@ -129,7 +147,9 @@ def test_names_options_and_comments(tmp_path, monkeypatch, library, used, made, 
     """Without a material of the whole name, the first word is the name, as published. Alpha is dropped."""
     image_module = pytest.importorskip("PIL.Image")
     color = {"RGB": (51, 51, 51), "RGBA": (51, 51, 51, 0), "L": 51}[mode]
-    image_module.new(mode, (2, 2), color).save(tmp_path / ("wood #1.png" if "#1" in image else "wood.png"))
+    image_module.new(mode, (2, 2), color).save(
+        tmp_path / ("wood #1.png" if "#1" in image else "wood.png")
+    )
     obj = f"mtllib {library}\n{TRIANGLE}vt 0.5\nusemtl {used}\nf 1/1 2/1 3/1\n"
     mtl = f"newmtl blue\nKd 0 0 1\n\nnewmtl {made}\nKd 1 0 0 # red\nmap_Kd {image}\n"
     write(tmp_path, a_obj=obj, a_mtl=mtl)
@@ -142,7 +162,9 @@ def test_names_options_and_comments(tmp_path, monkeypatch, library, used, made, 
 def test_images_of_16_bits(tmp_path):
     image_module = pytest.importorskip("PIL.Image")
     image_module.fromarray(np.full((2, 2), 13107, dtype=np.uint16)).save(tmp_path / "deep.png")
-    np.testing.assert_allclose(read_image(str(tmp_path / "deep.png")), np.full((2, 2, 3), 0.2), atol=1e-6)
+    np.testing.assert_allclose(
+        read_image(str(tmp_path / "deep.png")), np.full((2, 2, 3), 0.2), atol=1e-6
+    )
 
 
 def test_textures_of_another_material_file(tmp_path):
@@ -150,8 +172,16 @@ def test_textures_of_another_material_file(tmp_path):
     textures = nr.load_obj(path, texture_size=2, load_texture=True)[2]
     assert torch.equal(load_textures(path, tmp_path / "a.mtl", 2), textures)
     (tmp_path / "b.mtl").write_text("newmtl red\nKd 0 1 0\n")
-    assert torch.all(load_textures(path, tmp_path / "b.mtl", 2, use_bilinear=False)[1] == torch.tensor([0, 1.0, 0]))
-    assert texture_wrapping_dict == {"REPEAT": 0, "MIRRORED_REPEAT": 1, "CLAMP_TO_EDGE": 2, "CLAMP_TO_BORDER": 3}
+    assert torch.all(
+        load_textures(path, tmp_path / "b.mtl", 2, use_bilinear=False)[1]
+        == torch.tensor([0, 1.0, 0])
+    )
+    assert texture_wrapping_dict == {
+        "REPEAT": 0,
+        "MIRRORED_REPEAT": 1,
+        "CLAMP_TO_EDGE": 2,
+        "CLAMP_TO_BORDER": 3,
+    }
     (tmp_path / "b.mtl").write_text("newmtl x\nKd 1 1\n")
     with pytest.raises(ValueError, match=r"b.mtl, line 2.*3 numbers are needed"):
         load_mtl(tmp_path / "b.mtl")
@@ -164,13 +194,20 @@ def test_images_without_pillow(tmp_path, monkeypatch):
     with pytest.raises(ImportError, match=r"pip install pillow"):
         nr.load_obj(path, load_texture=True)
     with pytest.raises(ImportError, match=r"pip install pillow"):
-        nr.save_obj(tmp_path / "b.obj", torch.rand(3, 3), torch.tensor([[0, 1, 2]]), torch.rand(1, 2, 2, 2, 3))
+        nr.save_obj(
+            tmp_path / "b.obj",
+            torch.rand(3, 3),
+            torch.tensor([[0, 1, 2]]),
+            torch.rand(1, 2, 2, 2, 3),
+        )
 
 
 def test_hostile_materials_and_images(tmp_path, monkeypatch):
     from PIL import Image
 
-    triangle = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    triangle = (
+        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
     write(tmp_path, **{"a_obj": triangle, "a_mtl": "newmtl m\nmap_Kd t.png\n"})
 
     def refused(message, kind=ValueError):
@@ -236,7 +273,9 @@ def test_textures_come_back(tmp_path, texture_size):
     if texture_size == 1:
         corner_colors = corner_colors[:, :1].expand(-1, 3, -1)
     # A texture that is linear in the weights, in which any correct resampling finds the same colours.
-    grid = torch.stack(torch.meshgrid(*[torch.linspace(0, 1, max(texture_size, 2))] * 3, indexing="ij"), -1)
+    grid = torch.stack(
+        torch.meshgrid(*[torch.linspace(0, 1, max(texture_size, 2))] * 3, indexing="ij"), -1
+    )
     grid = grid / grid.sum(-1, keepdim=True).clamp_min(1e-9)
     grid[0, 0, 0] = 1 / 3
     textures = torch.einsum("ijkc,fcd->fijkd", grid, corner_colors)[:, : texture_size or 1]
@@ -248,4 +287,6 @@ def test_textures_come_back(tmp_path, texture_size):
     _, _, loaded = nr.load_obj(tmp_path / "mesh.obj", texture_size=4, load_texture=True)
     for k in range(3):
         index = tuple(3 * (torch.arange(3) == k))
-        torch.testing.assert_close(loaded[(slice(None), *index)], corner_colors[:, k], rtol=0, atol=0.03)
+        torch.testing.assert_close(
+            loaded[(slice(None), *index)], corner_colors[:, k], rtol=0, atol=0.03
+        )

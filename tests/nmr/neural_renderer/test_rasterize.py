@@ -24,7 +24,11 @@ def corners_of(v, vertices):
 
 
 def textures_of(v, textures):
-    return torch.cat([textures, textures.permute(0, 1, 4, 3, 2, 5)], dim=1) if v["fill_back"] else textures
+    return (
+        torch.cat([textures, textures.permute(0, 1, 4, 3, 2, 5)], dim=1)
+        if v["fill_back"]
+        else textures
+    )
 
 
 def assert_image(image, v, name):
@@ -57,18 +61,24 @@ def test_depth(name):
 def test_colors(name):
     v = load_vector(name)
     outputs = ("rgb", "alpha", "depth") if str(v["mode"]) == "rgbad" else ("rgb",)
-    vertices, textures = (torch.from_numpy(v[key]).requires_grad_() for key in ("vertices", "textures"))
+    vertices, textures = (
+        torch.from_numpy(v[key]).requires_grad_() for key in ("vertices", "textures")
+    )
     corners, cubes = corners_of(v, vertices), textures_of(v, textures)
     settings = settings_of(v) | {"background_color": v["background"]}
     if outputs == ("rgb",):
         images = {"rgb": nr.rasterize(corners, cubes, **settings)}
     else:
         images = nr.rasterize_rgbad(corners, cubes, **settings)
-    torch.autograd.backward([images[o] for o in outputs], [torch.from_numpy(v[f"grad_{o}"]) for o in outputs])
+    torch.autograd.backward(
+        [images[o] for o in outputs], [torch.from_numpy(v[f"grad_{o}"]) for o in outputs]
+    )
     for output in outputs:
         assert_image(images[output], v, output)
     assert_gradient(vertices.grad, v["grad_vertices"], gradient_tolerance(name))
-    assert np.abs(textures.grad.numpy() - v["grad_textures"]).max() <= max(5 * v["grad_textures_fma_maxdiff"], 1e-5)
+    assert np.abs(textures.grad.numpy() - v["grad_textures"]).max() <= max(
+        5 * v["grad_textures_fma_maxdiff"], 1e-5
+    )
 
 
 def scene(batch=2, ts=2, dtype=torch.float32):
@@ -81,7 +91,9 @@ def scene(batch=2, ts=2, dtype=torch.float32):
 @pytest.mark.parametrize("size", [8.0, np.int64(8), np.float32(8), torch.tensor(8)])
 def test_sizes_that_are_whole_numbers(size):
     corners, _ = scene()
-    assert torch.equal(nr.rasterize_silhouettes(corners, size), nr.rasterize_silhouettes(corners, 8))
+    assert torch.equal(
+        nr.rasterize_silhouettes(corners, size), nr.rasterize_silhouettes(corners, 8)
+    )
 
 
 def test_outputs_that_are_not_wanted_are_none():
@@ -100,9 +112,13 @@ def test_outputs_that_are_not_wanted_are_none():
 def test_module_returns_rasters_from_the_bottom_up():
     corners, textures = scene()
     images = nr.rasterize_rgbad(corners, textures, 8, False)
-    rgb, alpha, depth = nr.Rasterize(8, 0.1, 100, 1e-4, (0, 0, 0), True, True, True)(corners, textures)
+    rgb, alpha, depth = nr.Rasterize(8, 0.1, 100, 1e-4, (0, 0, 0), True, True, True)(
+        corners, textures
+    )
     assert torch.equal(rgb.flip(1).permute(0, 3, 1, 2), images["rgb"])
-    assert torch.equal(alpha.flip(1), images["alpha"]) and torch.equal(depth.flip(1), images["depth"])
+    assert torch.equal(alpha.flip(1), images["alpha"]) and torch.equal(
+        depth.flip(1), images["depth"]
+    )
     rgb, alpha, depth = nr.Rasterize(8, 0.1, 100, 1e-4, (0, 0, 0), return_alpha=True)(corners)
     assert rgb.numel() == depth.numel() == 0 and alpha.shape == (2, 8, 8)
 

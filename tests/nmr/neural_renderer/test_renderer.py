@@ -12,7 +12,12 @@ import nmr
 import nmr.neural_renderer as nr
 
 RENDERERS = vector_names("renderer_*")
-OUTPUTS = {"rgb": ("rgb",), "silhouettes": ("alpha",), "depth": ("depth",), "all": ("rgb", "depth", "alpha")}
+OUTPUTS = {
+    "rgb": ("rgb",),
+    "silhouettes": ("alpha",),
+    "depth": ("depth",),
+    "all": ("rgb", "depth", "alpha"),
+}
 
 
 def sphere(batch=2):
@@ -29,15 +34,21 @@ def test_vectors(name):
             setattr(renderer, key.removeprefix("renderer_"), v[key].tolist())
     inputs = {key: torch.from_numpy(v[key]).requires_grad_() for key in ("vertices", "textures")}
     inputs |= {
-        key.removeprefix("param_"): torch.from_numpy(v[key]).requires_grad_() for key in v if key.startswith("param_")
+        key.removeprefix("param_"): torch.from_numpy(v[key]).requires_grad_()
+        for key in v
+        if key.startswith("param_")
     }
     for key in set(inputs) - {"vertices", "textures"}:
         setattr(renderer, key, inputs[key])
     faces = torch.from_numpy(v["faces"]).expand(len(v["vertices"]), -1, -1)
     mode = str(v["output"])
-    images = renderer(inputs["vertices"], faces, inputs["textures"], mode=None if mode == "all" else mode)
+    images = renderer(
+        inputs["vertices"], faces, inputs["textures"], mode=None if mode == "all" else mode
+    )
     images = dict(zip(OUTPUTS[mode], images if mode == "all" else [images], strict=True))
-    torch.autograd.backward(list(images.values()), [torch.from_numpy(v[f"upstream_{o}"]) for o in images])
+    torch.autograd.backward(
+        list(images.values()), [torch.from_numpy(v[f"upstream_{o}"]) for o in images]
+    )
     for output, image in images.items():
         close = np.isclose(image.detach().numpy(), v[f"out_{output}"], rtol=1e-5, atol=1e-5)
         close[tuple(v[f"fragile_{output}"].T)] = True
@@ -46,7 +57,9 @@ def test_vectors(name):
         if f"grad_{key}" in v:
             expected = v[f"grad_{key}"]
             # How far a contracted multiply-add moves the published gradient says how far rounding may.
-            latitude = np.linalg.norm(v.get(f"grad_{key}_fma", expected) - expected) / np.linalg.norm(expected)
+            latitude = np.linalg.norm(
+                v.get(f"grad_{key}_fma", expected) - expected
+            ) / np.linalg.norm(expected)
             error = np.linalg.norm(inputs[key].grad.numpy() - expected) / np.linalg.norm(expected)
             # The camera rounds otherwise, too: its published formula in float64 moves gradients by up to 2e-4.
             assert error <= max(5 * latitude, 1e-3), f"{key}: {error}, latitude {latitude}"
@@ -103,7 +116,11 @@ def test_faces_that_cross_the_plane_of_the_eye_are_not_clipped():
     how = dict(outputs=("alpha", "depth"), image_size=16)
     mesh = vertices, torch.tensor([[0, 1, 2]]), nmr.Look(renderer.eye)
     plain, cut = (nmr.render(*mesh, clip=clip, **how) for clip in (False, True))
-    assert torch.equal(alpha, plain.alpha) and torch.equal(depth, plain.depth) and not torch.equal(alpha, cut.alpha)
+    assert (
+        torch.equal(alpha, plain.alpha)
+        and torch.equal(depth, plain.depth)
+        and not torch.equal(alpha, cut.alpha)
+    )
 
 
 def test_defaults_of_attributes():
@@ -116,8 +133,17 @@ def test_defaults_of_attributes():
 def test_calibrated_cameras_are_stored_as_published():
     K, R, t = np.eye(3)[None], np.eye(3)[None], np.array([[0.0, 0, 4]])
     renderer = nr.Renderer(K=K, R=R, t=t, dist_coeffs=np.zeros((1, 5)))
-    for value, given in ((renderer.K, K), (renderer.R, R), (renderer.t, t), (renderer.dist_coeffs, np.zeros((1, 5)))):
-        assert isinstance(value, torch.Tensor) and value.dtype == torch.float32 and value.tolist() == given.tolist()
+    for value, given in (
+        (renderer.K, K),
+        (renderer.R, R),
+        (renderer.t, t),
+        (renderer.dist_coeffs, np.zeros((1, 5))),
+    ):
+        assert (
+            isinstance(value, torch.Tensor)
+            and value.dtype == torch.float32
+            and value.tolist() == given.tolist()
+        )
     K[0, 0, 0] = 2  # the array is the caller's
     assert renderer.K[0, 0, 0] == 1
     assert torch.equal(nr.Renderer(K=K, R=R, t=t).dist_coeffs, torch.zeros(1, 5))
@@ -151,7 +177,9 @@ def test_modes_of_a_call():
     assert torch.equal(renderer(vertices, faces, textures, "".join(["r", "gb"])), rgb)
     assert torch.equal(renderer(vertices, faces, mode="silhouettes"), alpha)
     assert torch.equal(renderer(vertices, faces, mode="depth"), depth)
-    with pytest.raises(ValueError, match="mode must be None, 'rgb', 'silhouettes' or 'depth', got 'normals'"):
+    with pytest.raises(
+        ValueError, match="mode must be None, 'rgb', 'silhouettes' or 'depth', got 'normals'"
+    ):
         renderer(vertices, faces, mode="normals")
 
 
@@ -176,15 +204,28 @@ def test_chainer_default_is_look_at():
 
 def test_cameras_of_a_call_win_over_those_of_the_renderer():
     vertices, faces = sphere()
-    K, R, t = np.diag([64.0, 64, 1]).astype(np.float32), np.eye(3, dtype=np.float32), np.array([[[0, 0, 4.0]]])
+    K, R, t = (
+        np.diag([64.0, 64, 1]).astype(np.float32),
+        np.eye(3, dtype=np.float32),
+        np.array([[[0, 0, 4.0]]]),
+    )
     K[:2, 2] = 32
-    expected = nr.Renderer(16, K=K[None], R=R[None], t=t, orig_size=64).render_silhouettes(vertices, faces)
+    expected = nr.Renderer(16, K=K[None], R=R[None], t=t, orig_size=64).render_silhouettes(
+        vertices, faces
+    )
     assert 0.05 < expected.mean() < 0.9
     renderer = nr.Renderer(16, K=torch.eye(3)[None], R=torch.eye(3)[None], t=torch.zeros(1, 1, 3))
-    given = dict(K=torch.from_numpy(K)[None], R=torch.from_numpy(R)[None], t=torch.from_numpy(t), orig_size=64)
+    given = dict(
+        K=torch.from_numpy(K)[None],
+        R=torch.from_numpy(R)[None],
+        t=torch.from_numpy(t),
+        orig_size=64,
+    )
     assert torch.equal(renderer(vertices, faces, mode="silhouettes", **given), expected)
     given["orig_size"] = np.array([64, 64])
-    assert torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected), "a pair, not two images"
+    assert torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected), (
+        "a pair, not two images"
+    )
     given["dist_coeffs"] = torch.tensor([[0.5, 0, 0, 0, 0]])
     assert not torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected)
 
@@ -203,7 +244,10 @@ def test_eyes_and_colours_in_any_container(convert, batch):
 
     def images():
         renderer.eye, renderer.camera_direction = give([0.5, 0.6, -3.0]), give([-0.5, -0.6, 3.0])
-        renderer.background_color, renderer.light_direction = give([0.1, 0.2, 0.3]), give([0.0, 1.0, -1.0])
+        renderer.background_color, renderer.light_direction = (
+            give([0.1, 0.2, 0.3]),
+            give([0.0, 1.0, -1.0]),
+        )
         renderer.light_color_ambient = renderer.light_color_directional = give([0.9, 0.8, 0.7])
         return renderer(vertices, faces, textures, mode="rgb")
 
@@ -224,7 +268,10 @@ def test_different_faces_of_one_set_of_vertices():
 def test_silhouettes_and_depth_have_their_own_range_as_published():
     vertices, faces = sphere()
     renderer = nr.Renderer(camera_mode="look_at", image_size=16, near=1e-3, far=1.5)
-    assert renderer.render_silhouettes(vertices, faces).any() and renderer.render_depth(vertices, faces).max() == 100
+    assert (
+        renderer.render_silhouettes(vertices, faces).any()
+        and renderer.render_depth(vertices, faces).max() == 100
+    )
     _, depth, alpha = renderer(vertices, faces, torch.rand(2, 80, 2, 2, 2, 3))
     assert not alpha.any() and torch.all(depth == 1.5)
 

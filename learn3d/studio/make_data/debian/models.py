@@ -43,9 +43,14 @@ class Report:
 
     def summary(self) -> str:
         """Lines for the terminal: meshes per category, skipped models per reason."""
-        lines = [f"{name:9s}{n:5d} meshes" for name, n in Counter(row["category"] for row in self.models).items()]
+        lines = [
+            f"{name:9s}{n:5d} meshes"
+            for name, n in Counter(row["category"] for row in self.models).items()
+        ]
         reasons = Counter(reason.split(" of ")[0] for reason in self.dropped.values())
-        return "\n".join([*lines, *(f"{n} skipped: {reason}" for reason, n in reasons.most_common())])
+        return "\n".join(
+            [*lines, *(f"{n} skipped: {reason}" for reason, n in reasons.most_common())]
+        )
 
 
 def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Report:
@@ -70,14 +75,20 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Repor
                     raise
                 note(f"without the optional package {name}: {missing}")
                 continue
-            files = read_package(package, (".sh3f", ".ac", ".xml", notice := f"/doc/{name}/copyright"))
+            files = read_package(
+                package, (".sh3f", ".ac", ".xml", notice := f"/doc/{name}/copyright")
+            )
             for path in [path for path in files if path.endswith(notice)]:
                 (folder / "licences" / f"{name}.copyright").write_bytes(files[path])
             about = {"package": name, "version": unquote(package.stem.split("_")[1])}
-            for facts, read in tqdm(find_models(files), desc=name, unit="model", disable=not is_watched(), leave=False):
+            for facts, read in tqdm(
+                find_models(files), desc=name, unit="model", disable=not is_watched(), leave=False
+            ):
                 try:
                     mesh = clean_mesh(read())
-                    report.models.append(about | facts | _write_model(mesh, facts, folder, kept[facts["category"]]))
+                    report.models.append(
+                        about | facts | _write_model(mesh, facts, folder, kept[facts["category"]])
+                    )
                 except ValueError as reason:
                     report.dropped[facts["source"]] = str(reason)
         report.models.sort(key=lambda row: (CATEGORIES.index(row["category"]), row["file"]))
@@ -93,13 +104,17 @@ def get_package(name: str, folder: Path) -> Path:
     Raises ValueError if apt-get fails, OSError if it is not installed.
     """
     if not any(folder.glob(f"{name}_*.deb")):
-        result = subprocess.run(["apt-get", "download", "-q", name], cwd=folder, capture_output=True, text=True)
+        result = subprocess.run(
+            ["apt-get", "download", "-q", name], cwd=folder, capture_output=True, text=True
+        )
         if result.returncode != 0:
             raise ValueError(
                 f"apt-get could not download {name} ({result.stderr.strip()}); run `apt-get update` as root, enable "
                 "the component non-free if the package is in it, or put the .deb file into the folder --packages-dir"
             )
-    return max(folder.glob(f"{name}_*.deb"), key=lambda path: [*map(int, re.findall(r"\d+", path.name))])
+    return max(
+        folder.glob(f"{name}_*.deb"), key=lambda path: [*map(int, re.findall(r"\d+", path.name))]
+    )
 
 
 def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
@@ -108,7 +123,12 @@ def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
     Raises ValueError for a damaged file, OSError if dpkg-deb is not installed.
     """
     with tempfile.TemporaryDirectory() as folder:
-        if subprocess.run(["dpkg-deb", "--extract", package, folder], capture_output=True).returncode != 0:
+        if (
+            subprocess.run(
+                ["dpkg-deb", "--extract", package, folder], capture_output=True
+            ).returncode
+            != 0
+        ):
             raise ValueError(f"{package} cannot be read as a Debian package; download it again")
         found = [path for path in Path(folder).rglob("*") if path.as_posix().endswith(suffixes)]
         regular = [path for path in found if path.is_file() and not path.is_symlink()]
@@ -130,7 +150,9 @@ def _write_model(
             iou = np.count_nonzero(mine & other) / np.count_nonzero(mine | other)
             if iou > DUPLICATE_IOU:
                 raise ValueError(f"{kind}near-duplicate of {name} (surface IoU {iou:.3f})")
-    stem = f"{facts['category']}/" + (re.sub(r"[^a-z0-9]+", "-", facts["stem"].lower()).strip("-") or "model")
+    stem = f"{facts['category']}/" + (
+        re.sub(r"[^a-z0-9]+", "-", facts["stem"].lower()).strip("-") or "model"
+    )
     free = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
     name = next(name for name in free if name not in kept)
     kept[name] = surface

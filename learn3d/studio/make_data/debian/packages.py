@@ -66,8 +66,12 @@ def furniture_category(name: str, section: str = "") -> str | None:
 
 def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
     """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
-    entries: defaultdict[int, dict[str, str]] = defaultdict(dict)  # N -> entry; general properties under 0
-    for key, number, value in re.findall(r"^\s*(\w+)(?:#(\d+))?\s*=[^\S\n]*(.*)$", text, re.MULTILINE):
+    entries: defaultdict[int, dict[str, str]] = defaultdict(
+        dict
+    )  # N -> entry; general properties under 0
+    for key, number, value in re.findall(
+        r"^\s*(\w+)(?:#(\d+))?\s*=[^\S\n]*(.*)$", text, re.MULTILINE
+    ):
         value = re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value).strip()
         entries[int(number or 0)][key] = value
     general = entries.pop(0, {})
@@ -81,11 +85,15 @@ def place_furniture(vertices: np.ndarray, entry: Mapping[str, str]) -> np.ndarra
     towards +z.
     """
     if "modelRotation" in entry:
-        vertices = vertices @ np.array(entry["modelRotation"].split(), dtype=np.float64).reshape(3, 3).T
+        vertices = (
+            vertices @ np.array(entry["modelRotation"].split(), dtype=np.float64).reshape(3, 3).T
+        )
     if all(key in entry for key in ("width", "height", "depth")):
         extents = np.ptp(vertices, axis=0)
         if (extents > 0).all():
-            vertices = vertices * ([float(entry[key]) for key in ("width", "height", "depth")] / extents)
+            vertices = vertices * (
+                [float(entry[key]) for key in ("width", "height", "depth")] / extents
+            )
     return vertices
 
 
@@ -93,7 +101,9 @@ def furniture_models(files: Mapping[str, bytes]) -> Iterator[Model]:
     """The pieces of furniture of every catalogue of a package, by catalogue and entry number."""
     for path in sorted(path for path in files if path.endswith(".sh3f")):
         archive, catalogue = zipfile.ZipFile(io.BytesIO(files[path])), PurePosixPath(path)
-        general, entries = read_catalogue(archive.read("PluginFurnitureCatalog.properties").decode("latin-1"))
+        general, entries = read_catalogue(
+            archive.read("PluginFurnitureCatalog.properties").decode("latin-1")
+        )
         for entry in entries:
             model = PurePosixPath(entry.get("model", "").removeprefix("/"))
             category = furniture_category(entry.get("name", ""), entry.get("category", ""))
@@ -102,7 +112,9 @@ def furniture_models(files: Mapping[str, bytes]) -> Iterator[Model]:
                     "category": category,
                     "title": entry["name"],
                     "author": entry.get("creator", ""),
-                    "licence": " ".join(entry.get("license", general.get("license", "see the package")).split()),
+                    "licence": " ".join(
+                        entry.get("license", general.get("license", "see the package")).split()
+                    ),
                     "source": f"{catalogue.name}!/{model}",
                     "stem": f"{catalogue.stem}-{model.stem}",
                 }
@@ -132,7 +144,9 @@ EFFECTS = re.compile(
     re.IGNORECASE,
 )
 MIN_DISC = 0.09  # diameter of a propeller disc over the longest side of the airplane
-DETACHED = 2e-3  # distance, over the longest side, at which a quadrilateral is not joined to other parts
+DETACHED = (
+    2e-3  # distance, over the longest side, at which a quadrilateral is not joined to other parts
+)
 
 
 def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:
@@ -149,20 +163,36 @@ def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:
     def is_disc(part: RawMesh, own: np.ndarray) -> bool:
         x, y, z = np.ptp(own, axis=0)
         area = trimesh.triangles.area(part.vertices[part.faces]).sum()
-        return max(y, z) > max(MIN_DISC * size, x / 0.03) and min(y, z) > 0.8 * max(y, z) and area > 0.55 * y * z
+        return (
+            max(y, z) > max(MIN_DISC * size, x / 0.03)
+            and min(y, z) > 0.8 * max(y, z)
+            and area > 0.55 * y * z
+        )
 
     def is_alone(own: np.ndarray) -> bool:
         middle = own.mean(axis=0)
-        others = [points for points in corners if np.abs(points.mean(axis=0) - middle).max() > DETACHED * size]
+        others = [
+            points
+            for points in corners
+            if np.abs(points.mean(axis=0) - middle).max() > DETACHED * size
+        ]
         return min((cdist(points, own).min() for points in others), default=0) > DETACHED * size
 
     found = zip(parts, corners, strict=True)
-    return [part for part, own in found if not is_disc(part, own) and not (len(part.faces) <= 2 and is_alone(own))]
+    return [
+        part
+        for part, own in found
+        if not is_disc(part, own) and not (len(part.faces) <= 2 and is_alone(own))
+    ]
 
 
 def aircraft_models(files: Mapping[str, bytes]) -> Iterator[Model]:
     """The airplanes among the files of the package, by path."""
-    texts = {p.removeprefix(AIRCRAFT): text.decode("latin-1") for p, text in files.items() if p.startswith(AIRCRAFT)}
+    texts = {
+        p.removeprefix(AIRCRAFT): text.decode("latin-1")
+        for p, text in files.items()
+        if p.startswith(AIRCRAFT)
+    }
     authors: dict[tuple[str, str], str] = {}  # (folder, name of a model file in it) -> author
     for path, text in texts.items():
         if path.endswith(".xml") and (author := re.search(r"<author>([^<]+)</author>", text)):
@@ -170,7 +200,9 @@ def aircraft_models(files: Mapping[str, bytes]) -> Iterator[Model]:
             for model in re.findall(r"<path>([^<]+)</path>", text):
                 key = path.split("/", 1)[0], PurePosixPath(model.strip()).name
                 authors[key] = min(authors.get(key, name), name)
-    for path in sorted(path for path in texts if path.endswith(".ac") and not NOT_AIRPLANES.search(path)):
+    for path in sorted(
+        path for path in texts if path.endswith(".ac") and not NOT_AIRPLANES.search(path)
+    ):
         folder, stem = path.split("/", 1)[0], PurePosixPath(path).stem
         facts = {
             "category": "airplane",
@@ -185,7 +217,9 @@ def aircraft_models(files: Mapping[str, bytes]) -> Iterator[Model]:
 
 def _read_aircraft(text: str) -> RawMesh:
     parts = remove_effects(read_ac3d(text, skip=EFFECTS.search))
-    vertices, faces = trimesh.util.append_faces([part.vertices for part in parts], [part.faces for part in parts])
+    vertices, faces = trimesh.util.append_faces(
+        [part.vertices for part in parts], [part.faces for part in parts]
+    )
     # from FlightGear's frame (nose -x, y up, left wing +z) to front +z, y up, left +x
     return RawMesh(np.stack([vertices[:, 2], vertices[:, 1], -vertices[:, 0]], axis=1), faces)
 

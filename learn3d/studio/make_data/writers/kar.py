@@ -34,17 +34,25 @@ def _write_kar(objects: Iterable[RenderedObject], category: str, root: Path, out
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     for item in objects:
         folder, poses, cameras = renders / item.name, item.poses, item.poses.cameras()
-        depth = nmr.render_depth(item.vertices, item.faces, cameras, image_size=size, anti_aliasing=False).numpy()
+        depth = nmr.render_depth(
+            item.vertices, item.faces, cameras, image_size=size, anti_aliasing=False
+        ).numpy()
         nearest = poses.distance.numpy()[:, None, None] - DEPTH_REACH
         level = np.rint((depth - nearest) / (2 * DEPTH_REACH) * 240).clip(0, 240)
         level = np.where(depth < 100.0, level, 255).astype(np.uint8)  # 100 is nmr's `far`
-        for i, (rgba, grey, extrinsic) in enumerate(zip(item.rgba(), level, item.world_to_camera(), strict=True)):
+        for i, (rgba, grey, extrinsic) in enumerate(
+            zip(item.rgba(), level, item.world_to_camera(), strict=True)
+        ):
             write_png(folder / f"render_{i}.png", rgba)
             write_png(folder / f"depth_{i}.png", grey)
             quaternion = np.roll(Rotation.from_matrix(extrinsic[:, :3]).as_quat(), 1)
-            _write_mat(folder / f"camera_{i}.mat", K=intrinsics, extrinsic=extrinsic, quat=quaternion)
+            _write_mat(
+                folder / f"camera_{i}.mat", K=intrinsics, extrinsic=extrinsic, quat=quaternion
+            )
         rows = zip(poses.azimuth_deg, poses.elevation_deg, poses.distance, strict=True)
-        (folder / "view.txt").write_text("".join(f"{a:.4f} {e:.4f} 0 {d:.4f}\n" for a, e, d in rows))
+        (folder / "view.txt").write_text(
+            "".join(f"{a:.4f} {e:.4f} 0 {d:.4f}\n" for a, e, d in rows)
+        )
         _write_mat(volumes / f"{item.name}.mat", Volume=item.voxels)
         lists[item.split].append(item.name)
     others = read_splits(output) if (output / "splits.json").exists() else {}

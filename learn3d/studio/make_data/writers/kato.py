@@ -46,7 +46,9 @@ def _voxels(objects: Sequence[RenderedObject]) -> np.ndarray:
 
 
 KATO = Writer(
-    paths=lambda category: tuple(path.name for split in SPLITS for path in kato.split_paths("", category, split)),
+    paths=lambda category: tuple(
+        path.name for split in SPLITS for path in kato.split_paths("", category, split)
+    ),
     write=_write_kato,
     join=_join_kato,
     fixed=("views",),
@@ -56,9 +58,13 @@ KATO = Writer(
 def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -> ViewDataset:
     depth = []
     for item in objects:
-        seen = nmr.render_depth(item.vertices, item.faces, item.poses.cameras(), image_size=64, anti_aliasing=False)
+        seen = nmr.render_depth(
+            item.vertices, item.faces, item.poses.cameras(), image_size=64, anti_aliasing=False
+        )
         depth.append(depth_levels(seen, item.poses).numpy())
-    poses = LookAtPoses.join([item.poses for item in objects] or [LookAtPoses(*np.zeros((4, 0), np.float32))])
+    poses = LookAtPoses.join(
+        [item.poses for item in objects] or [LookAtPoses(*np.zeros((4, 0), np.float32))]
+    )
     return ViewDataset(
         **LAYOUTS["around"].about(category, split),
         images=np.array([_images(item) for item in objects], np.uint8).reshape(-1, 4, 64, 64),

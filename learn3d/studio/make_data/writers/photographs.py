@@ -26,7 +26,9 @@ HEIGHTS, WIDTHS = (160, 300), (200, 400)  # ranges for photographs, in pixels
 SHARES = (0.5, 0.9)  # range of the side of the rendering over the shorter side of the photograph
 
 
-def _write_pascal3d(objects: Iterable[RenderedObject], category: str, folder: Path, _: Path) -> None:
+def _write_pascal3d(
+    objects: Iterable[RenderedObject], category: str, folder: Path, _: Path
+) -> None:
     """Write `{class}_{train,imagenet,val}.npz`, with renderings on out-of-focus backgrounds as photographs.
 
     Training images go to the first two files alternately. Raises ValueError if there is only one.
@@ -41,7 +43,9 @@ def _write_pascal3d(objects: Iterable[RenderedObject], category: str, folder: Pa
             }
             (val_rows if item.split == "val" else rows).append(row)
     if len(rows) == 1:
-        raise ValueError("the layout pascal3d needs two pictures or more for training; give more meshes or views")
+        raise ValueError(
+            "the layout pascal3d needs two pictures or more for training; give more meshes or views"
+        )
     for path, part in zip(PASCAL3D.paths(category), (rows[::2], rows[1::2], val_rows), strict=True):
         if part:
             images = np.empty(len(part), dtype=object)
@@ -54,12 +58,18 @@ def _pascal3d_views(vertices: np.ndarray, count: int, rng: np.random.Generator) 
     """Any azimuth, elevations in -10 .. 40, tilts up to 15 degrees: the poses of hand-held cameras."""
     ranges = ((-180.0, 180.0), (-10.0, 40.0), (-15.0, 15.0))
     azimuth_deg, elevation_deg, tilt_deg = (uniform(rng, limits, count) for limits in ranges)
-    look = nmr.LookAt.from_angles(1.0, torch.from_numpy(elevation_deg), torch.from_numpy(azimuth_deg))
-    upright = look.projection(torch.float64).matrix[:, :, :3].numpy() * np.array([[1.0], [-1.0], [1.0]])
+    look = nmr.LookAt.from_angles(
+        1.0, torch.from_numpy(elevation_deg), torch.from_numpy(azimuth_deg)
+    )
+    upright = look.projection(torch.float64).matrix[:, :, :3].numpy() * np.array(
+        [[1.0], [-1.0], [1.0]]
+    )
     cos, sin = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
     roll = np.tile(np.eye(3), (count, 1, 1))
     roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = cos, -sin, sin, cos
-    return RotationPoses(roll @ upright @ WORLD_FROM_OBJECT.T)  # rows: the right, up and away of the image
+    return RotationPoses(
+        roll @ upright @ WORLD_FROM_OBJECT.T
+    )  # rows: the right, up and away of the image
 
 
 def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -67,15 +77,21 @@ def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndar
     height, width = int(rng.integers(*HEIGHTS)), int(rng.integers(*WIDTHS))
     side = int(rng.uniform(*SHARES) * min(height, width))
     small = Image.fromarray(rgba).resize((side, side), Image.Resampling.BICUBIC)
-    rows, columns = (np.flatnonzero((np.asarray(small)[..., 3] > 127).any(axis=axis)) for axis in (1, 0))
+    rows, columns = (
+        np.flatnonzero((np.asarray(small)[..., 3] > 127).any(axis=axis)) for axis in (1, 0)
+    )
     if not len(rows):
         rows = columns = np.array([0, side - 1])  # the object vanished when the image was reduced
     size = np.array([columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1])
-    corner = rng.integers(0, np.array([width, height]) - size + 1)  # the whole object is in the photograph
+    corner = rng.integers(
+        0, np.array([width, height]) - size + 1
+    )  # the whole object is in the photograph
     left, top = corner[0] - columns[0], corner[1] - rows[0]
     photo = Image.fromarray(photo_background(height, width, rng))
     photo.paste(small, (int(left), int(top)), small)
-    cut = photo.crop((left, top, left + side, top + side)).resize(rgba.shape[:2], Image.Resampling.BICUBIC)
+    cut = photo.crop((left, top, left + side, top + side)).resize(
+        rgba.shape[:2], Image.Resampling.BICUBIC
+    )
     reference = np.concatenate([np.asarray(cut), rgba[..., 3:]], axis=-1)
     box = np.array([*corner, *size], dtype=np.int64)
     return {"images": np.asarray(photo), "images_ref": reference, "bounding_boxes": box}
@@ -86,7 +102,9 @@ def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndar
 #: generator requires. Half the diagonal of the bounding box is 1, so that a rotated object stays
 #: in [-1, 1].
 PASCAL3D = Writer(
-    paths=lambda category: tuple(f"{pascal3d.class_name(category)}_{n}.npz" for n in ("train", "imagenet", "val")),
+    paths=lambda category: tuple(
+        f"{pascal3d.class_name(category)}_{n}.npz" for n in ("train", "imagenet", "val")
+    ),
     write=_write_pascal3d,
     views=_pascal3d_views,
     image_size=224,
@@ -108,7 +126,9 @@ def _write_photos(objects: Iterable[RenderedObject], category: str, root: Path, 
     for item in objects:
         poses = item.poses
         images = over(item, np.stack([photo_background(size, size, item.rng) for _ in item.rgb]))
-        numbers = np.stack([poses.azimuth_deg, poses.elevation_deg, poses.distance, 2 * poses.half_fov_deg], axis=1)
+        numbers = np.stack(
+            [poses.azimuth_deg, poses.elevation_deg, poses.distance, 2 * poses.half_fov_deg], axis=1
+        )
         for k, (image, mask, row) in enumerate(zip(images, item.alpha, numbers, strict=True)):
             file = f"{item.name}_{k:02d}.png"
             write_png(folder / "images" / file, image)
@@ -121,7 +141,9 @@ def _write_photos(objects: Iterable[RenderedObject], category: str, root: Path, 
 PHOTOS = Writer(
     paths=lambda category: (category,),
     write=_write_photos,
-    views=functools.partial(random_views, (-10.0, 50.0), (12.0, 25.0)),  # lenses of 84 .. 38 mm on a square of 36 mm
+    views=functools.partial(
+        random_views, (-10.0, 50.0), (12.0, 25.0)
+    ),  # lenses of 84 .. 38 mm on a square of 36 mm
     image_size=256,
     default_views=12,
 )
@@ -130,15 +152,23 @@ PHOTOS = Writer(
 def over(item: RenderedObject, backgrounds: np.ndarray) -> np.ndarray:
     """Composite the images of an object over backgrounds instead of white; all are uint8 [n, S, S, 3]."""
     clear = 1 - item.alpha[..., None] / np.float32(255)
-    return np.rint(item.rgb + (backgrounds.astype(np.float32) - 255) * clear).clip(0, 255).astype(np.uint8)
+    return (
+        np.rint(item.rgb + (backgrounds.astype(np.float32) - 255) * clear)
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
 
 
 def photo_background(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     """Draw an out-of-focus background, uint8 [H, W, 3]: smooth colours, blotches and noise."""
 
     def enlarge(small: np.ndarray) -> np.ndarray:
-        channels = [Image.fromarray(channel.astype(np.float32)) for channel in np.moveaxis(small, 2, 0)]
-        return np.stack([c.resize((width, height), Image.Resampling.BILINEAR) for c in channels], axis=-1)
+        channels = [
+            Image.fromarray(channel.astype(np.float32)) for channel in np.moveaxis(small, 2, 0)
+        ]
+        return np.stack(
+            [c.resize((width, height), Image.Resampling.BILINEAR) for c in channels], axis=-1
+        )
 
     corners = rng.uniform(40, 230, (2, 2, 3))
     blotches = rng.normal(0, 25, (8, 8, 1))

@@ -73,8 +73,12 @@ class Writer:
     fixed: tuple[str, ...] = ()  # options (views, test) that must have their default values
     shared: tuple[str, ...] = ()  # files with entries for all categories of the folder
     convention: VoxelConvention = KATO
-    turn: np.ndarray = field(default_factory=lambda: np.eye(3))  # frame of `mesh_to_object` to layout's object frame
-    diagonal: float | None = None  # diagonal of an object's bounding box; None if its longest side is 1
+    turn: np.ndarray = field(
+        default_factory=lambda: np.eye(3)
+    )  # frame of `mesh_to_object` to layout's object frame
+    diagonal: float | None = (
+        None  # diagonal of an object's bounding box; None if its longest side is 1
+    )
     natural: bool = False  # True for everyday colours and lights; else objects are light grey
 
 
@@ -90,7 +94,9 @@ def random_views(
         uniform(rng, (-180.0, 180.0), count),
         uniform(rng, elevations_deg, count),
     )
-    half_fov_deg = half_fovs_deg if isinstance(half_fovs_deg, float) else uniform(rng, half_fovs_deg, count)
+    half_fov_deg = (
+        half_fovs_deg if isinstance(half_fovs_deg, float) else uniform(rng, half_fovs_deg, count)
+    )
     least = np.linalg.norm(vertices, axis=1).max() / np.sin(np.deg2rad(np.float64(half_fov_deg)))
     distance = np.round(least * rng.uniform(*RELATIVE_DISTANCES, count), 4).astype(np.float32)
     return LookAtPoses(azimuth_deg, elevation_deg, distance, half_fov_deg)

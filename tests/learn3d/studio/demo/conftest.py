@@ -15,7 +15,17 @@ def server(finished_run, tmp_path_factory) -> Iterator[tuple[subprocess.Popen, s
     pytest.importorskip("uvicorn", reason="needs the extra demo")
     folder = tmp_path_factory.mktemp("demo")
     shutil.copytree(finished_run, folder / "other")
-    words = [sys.executable, "-m", "learn3d", "demo", "--port", "0", "--no-browser", "--run", str(finished_run)]
+    words = [
+        sys.executable,
+        "-m",
+        "learn3d",
+        "demo",
+        "--port",
+        "0",
+        "--no-browser",
+        "--run",
+        str(finished_run),
+    ]
     pipes = {"stdout": subprocess.PIPE, "stderr": (folder / "errors.txt").open("w"), "text": True}
     with subprocess.Popen([*words, str(folder / "other")], cwd=folder, **pipes) as process:
         process.folder = folder

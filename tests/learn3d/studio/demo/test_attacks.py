@@ -145,7 +145,9 @@ def silent_crowd(page: Page) -> None:
         for number in range(250):
             silent = crowd.enter_context(page.connect())
             silent.sendall(page.get()[:20] if number % 2 else b"")
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        browser = playwright.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"]
+        )
         shown = browser.new_page()
         shown.set_default_timeout(300_000)
         shown.goto(page.url)
@@ -261,18 +263,31 @@ def pictures_of_one_address(page: Page) -> None:
 
 
 def odd_origins_and_hosts(page: Page) -> None:
-    origins = ["http://[", "http://[::1", "null", "http://evil.example", f"http://{page.host}@evil.example", "\x80"]
+    origins = [
+        "http://[",
+        "http://[::1",
+        "null",
+        "http://evil.example",
+        f"http://{page.host}@evil.example",
+        "\x80",
+    ]
     hosts = ["evil.example", "", "[", "[::1", "localhost.evil.example", "127.0.0.1.evil.example"]
     for header in [{"Origin": text} for text in origins] + [{"Host": text} for text in hosts]:
         encoded = {name: text.encode("latin-1") for name, text in header.items()}
         for method in ("GET", "POST"):
-            assert httpx.request(method, page.url + ADDRESS, headers=encoded).status_code == 403, header
+            assert httpx.request(method, page.url + ADDRESS, headers=encoded).status_code == 403, (
+                header
+            )
 
 
 def odd_numbers(page: Page) -> None:
     for number in ("٦٤", "６４", "6_4", "+64", " 64", "64.0", "6e1", "9" * 5000, ""):
-        answers = [httpx.post(page.url + "mesh", params={"width": number, "height": SIZE}, content=box())]
-        answers += [httpx.post(page.url + ADDRESS, params={"box": f"8,8,{number},40"}, content=box())]
+        answers = [
+            httpx.post(page.url + "mesh", params={"width": number, "height": SIZE}, content=box())
+        ]
+        answers += [
+            httpx.post(page.url + ADDRESS, params={"box": f"8,8,{number},40"}, content=box())
+        ]
         assert [answer.status_code for answer in answers[:1]] == [400], number
 
 
@@ -305,10 +320,18 @@ def pictures_full_of_holes(page: Page) -> None:
     ring = np.abs(np.hypot(x - 256, y - 256) - 200) < 3
     boxed = (np.abs(x - 256) < 230) & (np.abs(y - 256) < 230)
     dots = (x % 2 == 0) & (y % 2 == 0)
-    masks = [(x // 8 + y // 8) % 2 == 0, ring, boxed & ~dots, np.random.default_rng(0).random((512, 512)) < 0.6]
+    masks = [
+        (x // 8 + y // 8) % 2 == 0,
+        ring,
+        boxed & ~dots,
+        np.random.default_rng(0).random((512, 512)) < 0.6,
+    ]
     grey = np.full((512, 512, 3), 200, np.uint8)
     pictures = [Picture(grey // 2, 255 * mask.astype(np.uint8)) for mask in masks]
-    found = [Picture(np.where(mask[..., None], np.uint8(30), grey), np.full_like(grey[..., 0], 255)) for mask in masks]
+    found = [
+        Picture(np.where(mask[..., None], np.uint8(30), grey), np.full_like(grey[..., 0], 255))
+        for mask in masks
+    ]
     seconds = []
     for picture in (ordinary, ordinary, *pictures, *found):
         start = time.process_time()

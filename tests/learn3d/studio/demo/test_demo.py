@@ -42,7 +42,9 @@ def test_the_mask_is_the_largest_region_and_only_the_background_makes_holes(phot
     assert np.array_equal(mask > 0, np.hypot(*np.ogrid[-50:50, -80:80]) < 30)
     assert left_out is None and not threshold_mask(photo, 0.9).any()
     photo[45:55, 75:85] = photo[:10, :10]
-    assert (keep_object(threshold_mask(photo, 0.05))[0] == 0)[45:55, 75:85].all(), "the background is seen"
+    assert (keep_object(threshold_mask(photo, 0.05))[0] == 0)[45:55, 75:85].all(), (
+        "the background is seen"
+    )
     photo[5:40, 5:40] = 0
     assert keep_object(threshold_mask(photo, 0.2))[1], "a second thing"
 
@@ -50,10 +52,14 @@ def test_the_mask_is_the_largest_region_and_only_the_background_makes_holes(phot
 def test_pixels_are_unpacked_as_the_page_packs_them() -> None:
     given = np.random.default_rng(0).integers(0, 256, (3, 5, 4)).astype(np.uint8)
     picture = pictures.unpack(given.tobytes(), 5, 3)
-    assert np.array_equal(np.dstack([picture.colors, picture.mask]), given) and picture.strokes is None
+    assert (
+        np.array_equal(np.dstack([picture.colors, picture.mask]), given) and picture.strokes is None
+    )
     strokes = np.arange(15, dtype=np.uint8).reshape(3, 5)
     picture = pictures.unpack(given.tobytes() + strokes.tobytes(), 5, 3)
-    assert np.array_equal(np.dstack([picture.colors, picture.mask]), given) and np.array_equal(picture.strokes, strokes)
+    assert np.array_equal(np.dstack([picture.colors, picture.mask]), given) and np.array_equal(
+        picture.strokes, strokes
+    )
 
 
 def test_the_object_is_given_or_found_or_corrected(photo) -> None:
@@ -65,7 +71,9 @@ def test_the_object_is_given_or_found_or_corrected(photo) -> None:
     apart = given.copy()
     apart[60:80, 100:120] = 255
     found, left_out = pictures.find_object(pictures.Picture(photo, apart))
-    assert np.array_equal(found.mask, given) and left_out.startswith("several objects of similar size")
+    assert np.array_equal(found.mask, given) and left_out.startswith(
+        "several objects of similar size"
+    )
     strokes = np.zeros_like(given)
     strokes[10:20, 20:40] = 1
     given[90, 150] = 255
@@ -95,7 +103,9 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
     assert len(trimesh.load(io.BytesIO(glb), "glb", force="mesh").faces) > 100
     for mask in (np.zeros_like(alpha[..., 0]), np.full_like(alpha[..., 0], 254)):
         pictures.make_meshes(models, [pictures.Picture(colors, mask)], sent.append)
-        assert sent[-1] == {"error": "No object was found. Draw a box around it, or paint it with Add."}
+        assert sent[-1] == {
+            "error": "No object was found. Draw a box around it, or paint it with Add."
+        }
 
 
 def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> None:
@@ -114,19 +124,31 @@ def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> Non
 
 def test_the_side_of_the_input_is_found() -> None:
     mesh = make_shape("chair", np.random.default_rng(6))
-    vertices, faces = torch.from_numpy(mesh.vertices @ mesh_to_object("y", "z").T).float(), torch.from_numpy(mesh.faces)
+    vertices, faces = (
+        torch.from_numpy(mesh.vertices @ mesh_to_object("y", "z").T).float(),
+        torch.from_numpy(mesh.faces),
+    )
     for azimuth in (0.0, 45.0, 210.0):
         camera = nmr.LookAt.from_angles(2.732, 30.0, [azimuth], half_fov_deg=15.0)
-        mask = (nmr.render_silhouette(vertices, faces, camera, image_size=128)[0] * 255).byte().numpy()
-        assert abs(wrap_deg(torch.tensor(input_azimuth_deg(Surface(vertices, faces), mask) - azimuth))) < 5
+        mask = (
+            (nmr.render_silhouette(vertices, faces, camera, image_size=128)[0] * 255).byte().numpy()
+        )
+        assert (
+            abs(wrap_deg(torch.tensor(input_azimuth_deg(Surface(vertices, faces), mask) - azimuth)))
+            < 5
+        )
 
 
-def test_the_packages_own_model_is_the_default(finished_run, tmp_path, monkeypatch, command) -> None:
+def test_the_packages_own_model_is_the_default(
+    finished_run, tmp_path, monkeypatch, command
+) -> None:
     monkeypatch.setattr(reconstruction, "SMALL_MODEL", tmp_path / "small.safetensors")
     (tmp_path / "car.png").write_bytes(pictures.example("car"))
     words = ("reconstruct", tmp_path / "car.png", "--output", tmp_path / "out")
     status, _, error = command(*words)
-    assert status == 1 and f"error: there is no checkpoint {tmp_path / 'small.safetensors'}" in error
+    assert (
+        status == 1 and f"error: there is no checkpoint {tmp_path / 'small.safetensors'}" in error
+    )
     export(finished_run, tmp_path / "small.safetensors")
     status, out, _ = command(*words)
     assert status == 0 and "car.glb" in out
@@ -139,6 +161,9 @@ def test_a_page_that_cannot_be_opened_is_one_sentence(finished_run, tmp_path, co
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         status, _, said = command("demo", "--port", port, "--no-browser", "--run", finished_run)
-    assert (status, said) == (1, f"error: cannot open a page at 127.0.0.1:{port}; give another --port or --host\n")
+    assert (status, said) == (
+        1,
+        f"error: cannot open a page at 127.0.0.1:{port}; give another --port or --host\n",
+    )
     status, _, said = command("demo", "--port", 0, "--no-browser", "--run", tmp_path / "none")
     assert status == 1 and "there is no checkpoint" in said and said.count("\n") == 1

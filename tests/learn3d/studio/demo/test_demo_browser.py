@@ -27,7 +27,9 @@ PATIENCE = 60_000  # milliseconds
 @pytest.fixture(scope="module")
 def browser() -> Iterator[api.Browser]:
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"]
+        )
         yield browser
         browser.close()
 
@@ -38,7 +40,9 @@ def page(browser, server) -> Iterator[api.Page]:
     page = browser.new_page(viewport={"width": 1280, "height": 1100})
     page.set_default_timeout(PATIENCE)
     said, asked = [], []
-    page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    page.on(
+        "console", lambda message: said.append(message.text) if message.type == "error" else None
+    )
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.append(request.url))
     page.goto(server[1])
@@ -84,20 +88,34 @@ def test_a_picture_becomes_meshes_that_turn_and_can_be_kept(page, box, tmp_path)
     before = pixels(canvas.first)
     assert np.ptp(before) > 60
     page.wait_for_timeout(4000)
-    assert (np.abs(pixels(canvas.first) - before).max(axis=2) > 20).mean() > 0.01, "it turns by itself"
+    assert (np.abs(pixels(canvas.first) - before).max(axis=2) > 20).mean() > 0.01, (
+        "it turns by itself"
+    )
     area = canvas.first.bounding_box()
     page.mouse.move(area["x"] + area["width"] / 2, area["y"] + area["height"] / 2)
     page.mouse.down()
     before = pixels(canvas.first)
-    page.mouse.move(area["x"] + area["width"] / 2 + 90, area["y"] + area["height"] / 2 + 30, steps=5)
+    page.mouse.move(
+        area["x"] + area["width"] / 2 + 90, area["y"] + area["height"] / 2 + 30, steps=5
+    )
     page.wait_for_timeout(1000)
-    assert (np.abs(pixels(canvas.first) - before).max(axis=2) > 20).mean() > 0.01, "it turns by hand"
+    assert (np.abs(pixels(canvas.first) - before).max(axis=2) > 20).mean() > 0.01, (
+        "it turns by hand"
+    )
     page.mouse.up()
-    meshes = [trimesh.load(download(page, kind, tmp_path), force="mesh", process=False) for kind in ("GLB", "OBJ")]
-    assert np.allclose(meshes[0].vertices, meshes[1].vertices, atol=1e-4) and len(meshes[0].faces) > 100
+    meshes = [
+        trimesh.load(download(page, kind, tmp_path), force="mesh", process=False)
+        for kind in ("GLB", "OBJ")
+    ]
+    assert (
+        np.allclose(meshes[0].vertices, meshes[1].vertices, atol=1e-4)
+        and len(meshes[0].faces) > 100
+    )
     (tmp_path / "kept").mkdir()
     with Image.open(download(page, "Cut-out", tmp_path / "kept")) as image:
-        assert (np.asarray(image)[..., 3] > 0).mean() == pytest.approx(80 * 140 / (200 * 300), rel=0.05)
+        assert (np.asarray(image)[..., 3] > 0).mean() == pytest.approx(
+            80 * 140 / (200 * 300), rel=0.05
+        )
 
 
 def test_the_outline_is_corrected_by_brushes_and_a_box(page, box) -> None:
@@ -106,7 +124,10 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(page, box) -> None:
     area = page.locator("#picture").bounding_box()
 
     def drag(tool: str, *ends: tuple[float, float]) -> np.ndarray:
-        if page.get_by_role("button", name=tool, exact=True).get_attribute("aria-pressed") == "false":
+        if (
+            page.get_by_role("button", name=tool, exact=True).get_attribute("aria-pressed")
+            == "false"
+        ):
             page.get_by_role("button", name=tool, exact=True).click()
         for step, (x, y) in enumerate(ends):
             page.mouse.move(area["x"] + x * area["width"], area["y"] + y * area["height"], steps=6)
@@ -156,7 +177,9 @@ def test_narrow_windows_and_dark_mode(browser, server, scheme) -> None:
     page.get_by_role("button", name="sofa").wait_for()
     assert page.evaluate("document.documentElement.scrollWidth") <= 380, "nothing sticks out"
     background = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    light = np.mean([int(part) for part in background[background.index("(") + 1 : -1].split(",")[:3]])
+    light = np.mean(
+        [int(part) for part in background[background.index("(") + 1 : -1].split(",")[:3]]
+    )
     assert (light < 80) == (scheme == "dark")
     page.close()
 

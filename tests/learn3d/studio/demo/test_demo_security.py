@@ -45,13 +45,20 @@ def messages(answer: httpx.Response) -> list[dict]:
 
 @pytest.mark.parametrize("name", ["localhost", "127.0.0.1", "[::1]"])
 def test_its_own_page_can(client, name) -> None:
-    assert client.get("", headers={"Host": f"{name}:1", "Origin": f"http://{name}:1"}).status_code == 200
+    assert (
+        client.get("", headers={"Host": f"{name}:1", "Origin": f"http://{name}:1"}).status_code
+        == 200
+    )
 
 
-@pytest.mark.parametrize("path", ["", "page.js", "about", "examples/chair.png", "none", "../server.py"])
+@pytest.mark.parametrize(
+    "path", ["", "page.js", "about", "examples/chair.png", "none", "../server.py"]
+)
 def test_browsers_are_told_to_run_and_fetch_nothing_else(client, path) -> None:
     headers = client.get(path).headers
-    assert headers["content-security-policy"].startswith("default-src 'self'; img-src 'self' blob:;")
+    assert headers["content-security-policy"].startswith(
+        "default-src 'self'; img-src 'self' blob:;"
+    )
     assert "frame-ancestors 'none'" in headers["content-security-policy"]
     assert headers["x-content-type-options"] == "nosniff"
 
@@ -60,7 +67,9 @@ def test_browsers_are_told_to_run_and_fetch_nothing_else(client, path) -> None:
 def test_only_files_of_the_page_are_served(server, path) -> None:
     host, _, port = urlsplit(server[1]).netloc.partition(":")
     with socket.create_connection((host, int(port))) as visitor:  # httpx would tidy the path up
-        visitor.sendall(f"GET /{path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+        visitor.sendall(
+            f"GET /{path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode()
+        )
         assert b" 404 " in visitor.recv(100)
 
 
@@ -68,11 +77,15 @@ def test_a_picture_becomes_meshes_and_nothing_of_it_comes_back(client, box) -> N
     answer = client.post(ADDRESS, content=box)
     assert answer.headers["content-type"] == "application/x-ndjson"
     mask, *_, last = messages(answer)
-    found = np.unpackbits(np.frombuffer(base64.b64decode(mask["mask"]), np.uint8)).reshape(SIZE, SIZE)
+    found = np.unpackbits(np.frombuffer(base64.b64decode(mask["mask"]), np.uint8)).reshape(
+        SIZE, SIZE
+    )
     assert found.sum() == 32 * 32 and found[16:48, 16:48].all()
     assert len(last["meshes"]) == 2 and last["meshes"][1]["label"] == "other"
     for made in last["meshes"]:
-        glb = trimesh.load(trimesh.util.wrap_as_stream(base64.b64decode(made["glb"])), "glb", force="mesh")
+        glb = trimesh.load(
+            trimesh.util.wrap_as_stream(base64.b64decode(made["glb"])), "glb", force="mesh"
+        )
         assert len(glb.faces) > 100 and b"COLOR_0" in base64.b64decode(made["glb"])
 
 
@@ -98,7 +111,9 @@ def test_what_is_no_picture_is_refused_in_a_sentence(client, server, box, change
 
 @pytest.mark.parametrize("where", ["1,1,200,200", "-5,0,20,20", "0,0,64,64", "3,3,1,1"])
 def test_a_box_that_cannot_be_is_an_error_of_the_picture(client, box, where) -> None:
-    (said,) = messages(client.post(ADDRESS, params={"width": SIZE, "height": SIZE, "box": where}, content=box))
+    (said,) = messages(
+        client.post(ADDRESS, params={"width": SIZE, "height": SIZE, "box": where}, content=box)
+    )
     assert "box" in said["error"]
 
 

@@ -67,11 +67,18 @@ def test_every_format_round_trips_through_the_reader(tmp_path, folder):
         vertices, faces = placed(folder / name)
         own = dataset.convention.voxelize(vertices, faces)[0]
         assert torch.equal(own, torch.from_numpy(dataset.voxels[number])), name
-        alpha = nmr.render_silhouette(vertices, faces, view_poses(torch.arange(24)).cameras(), image_size=64)
-        np.testing.assert_array_equal(images[number, :, 3], np.rint(255 * alpha.numpy()), err_msg=name)
+        alpha = nmr.render_silhouette(
+            vertices, faces, view_poses(torch.arange(24)).cameras(), image_size=64
+        )
+        np.testing.assert_array_equal(
+            images[number, :, 3], np.rint(255 * alpha.numpy()), err_msg=name
+        )
     brightest, alpha = images[:, :, :3].max(axis=2), images[:, :, 3]  # colours are stored inverted
     assert (brightest[alpha == 0] == 0).all() and (brightest[alpha == 255] > 0).all()
-    assert "6 meshes used, 0 skipped" in report.text() and "_contact.png: rows: up to 6 objects" in report.text()
+    assert (
+        "6 meshes used, 0 skipped" in report.text()
+        and "_contact.png: rows: up to 6 objects" in report.text()
+    )
 
 
 def test_up_and_front_turn_the_mesh(tmp_path):
@@ -100,20 +107,31 @@ def test_bugs_are_raised_and_leave_no_files(tmp_path, folder, monkeypatch):
 
 def test_only_training_objects_get_scaled_copies(tmp_path, folder):
     report = make(tmp_path / "data", folder, test=2, val=1, augment=2)
-    assert report.counts == {"train": 9, "val": 1, "test": 2} and len(set(report.objects["train"])) == 9
+    assert (
+        report.counts == {"train": 9, "val": 1, "test": 2}
+        and len(set(report.objects["train"])) == 9
+    )
     dataset, _ = load(tmp_path / "data")
     name = json.loads((tmp_path / "data" / "03001627_card.json").read_text())["splits"]["train"][0]
     own = dataset.convention.voxelize(*placed(folder / name))[0].numpy()
     np.testing.assert_array_equal(dataset.voxels[0], own)
-    assert not np.array_equal(dataset.voxels[1], own) and not np.array_equal(dataset.voxels[1], dataset.voxels[2])
+    assert not np.array_equal(dataset.voxels[1], own) and not np.array_equal(
+        dataset.voxels[1], dataset.voxels[2]
+    )
     for voxels in dataset.voxels:  # every copy fills the box again
-        spans = [np.ptp(np.nonzero(voxels.any(axis=other))[0]) + 1 for other in ((1, 2), (0, 2), (0, 1))]
+        spans = [
+            np.ptp(np.nonzero(voxels.any(axis=other))[0]) + 1 for other in ((1, 2), (0, 2), (0, 1))
+        ]
         assert max(spans) >= 31
 
 
 def test_meshes_and_shapes_may_be_mixed_and_only_meshes_get_copies(tmp_path, folder):
-    names = make(tmp_path / "data", folder, procedural=5, front="z", test=0, augment=2).objects["train"]
-    assert sorted(name for name in names if name.startswith("chair_")) == [f"chair_{i:05d}" for i in range(5)]
+    names = make(tmp_path / "data", folder, procedural=5, front="z", test=0, augment=2).objects[
+        "train"
+    ]
+    assert sorted(name for name in names if name.startswith("chair_")) == [
+        f"chair_{i:05d}" for i in range(5)
+    ]
     assert len(names) == 5 + 3 * 6
 
 
@@ -126,7 +144,9 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
     ):
         splits = meshes.split_objects(116, test, val, 0)
         assert [len(splits[s]) for s in ("test", "val", "train")] == sizes
-        np.testing.assert_array_equal(np.concatenate([splits[s] for s in ("test", "val", "train")]), order)
+        np.testing.assert_array_equal(
+            np.concatenate([splits[s] for s in ("test", "val", "train")]), order
+        )
     for count in (1, 2, 3, 7, 39):
         small = meshes.split_objects(count, 0.2, 0.1, 0)  # the defaults leave something to train on
         assert len(small["train"]) >= max(1, count // 3)
@@ -182,7 +202,11 @@ def test_command_line(tmp_path, folder, monkeypatch, capsys):
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 @pytest.mark.parametrize("layout", [name for name, writer in WRITERS.items() if writer.write])

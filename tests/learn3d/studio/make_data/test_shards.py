@@ -49,7 +49,9 @@ def here(monkeypatch) -> None:
 
 def contents(folder: Path) -> dict[str, bytes]:
     """All files of the splits."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("*/*/*"))}
+    return {
+        str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("*/*/*"))
+    }
 
 
 def test_the_objects_and_the_report_are_those_of_one_process(config, tmp_path, capsys) -> None:
@@ -61,9 +63,13 @@ def test_the_objects_and_the_report_are_those_of_one_process(config, tmp_path, c
     one, other = (folder / "03001627_contact.png" for folder in (tmp_path / "one", config.output))
     assert one.read_bytes() == other.read_bytes()
     for split in ("train", "val", "test"):
-        one, other = (load_dataset("kato", f, "chair", split) for f in (tmp_path / "one", config.output))
+        one, other = (
+            load_dataset("kato", f, "chair", split) for f in (tmp_path / "one", config.output)
+        )
         every = torch.arange(len(one))
-        assert len(one) == len(other) and torch.equal(one.batch(every).images, other.batch(every).images)
+        assert len(one) == len(other) and torch.equal(
+            one.batch(every).images, other.batch(every).images
+        )
         assert torch.equal(one.batch(every).voxels, other.batch(every).voxels)
 
 
@@ -82,13 +88,17 @@ def test_a_second_call_makes_nothing_and_other_settings_are_refused(config, here
     assert contents(config.output) != before
 
 
-def test_bad_meshes_are_listed_and_another_list_of_meshes_is_refused(tmp_path, here, capsys) -> None:
+def test_bad_meshes_are_listed_and_another_list_of_meshes_is_refused(
+    tmp_path, here, capsys
+) -> None:
     """The order of the meshes decides which of them are kept for the test."""
     (tmp_path / "meshes").mkdir()
     folder = write_meshes(tmp_path / "meshes")
     for name in ("a.obj", "zz.ply"):
         (folder / name).write_text("v 0 0\n")
-    config = DatasetConfig(output=tmp_path / "shards", category="mug", source=folder, test=1, val=0, shards=True)
+    config = DatasetConfig(
+        output=tmp_path / "shards", category="mug", source=folder, test=1, val=0, shards=True
+    )
     assert render.make_shards(config) == 0
     out = capsys.readouterr().out
     assert ", 2 skipped" in out and "skipped a.obj" in out and "skipped zz.ply" in out
@@ -137,7 +147,9 @@ def find_workers(where: str) -> list[int]:
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             if "tasks._child" in " ".join(process.cmdline()) and process.cwd() == os.getcwd():
-                worker = process if where == "here" else process.parent()  # an orphan's is not a worker
+                worker = (
+                    process if where == "here" else process.parent()
+                )  # an orphan's is not a worker
                 if where == "here" or "multiprocessing" in " ".join(worker.cmdline()):
                     found.append(worker.pid)
     return found
@@ -147,7 +159,9 @@ def find_workers(where: str) -> list[int]:
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_killed_call_is_continued(config, here, tmp_path, monkeypatch) -> None:
     """Killed with its workers, or stopped, at several moments, the same command ends with the same files."""
-    config = dataclasses.replace(config, procedural=24)  # enough that no call ends before its signal
+    config = dataclasses.replace(
+        config, procedural=24
+    )  # enough that no call ends before its signal
     whole = dataclasses.replace(config, output=tmp_path / "whole")
     assert render.make_shards(whole) == 0
     monkeypatch.undo()
@@ -156,9 +170,14 @@ def test_a_killed_call_is_continued(config, here, tmp_path, monkeypatch) -> None
     words += [str(word) for name in NUMBERS for word in (f"--{name}", getattr(config, name))]
     for kind in (signal.SIGKILL, signal.SIGTERM):
         begun = len(list(config.output.glob("*/*/[0-9]*.safetensors")))
-        with subprocess.Popen([sys.executable, tmp_path / "make.py", *words], start_new_session=True) as process:
+        with subprocess.Popen(
+            [sys.executable, tmp_path / "make.py", *words], start_new_session=True
+        ) as process:
             deadline = time.monotonic() + 60
-            while len(list(config.output.glob("*/*/[0-9]*.safetensors"))) <= begun and time.monotonic() < deadline:
+            while (
+                len(list(config.output.glob("*/*/[0-9]*.safetensors"))) <= begun
+                and time.monotonic() < deadline
+            ):
                 time.sleep(0.01)
             with contextlib.suppress(ProcessLookupError):
                 if kind == signal.SIGKILL:
@@ -166,5 +185,7 @@ def test_a_killed_call_is_continued(config, here, tmp_path, monkeypatch) -> None
                 else:
                     process.send_signal(kind)
     assert not shards.holds(config.output, "chair", "train")
-    assert subprocess.run([sys.executable, tmp_path / "make.py", *words], timeout=300).returncode == 0
+    assert (
+        subprocess.run([sys.executable, tmp_path / "make.py", *words], timeout=300).returncode == 0
+    )
     assert contents(config.output) == contents(whole.output)

@@ -49,31 +49,42 @@ def in_object_frame(vertices: torch.Tensor) -> torch.Tensor:
 
 
 def silhouette(vertices, faces, camera, size, anti_aliasing=True) -> np.ndarray:
-    alpha = nmr.render_silhouette(vertices.float(), faces, camera, image_size=size, anti_aliasing=anti_aliasing)
+    alpha = nmr.render_silhouette(
+        vertices.float(), faces, camera, image_size=size, anti_aliasing=anti_aliasing
+    )
     return np.rint(255 * alpha[0].numpy())
 
 
 def assert_same_mask(stored: np.ndarray, wanted: np.ndarray) -> None:
     """Equal but for a few subpixels on the edge, which the rounding of another camera model moves."""
     assert (stored > 0).any() and (stored == 0).any()
-    assert (stored != wanted).mean() < 5e-4 and np.abs(stored - wanted).max() <= 64, (stored != wanted).mean()
+    assert (stored != wanted).mean() < 5e-4 and np.abs(stored - wanted).max() <= 64, (
+        stored != wanted
+    ).mean()
 
 
-def assert_oriented(voxels: np.ndarray, vertices: torch.Tensor, faces: torch.Tensor, span: float) -> None:
+def assert_oriented(
+    voxels: np.ndarray, vertices: torch.Tensor, faces: torch.Tensor, span: float
+) -> None:
     """Of all 48 orientations of the grid, the one it has agrees best with the mesh; axes as the vertices'.
 
     vertices: in the axes of the grid, which spans [-span / 2, span / 2].
     """
     boxes = [part.bounds for part in trimesh.Trimesh(vertices.numpy(), faces.numpy()).split()]
     centers = (np.indices((32,) * 3).reshape(3, -1).T + 0.5) / 32 * span - span / 2
-    inside = np.any([((low < centers) & (centers < high)).all(axis=1) for low, high in boxes], axis=0)
+    inside = np.any(
+        [((low < centers) & (centers < high)).all(axis=1) for low, high in boxes], axis=0
+    )
     inside = inside.reshape((32,) * 3)
     scores = {}
     for order in itertools.permutations(range(3)):
         for flips in itertools.product((1, -1), repeat=3):
             other = inside.transpose(order)[:: flips[0], :: flips[1], :: flips[2]]
             scores[order, flips] = (other & voxels).sum() / (other | voxels).sum()
-    assert max(scores, key=scores.get) == ((0, 1, 2), (1, 1, 1)) and scores[(0, 1, 2), (1, 1, 1)] > 0.75
+    assert (
+        max(scores, key=scores.get) == ((0, 1, 2), (1, 1, 1))
+        and scores[(0, 1, 2), (1, 1, 1)] > 0.75
+    )
 
 
 def opencv_camera(eye: np.ndarray, focal: float, size: int) -> nmr.cameras.Camera:
@@ -83,7 +94,9 @@ def opencv_camera(eye: np.ndarray, focal: float, size: int) -> nmr.cameras.Camer
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     pixels = [[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]
-    return nmr.cameras.from_opencv(pixels, rotation, -rotation @ eye, height=size, width=size, pixel_center=0.5)
+    return nmr.cameras.from_opencv(
+        pixels, rotation, -rotation @ eye, height=size, width=size, pixel_center=0.5
+    )
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -115,16 +128,24 @@ def test_kar(tmp_path, folder):
         rgba = read_image(root / f"render_{i}.png")
         assert_same_mask(rgba[..., 3], silhouette(vertices, faces, camera, 224))
         assert (rgba[rgba[..., 3] == 0] == 0).all() and rgba[rgba[..., 3] > 0][:, :3].min() > 20
-        assert not rgba[[0, -1], :, 3].any() and not rgba[:, [0, -1], 3].any()  # the whole object is seen
+        assert (
+            not rgba[[0, -1], :, 3].any() and not rgba[:, [0, -1], 3].any()
+        )  # the whole object is seen
         depth = np.asarray(Image.open(root / f"depth_{i}.png"))
         hard = silhouette(vertices, faces, camera, 224, anti_aliasing=False)
         assert_same_mask(255.0 * (depth < 250), hard)
-        true_depth = nmr.render_depth(vertices, faces, camera, image_size=224, anti_aliasing=False)[0].numpy()
+        true_depth = nmr.render_depth(vertices, faces, camera, image_size=224, anti_aliasing=False)[
+            0
+        ].numpy()
         seen = (depth < 250) & (hard > 0)
-        np.testing.assert_allclose(depth[seen] / 240 * 1.8 + distance - 0.9, true_depth[seen], atol=0.005)
+        np.testing.assert_allclose(
+            depth[seen] / 240 * 1.8 + distance - 0.9, true_depth[seen], atol=0.005
+        )
         matrices = loadmat(root / f"camera_{i}.mat")
         rotation, offset = matrices["extrinsic"][:, :3], matrices["extrinsic"][:, 3]
-        opencv = nmr.cameras.from_opencv(matrices["K"], rotation, offset, height=224, width=224, pixel_center=0.5)
+        opencv = nmr.cameras.from_opencv(
+            matrices["K"], rotation, offset, height=224, width=224, pixel_center=0.5
+        )
         assert_same_mask(rgba[..., 3], silhouette(mesh, faces, opencv, 224))
         quaternion = Rotation.from_quat(np.roll(matrices["quat"].reshape(4), -1))
         np.testing.assert_allclose(quaternion.as_matrix(), rotation, atol=1e-6)
@@ -140,7 +161,9 @@ def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
     rgb = np.rint(color * share + 255 * (1 - share)).astype(np.uint8)
     item = RenderedObject("a", "train", None, None, None, rgb, alpha, None, rng)
     rgba = item.rgba()
-    assert rgba.dtype == np.uint8 and (rgba[..., 3] == alpha).all() and (rgba[alpha == 0] == 0).all()
+    assert (
+        rgba.dtype == np.uint8 and (rgba[..., 3] == alpha).all() and (rgba[alpha == 0] == 0).all()
+    )
     assert np.abs(rgba[..., :3].astype(int) - color)[alpha >= 128].max() <= 2
     background = rng.integers(0, 256, rgb.shape).astype(np.uint8)
     wanted = color * share + background * (1 - share)
@@ -157,7 +180,9 @@ def test_photos(tmp_path, folder):
     for row in rows[:3]:
         vertices, faces = true_mesh(folder, row["object"])
         azimuth, elevation, distance, fov = map(float, list(row.values())[1:5])
-        a, e = np.deg2rad([azimuth, elevation])  # anti-clockwise from the front, seen from above: x is front, -z right
+        a, e = np.deg2rad(
+            [azimuth, elevation]
+        )  # anti-clockwise from the front, seen from above: x is front, -z right
         eye = distance * np.array([np.cos(e) * np.cos(a), np.sin(e), -np.cos(e) * np.sin(a)])
         mask = read_image(tmp_path / "chair" / "masks" / row["file"])
         camera = opencv_camera(eye, 128 / np.tan(np.deg2rad(fov / 2)), 256)

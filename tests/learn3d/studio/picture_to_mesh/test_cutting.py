@@ -46,10 +46,14 @@ def test_an_object_is_cut_out_of_a_busy_background(scene, box) -> None:
     assert np.array_equal(mask, cut_out(colors, box)), "the same mask every time"
 
 
-@pytest.mark.parametrize("box", [(-1, 0, 50, 50), (0, 0, 401, 300), (10, 10, 0, 5), (0, 0, 400, 300)])
+@pytest.mark.parametrize(
+    "box", [(-1, 0, 50, 50), (0, 0, 401, 300), (10, 10, 0, 5), (0, 0, 400, 300)]
+)
 def test_a_box_must_leave_some_background(scene, box) -> None:
     pytest.importorskip("cv2", reason="needs the extra photos")
-    with pytest.raises(ValueError, match=r"box .*(must lie within the 400x300 pixels|covers the whole picture)"):
+    with pytest.raises(
+        ValueError, match=r"box .*(must lie within the 400x300 pixels|covers the whole picture)"
+    ):
         cut_out(scene[0], box)
 
 
@@ -66,10 +70,19 @@ def test_plain_backgrounds_need_no_opencv(scene, monkeypatch) -> None:
 def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -> None:
     pytest.importorskip("cv2", reason="needs the extra photos")
     Image.fromarray(scene[0]).save(tmp_path / "disc.png")
-    words = ("reconstruct", tmp_path / "disc.png", "--run", finished_run, "--output", tmp_path / "out")
+    words = (
+        "reconstruct",
+        tmp_path / "disc.png",
+        "--run",
+        finished_run,
+        "--output",
+        tmp_path / "out",
+    )
     status, _, said = command(*words)
     how = "by its difference from the background at the border"
-    assert status == 0 and f"{how}; if the outline in the strip of views is wrong, give --box" in said
+    assert (
+        status == 0 and f"{how}; if the outline in the strip of views is wrong, give --box" in said
+    )
     status, _, said = command(*words, "--box", 80, 50, 220, 220)
     assert status == 0, said
     with Image.open(tmp_path / "out" / "disc.png") as strip:
@@ -77,10 +90,14 @@ def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -
     assert 0.15 < (shown > 127).mean() < 0.7
     cut = (tmp_path / "out" / "disc.png").read_bytes()
     Image.fromarray(
-        np.dstack([scene[0], np.where(np.arange(400) < 390, 255, 0) + np.zeros((300, 1))]).astype(np.uint8)
+        np.dstack([scene[0], np.where(np.arange(400) < 390, 255, 0) + np.zeros((300, 1))]).astype(
+            np.uint8
+        )
     ).save(tmp_path / "disc.png")
     status, _, said = command(*words, "--box", 80, 50, 220, 220)
-    assert status == 0 and (tmp_path / "out" / "disc.png").read_bytes() == cut, "the box goes before transparency"
+    assert status == 0 and (tmp_path / "out" / "disc.png").read_bytes() == cut, (
+        "the box goes before transparency"
+    )
     status, _, said = command(*words, "--box", 80, 50, 220, 220, "--masks", tmp_path / "disc.png")
     assert status == 1 and "--box is for one photograph" in said
 
@@ -106,7 +123,9 @@ def test_wall_floor_and_shadow_stay_outside(room, box) -> None:
     colors, inside = room
     assert not is_plain(colors)
     center = np.hypot(*(np.indices(inside.shape) - [[[170]], [[210]]]))
-    outline = find_outline(colors, box, lambda seen, mask: -float(center[::2, ::2][:150, :200].mean()))
+    outline = find_outline(
+        colors, box, lambda seen, mask: -float(center[::2, ::2][:150, :200].mean())
+    )
     assert overlap(outline.mask, inside) > 0.9 and outline.doubt is None
     whole = cutting._grab_cut(colors, *[np.pad(np.ones((280, 380), bool), 10)] * 2, 5)
     assert overlap(whole, inside) < 0.85, "GrabCut alone keeps more of the room"
@@ -131,7 +150,14 @@ def test_a_doubtful_outline_needs_a_box(finished_run, tmp_path: Path, command) -
     noise = np.random.default_rng(0).integers(0, 256, (120, 120, 3)).astype(np.uint8)
     noise[50:70] = (200, 30, 30)
     Image.fromarray(noise).save(tmp_path / "band.png")
-    words = ("reconstruct", tmp_path / "band.png", "--run", finished_run, "--output", tmp_path / "out")
+    words = (
+        "reconstruct",
+        tmp_path / "band.png",
+        "--run",
+        finished_run,
+        "--output",
+        tmp_path / "out",
+    )
     status, _, said = command(*words)
     assert status == 1 and "no object was found" in said and "Give --box or --masks" in said
     assert not (tmp_path / "out").exists()
@@ -152,10 +178,14 @@ class Rembg:
         if self.failure is not None:
             raise self.failure
         red, green, _ = photo.split()
-        return Image.fromarray(np.where(np.asarray(red) > 2.0 * np.asarray(green), 240, 10).astype(np.uint8))
+        return Image.fromarray(
+            np.where(np.asarray(red) > 2.0 * np.asarray(green), 240, 10).astype(np.uint8)
+        )
 
 
-def test_rembg_is_used_if_installed_and_says_so(room, finished_run, tmp_path: Path, monkeypatch, command) -> None:
+def test_rembg_is_used_if_installed_and_says_so(
+    room, finished_run, tmp_path: Path, monkeypatch, command
+) -> None:
     colors, inside = room
     rembg = Rembg()
     rembg.__spec__ = ModuleSpec("rembg", None)
@@ -164,12 +194,25 @@ def test_rembg_is_used_if_installed_and_says_so(room, finished_run, tmp_path: Pa
     outline = find_outline(colors)
     assert overlap(outline.mask, inside) > 0.99 and outline.doubt is None
     Image.fromarray(colors).save(tmp_path / "table.png")
-    words = ("reconstruct", tmp_path / "table.png", "--run", finished_run, "--output", tmp_path / "out")
+    words = (
+        "reconstruct",
+        tmp_path / "table.png",
+        "--run",
+        finished_run,
+        "--output",
+        tmp_path / "out",
+    )
     status, _, said = command(*words)
-    assert status == 0 and "by rembg, which loads its weights from the internet at its first use" in said
+    assert (
+        status == 0
+        and "by rembg, which loads its weights from the internet at its first use" in said
+    )
     rembg.failure = OSError("no route to host")
     status, _, said = command(*words)
-    assert status == 1 and "rembg does not cut the object out (no route to host); give a box or a mask" in said
+    assert (
+        status == 1
+        and "rembg does not cut the object out (no route to host); give a box or a mask" in said
+    )
     cutting._rembg_session.cache_clear()
 
 
@@ -177,7 +220,9 @@ def test_a_picture_on_the_wall_is_left_out_though_the_object_touches_it(room) ->
     pytest.importorskip("cv2", reason="needs the extra photos")
     colors, inside = room
     colors = colors.copy()
-    colors[80:141, 170:240] = np.where(inside[80:141, 170:240, None], colors[80:141, 170:240], (60, 110, 70))
+    colors[80:141, 170:240] = np.where(
+        inside[80:141, 170:240, None], colors[80:141, 170:240], (60, 110, 70)
+    )
 
     def judge(seen: np.ndarray, mask: np.ndarray) -> float:
         """A stand-in for a model that knows this table."""

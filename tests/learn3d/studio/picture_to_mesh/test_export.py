@@ -17,7 +17,9 @@ from learn3d.training import train
 
 
 @pytest.mark.parametrize("preset", ["peng2020-kato", "plus-kato"])
-def test_an_exported_model_gives_the_shapes_of_the_run(tiny_config, tiny_set, run_folder, tmp_path, preset) -> None:
+def test_an_exported_model_gives_the_shapes_of_the_run(
+    tiny_config, tiny_set, run_folder, tmp_path, preset
+) -> None:
     train(tiny_config(run_folder, preset=preset, ema_decay=0.5))
     size = export(run_folder, tmp_path / "small.safetensors")
     assert size == (tmp_path / "small.safetensors").stat().st_size
@@ -53,7 +55,9 @@ def test_other_methods_are_refused(tiny_config, run_folder, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("category", "iou"), [("airplane", 0.5), ("car", 0.75), ("sofa", 0.55)])
-def test_the_small_model_of_the_package_knows_generated_objects(category: str, iou: float, tmp_path) -> None:
+def test_the_small_model_of_the_package_knows_generated_objects(
+    category: str, iou: float, tmp_path
+) -> None:
     assert len(zlib.compress(SMALL_MODEL.read_bytes())) < 10e6, "in the wheel"
     make_dataset(DatasetConfig(tmp_path, category, procedural=8, test=6, val=1, seed=99))
     method, *_ = checkpoint.load_method(SMALL_MODEL)

@@ -21,7 +21,15 @@ from learn3d.presets import PRESETS
 from learn3d.studio.picture_to_mesh.coloring import _nearest_clear, color_mesh
 from learn3d.studio.picture_to_mesh.export import export
 from learn3d.studio.picture_to_mesh.familiarity import KnownCodes, known_codes, learn_others
-from learn3d.studio.picture_to_mesh.fit import AZIMUTHS, CENTRED_SIZE, View, find_view, fit, frame_view, predict
+from learn3d.studio.picture_to_mesh.fit import (
+    AZIMUTHS,
+    CENTRED_SIZE,
+    View,
+    find_view,
+    fit,
+    frame_view,
+    predict,
+)
 from learn3d.studio.picture_to_mesh.reconstruction import (
     Reconstruction,
     cut_out_pictures,
@@ -45,7 +53,9 @@ def arrow() -> tuple[torch.Tensor, torch.Tensor]:
 def method() -> MeshMethod:
     """A method that predicts the arrow, made longer by its code."""
     settings = dataclasses.replace(PRESETS["many-views-around"].settings, symmetry="z")
-    method = create_method(settings, DatasetInfo(24, inverted=True), device="cpu", precision="fp32", seed=0)
+    method = create_method(
+        settings, DatasetInfo(24, inverted=True), device="cpu", precision="fp32", seed=0
+    )
     vertices, _ = arrow()
     base, stretch = vertices[None], torch.tensor([1.0, 0.0, 0.0])
     method.encode = lambda images: torch.ones(len(images), 4)
@@ -54,11 +64,13 @@ def method() -> MeshMethod:
     return method
 
 
-def framed_mask(vertices: torch.Tensor, faces: torch.Tensor, azimuth: float, elevation: float) -> torch.Tensor:
+def framed_mask(
+    vertices: torch.Tensor, faces: torch.Tensor, azimuth: float, elevation: float
+) -> torch.Tensor:
     cameras = nmr.LookAt.from_angles(3.5, [elevation], [azimuth], half_fov_deg=12.0)
-    return centre(nmr.render_silhouette(vertices, faces, cameras, image_size=128)[:, None].float())[:, :, ::2, ::2][
-        0, 0
-    ]
+    return centre(nmr.render_silhouette(vertices, faces, cameras, image_size=128)[:, None].float())[
+        :, :, ::2, ::2
+    ][0, 0]
 
 
 def test_views_are_framed() -> None:
@@ -96,23 +108,33 @@ def test_probabilities_decide_between_views_with_one_outline() -> None:
 
 def test_the_shape_comes_closer_to_the_outline_and_stays_symmetric(method: MeshMethod) -> None:
     vertices, faces = arrow()
-    longer = vertices * torch.tensor([1.4, 1.0, 1.0]) + 0.04 * torch.tensor([0.0, 1.0, 0.0]) * (vertices[:, :1] > 0.2)
+    longer = vertices * torch.tensor([1.4, 1.0, 1.0]) + 0.04 * torch.tensor([0.0, 1.0, 0.0]) * (
+        vertices[:, :1] > 0.2
+    )
     mask, said = framed_mask(longer, faces, 20.0, 15.0), []
     image = torch.zeros(4, 64, 64, dtype=torch.uint8)
     predicted = predict(method, image, mask)
     found = fit(method, predicted, mask, lambda text, part: said.append(part))
     assert predicted.shape.iou < found.iou and found.iou > 0.91
-    assert torch.allclose(method.generator.symmetrized(found.vertices[None])[0], found.vertices, atol=1e-5)
+    assert torch.allclose(
+        method.generator.symmetrized(found.vertices[None])[0], found.vertices, atol=1e-5
+    )
     assert said == sorted(said) and 0 < said[-1] < 1
 
 
-def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_mirror_image() -> None:
+def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_mirror_image() -> (
+    None
+):
     vertices, faces = arrow()
     centres = vertices[faces].mean(1)
-    paint = np.where(centres[:, 1:2] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]])  # red above, blue below
+    paint = np.where(
+        centres[:, 1:2] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]]
+    )  # red above, blue below
     view = frame_view(vertices[None], torch.tensor([20.0]), torch.tensor([10.0]))
     lights = nmr.Lights(1.0, 0.0)
-    rgb, alpha = photograph(view.place(vertices[None])[0], faces, paint, view.cameras(), image_size=256, lights=lights)
+    rgb, alpha = photograph(
+        view.place(vertices[None])[0], faces, paint, view.cameras(), image_size=256, lights=lights
+    )
     picture = np.concatenate([rgb[0].transpose(2, 0, 1), alpha])
     reflection = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
     surface = color_mesh((vertices, faces), view, [picture], reflection)
@@ -122,13 +144,22 @@ def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_m
             found = surface.colors[side & part].mean(0)
             assert torch.allclose(found, torch.tensor(wanted), atol=0.12), (found, wanted)
     alone = color_mesh((vertices, faces), view, [picture])
-    assert torch.isfinite(alone.colors).all() and alone.colors.min() >= 0 and alone.colors.max() <= 1
+    assert (
+        torch.isfinite(alone.colors).all() and alone.colors.min() >= 0 and alone.colors.max() <= 1
+    )
 
 
 def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
-    box, faces = map(torch.tensor, (trimesh.creation.box((0.1, 0.4, 0.1)).vertices, trimesh.creation.box().faces))
-    places = torch.tensor([(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)])  # two legs, and another part near
-    vertices, faces = (box + places[:, None]).flatten(0, 1), torch.cat([faces, faces + 8, faces + 16])
+    box, faces = map(
+        torch.tensor, (trimesh.creation.box((0.1, 0.4, 0.1)).vertices, trimesh.creation.box().faces)
+    )
+    places = torch.tensor(
+        [(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)]
+    )  # two legs, and another part near
+    vertices, faces = (
+        (box + places[:, None]).flatten(0, 1),
+        torch.cat([faces, faces + 8, faces + 16]),
+    )
     clear = np.arange(24) % 24 // 8 != 1
     nearest = _nearest_clear(vertices.numpy(), clear, joined(faces.numpy(), 24))
     assert nearest.tolist() == [*range(8), *range(8), *range(16, 24)]
@@ -146,10 +177,18 @@ def test_a_picture_is_reconstructed_with_and_without_the_fit(finished_run) -> No
     rows, columns = np.ogrid[:size, :size]
     mask = (255 * (((rows - 60) / 20) ** 2 + ((columns - 64) / 50) ** 2 < 1)).astype(np.uint8)
     colors = np.full((size, size, 3), (200, 120, 40), np.uint8)
-    fitted, plain = (reconstruct_picture(model, colors, mask, refined=refined) for refined in (True, False))
+    fitted, plain = (
+        reconstruct_picture(model, colors, mask, refined=refined) for refined in (True, False)
+    )
     assert isinstance(fitted, Reconstruction) and fitted.silhouette_iou > 0.6
-    assert torch.allclose(fitted.surface.colors.mean(0), torch.tensor([200, 120, 40]) / 255, atol=0.03)
-    assert plain.surface.colors is None and plain.silhouette_iou is None and plain.kind is plain.warning is None
+    assert torch.allclose(
+        fitted.surface.colors.mean(0), torch.tensor([200, 120, 40]) / 255, atol=0.03
+    )
+    assert (
+        plain.surface.colors is None
+        and plain.silhouette_iou is None
+        and plain.kind is plain.warning is None
+    )
 
 
 def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> None:
@@ -162,7 +201,9 @@ def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> No
     assert all(model.known_codes.is_strange(code) for code in -codes)
     assert recognize(model, codes[0]) == (None, None), "it knows only one category"
     other = model._replace(known_codes=KnownCodes(-model.known_codes.kinds))
-    assert recognize(other, codes[0])[1].startswith("this looks like nothing that the model was trained on (airplane)")
+    assert recognize(other, codes[0])[1].startswith(
+        "this looks like nothing that the model was trained on (airplane)"
+    )
 
 
 def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, tmp_path) -> None:
@@ -174,14 +215,20 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     known = KnownCodes(known[None], *learn_others(known, other[:20]))
     assert all(known.is_strange(7 * code) for code in other[20:])
     assert not any(known.is_strange(7 * code) for code in (*first[20:], *second[20:]))
-    wrong = known._replace(output=torch.tensor([0.0] * len(known.hidden) + [9.0]))  # calls everything another thing
-    assert not any(wrong.is_strange(7 * code) for code in first[20:]), "it is too near to a category for that"
+    wrong = known._replace(
+        output=torch.tensor([0.0] * len(known.hidden) + [9.0])
+    )  # calls everything another thing
+    assert not any(wrong.is_strange(7 * code) for code in first[20:]), (
+        "it is too near to a category for that"
+    )
     assert all(wrong.is_strange(7 * code) for code in other[20:])
     model = load_model(finished_run)
     with pytest.raises(ValueError, match="no PNG file in"):
         cut_out_pictures(model, tmp_path)
     image = tiny_set.images[0]
-    Image.fromarray(np.concatenate([255 - image[:3], image[3:]]).transpose(1, 2, 0)).save(tmp_path / "other.png")
+    Image.fromarray(np.concatenate([255 - image[:3], image[3:]]).transpose(1, 2, 0)).save(
+        tmp_path / "other.png"
+    )
     export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
     known = load_model(tmp_path / "small.safetensors").known_codes
     assert len(known.output) == len(known.hidden) + 1 == 2 * 64 + 1

@@ -10,7 +10,12 @@ from PIL import Image
 
 from learn3d.pictures.surfaces import draw_around
 from learn3d.studio.picture_to_mesh.inflation import CELLS, DEPTH, inflate
-from learn3d.studio.picture_to_mesh.reconstruction import frame, load_model, reconstruct_picture, reduce_mask
+from learn3d.studio.picture_to_mesh.reconstruction import (
+    frame,
+    load_model,
+    reconstruct_picture,
+    reduce_mask,
+)
 
 SIZE = 200
 Y, X = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
@@ -50,7 +55,9 @@ def test_a_disc_becomes_an_ellipsoid_with_the_picture_on_both_sides() -> None:
     front, back = (image.astype(int) for image in draw_around(surface, [0, 180], image_size=64))
     assert front[32, 44, 0] > front[32, 20, 0] + 20, "red grows to the right"
     assert back[32, 44, 0] < back[32, 20, 0] - 20, "and to the left from behind"
-    assert surface.texture.image.shape == (256, 256, 3) and surface.colors.min() > 0.1, "no white of the background"
+    assert surface.texture.image.shape == (256, 256, 3) and surface.colors.min() > 0.1, (
+        "no white of the background"
+    )
 
 
 def test_pictures_of_unknown_kinds_are_inflated(tmp_path) -> None:

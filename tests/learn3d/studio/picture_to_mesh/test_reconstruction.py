@@ -33,7 +33,8 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
 @pytest.fixture
 def short_turntables(monkeypatch) -> None:
     monkeypatch.setattr(
-        "learn3d.studio.picture_to_mesh.reconstruction.turntable", lambda _: np.zeros((2, 32, 32, 3), np.uint8)
+        "learn3d.studio.picture_to_mesh.reconstruction.turntable",
+        lambda _: np.zeros((2, 32, 32, 3), np.uint8),
     )
 
 
@@ -50,7 +51,9 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
     written = reconstruct_files(finished_run, tmp_path / "out", [tmp_path / "box.png"])
     assert len(trimesh.load(written[0], force="mesh").faces) > 100
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
-    with pytest.raises(ValueError, match=r"plain.png: no object was found .* Give --box or --masks"):
+    with pytest.raises(
+        ValueError, match=r"plain.png: no object was found .* Give --box or --masks"
+    ):
         _read(tmp_path / "plain.png")
     picture[40:80, 120:150] = 0
     Image.fromarray(picture).save(tmp_path / "two.png")
@@ -67,19 +70,26 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("category", "specks"), [("chair", 1), ("airplane", 12), ("sofa", 30)])
-def test_specks_change_neither_kind_nor_outline(category: str, specks: int, tmp_path, capsys) -> None:
+def test_specks_change_neither_kind_nor_outline(
+    category: str, specks: int, tmp_path, capsys
+) -> None:
     rng, model = np.random.default_rng(specks), load_model(None)
     with Image.open(io.BytesIO(example(category))) as image:
         clean = np.pad(np.asarray(image), ((40, 90), (130, 20), (0, 0)))
     dirty = clean.copy()
     free = np.argwhere(maximum_filter(clean[..., 3], 9) == 0)
     for y, x in free[rng.integers(len(free), size=specks)]:
-        dirty[y - 2 : y + rng.integers(1, 3), x - 2 : x + rng.integers(1, 3)] = (*rng.integers(0, 256, 3), 255)
+        dirty[y - 2 : y + rng.integers(1, 3), x - 2 : x + rng.integers(1, 3)] = (
+            *rng.integers(0, 256, 3),
+            255,
+        )
     made = []
     for name, picture in (("clean", clean), ("dirty", dirty)):
         Image.fromarray(picture).save(tmp_path / f"{name}.png")
         made.append(reconstruct_picture(model, *_read(tmp_path / f"{name}.png")))
-    assert made[0].kind == made[1].kind == category and (made[0].warning is None) == (made[1].warning is None)
+    assert made[0].kind == made[1].kind == category and (made[0].warning is None) == (
+        made[1].warning is None
+    )
     assert made[0].silhouette_iou == pytest.approx(made[1].silhouette_iou, abs=0.02)
 
 
@@ -88,13 +98,17 @@ def test_results_never_replace_the_images(finished_run, tmp_path) -> None:
     picture[20:40, 10:50] = 255
     Image.fromarray(picture).save(tmp_path / "chair.png")
     before = (tmp_path / "chair.png").read_bytes()
-    with pytest.raises(ValueError, match=r"chair\.png would replace an image that was given; give another --output"):
+    with pytest.raises(
+        ValueError, match=r"chair\.png would replace an image that was given; give another --output"
+    ):
         reconstruct_files(finished_run, tmp_path, [tmp_path / "chair.png"])
     assert (tmp_path / "chair.png").read_bytes() == before
 
 
 def test_an_empty_shape_is_an_empty_file(tmp_path) -> None:
-    export_mesh(tmp_path / "empty.glb", Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64)))
+    export_mesh(
+        tmp_path / "empty.glb", Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64))
+    )
     assert not trimesh.load(tmp_path / "empty.glb").geometry
 
 
@@ -102,9 +116,14 @@ def test_a_large_photograph_is_prepared_like_a_small_one() -> None:
     y, x = np.mgrid[:150, :200]
     colors = np.stack([x, y, x + y], axis=2).astype(np.uint8) // 2
     mask = (255 * (((x - 110) / 60) ** 2 + ((y - 70) / 50) ** 2 < 1)).astype(np.uint8)
-    large = (np.kron(colors, np.ones((16, 16, 1), np.uint8)), np.kron(mask, np.ones((16, 16), np.uint8)))
+    large = (
+        np.kron(colors, np.ones((16, 16, 1), np.uint8)),
+        np.kron(mask, np.ones((16, 16), np.uint8)),
+    )
     for options in ({}, {"crop": False}, {"size": 32}):
-        difference = prepare_image(*large, **options).astype(int) - prepare_image(colors, mask, **options)
+        difference = prepare_image(*large, **options).astype(int) - prepare_image(
+            colors, mask, **options
+        )
         assert np.abs(difference).mean() < 2, options
 
 
@@ -166,7 +185,9 @@ def test_colours_of_vertices_are_kept(tmp_path, kind: str) -> None:
     colors = (vertices - vertices.min()) / (vertices.max() - vertices.min())
     export_mesh(tmp_path / f"chair.{kind}", Surface(vertices, faces, colors))
     assert [path.name for path in tmp_path.iterdir()] == [f"chair.{kind}"]
-    (mesh,) = trimesh.load(tmp_path / f"chair.{kind}", force="scene", process=False).geometry.values()
+    (mesh,) = trimesh.load(
+        tmp_path / f"chair.{kind}", force="scene", process=False
+    ).geometry.values()
     found = mesh.visual.vertex_attributes["color"] if kind == "glb" else mesh.visual.vertex_colors
     wanted = colors.numpy() ** (2.2 if kind == "glb" else 1)  # those of a GLB are linear
     assert np.abs(found[:, :3] / 255 - wanted).max() < 0.01
@@ -181,7 +202,9 @@ def test_the_faces_of_a_glb_are_seen_from_both_sides(tmp_path) -> None:
     assert list(trimesh.load(tmp_path / "chair.glb").geometry) == ["chair"]
 
 
-def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_path, short_turntables) -> None:
+def test_files_and_data_sets_give_the_same_mesh(
+    finished_run, tiny_folder, tmp_path, short_turntables
+) -> None:
     paths = reconstruct_dataset(finished_run, tmp_path / "a", tiny_folder, [5])
     assert [p.name for p in paths] == [f"airplane_test_000005.{s}" for s in ("glb", "gif", "png")]
     with np.load(tiny_folder / "02691156_test_images.npz") as archive:
@@ -190,11 +213,17 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
     (tmp_path / "in").mkdir()
     Image.fromarray(rgba).save(tmp_path / "photo.png")
     Image.fromarray(rgba).save(tmp_path / "in" / "photo.png")
-    files = reconstruct_files(finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, refined=False)
+    files = reconstruct_files(
+        finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, refined=False
+    )
     meshes = [trimesh.load(path[0], force="mesh") for path in (files, paths)]
-    assert np.array_equal(*(mesh.vertices for mesh in meshes)) and np.array_equal(*(mesh.faces for mesh in meshes))
+    assert np.array_equal(*(mesh.vertices for mesh in meshes)) and np.array_equal(
+        *(mesh.faces for mesh in meshes)
+    )
     (surface,) = reconstruct(load_model(finished_run).method, stored[None])
-    assert np.allclose((surface.vertices.numpy() @ mesh_to_object()).max(0), meshes[0].bounds[1], atol=1e-5)
+    assert np.allclose(
+        (surface.vertices.numpy() @ mesh_to_object()).max(0), meshes[0].bounds[1], atol=1e-5
+    )
     twins = [tmp_path / "photo.png", tmp_path / "in" / "photo.png"]
     files = reconstruct_files(finished_run, tmp_path / "c", twins, mesh_format="ply")
     assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
@@ -202,7 +231,9 @@ def test_files_and_data_sets_give_the_same_mesh(finished_run, tiny_folder, tmp_p
         reconstruct_files(finished_run, tmp_path / "d", twins, [tmp_path / "photo.png"])
     (tmp_path / "bad.png").write_text("no picture")
     with pytest.raises(ValueError, match=r"bad\.png"):
-        reconstruct_files(finished_run, tmp_path / "e", [tmp_path / "bad.png", tmp_path / "photo.png"])
+        reconstruct_files(
+            finished_run, tmp_path / "e", [tmp_path / "bad.png", tmp_path / "photo.png"]
+        )
     assert (tmp_path / "e" / "photo.glb").is_file(), "the others are done"
 
 

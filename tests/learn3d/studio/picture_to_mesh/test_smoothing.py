@@ -11,12 +11,20 @@ from learn3d.studio.picture_to_mesh.smoothing import outer_surface
 
 def test_crossing_parts_become_one_closed_surface_and_thin_ones_stay() -> None:
     ball, faces = nmr.icosphere(3)
-    parts = [0.3 * ball, 0.3 * ball + torch.tensor([0.3, 0, 0]), torch.tensor([0.003, 0.5, 0.2]) * ball]
+    parts = [
+        0.3 * ball,
+        0.3 * ball + torch.tensor([0.3, 0, 0]),
+        torch.tensor([0.003, 0.5, 0.2]) * ball,
+    ]
     inverted = faces[:, [0, 2, 1]]
     triangles = torch.cat([faces, inverted + len(ball), faces + 2 * len(ball)])
     vertices, triangles = outer_surface(torch.cat(parts), triangles)
     mesh = trimesh.Trimesh(vertices.numpy(), triangles.numpy(), process=False)
     assert mesh.is_watertight and mesh.body_count == 1
     lens = torch.pi * 0.3**3 * 5 / 12  # of two balls of radius r at the distance r
-    assert abs(mesh.volume / (2 * 4 / 3 * torch.pi * 0.3**3 - lens) - 1) < 0.08, "and faces point outwards"
-    assert torch.allclose(vertices[:, 1].abs().max(), torch.tensor(0.5), atol=0.03), "the sheet is whole"
+    assert abs(mesh.volume / (2 * 4 / 3 * torch.pi * 0.3**3 - lens) - 1) < 0.08, (
+        "and faces point outwards"
+    )
+    assert torch.allclose(vertices[:, 1].abs().max(), torch.tensor(0.5), atol=0.03), (
+        "the sheet is whole"
+    )

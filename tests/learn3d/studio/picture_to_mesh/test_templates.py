@@ -37,12 +37,16 @@ def model() -> Model:
 def picture(category: str, number: int) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = template(category, number)
     camera = nmr.LookAt.from_angles(2.7, 20.0, [35.0], half_fov_deg=15.0)
-    colors, mask = photograph(vertices * torch.tensor([1.1, 1.0, 0.95]), faces, (0.2, 0.5, 0.3), camera, image_size=128)
+    colors, mask = photograph(
+        vertices * torch.tensor([1.1, 1.0, 0.95]), faces, (0.2, 0.5, 0.3), camera, image_size=128
+    )
     return colors[0], mask[0]
 
 
 def bodies(surface: Surface) -> int:
-    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())  # it merges equal vertices
+    mesh = trimesh.Trimesh(
+        surface.vertices.numpy(), surface.faces.numpy()
+    )  # it merges equal vertices
     return mesh.body_count if mesh.volume > 0 else 0  # below 0: it is inside out
 
 
@@ -53,9 +57,13 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
         code = model.method.encode(torch.from_numpy(model.prepare(colors, mask))[None])[0]
         names, cosines = model.templates.nearest(code.float(), model.categories)
         assert (category, number) in names and (cosines.diff() <= 0).all()
-    made = reconstruct_picture(model, *(shown := picture("chair", int(model.templates.numbers[2, 8]))))
+    made = reconstruct_picture(
+        model, *(shown := picture("chair", int(model.templates.numbers[2, 8])))
+    )
     assert made.kind == "chair" and made.silhouette_iou > 0.8 and bodies(made.surface) >= 3
-    assert torch.allclose(made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08), "the picture's"
+    assert torch.allclose(
+        made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08
+    ), "the picture's"
     unknown = model.known_codes._replace(output=model.known_codes.output + 100)
     lump = reconstruct_picture(model._replace(known_codes=unknown), *shown)
     assert lump.warning and bodies(lump.surface) < 3, "other things are inflated"
@@ -65,7 +73,10 @@ def test_guesses_differ_and_a_known_category_is_obeyed(model: Model) -> None:
     shown = picture("chair", int(model.templates.numbers[2, 8]))
     first, *others = reconstruct_guesses(model, *shown, guesses=3)
     assert first.kind == "chair" and 1 <= len(others) <= 2
-    grids = [nmr.voxelize(0.99 * made.surface.vertices + 0.5, made.surface.faces) for made in (first, *others)]
+    grids = [
+        nmr.voxelize(0.99 * made.surface.vertices + 0.5, made.surface.faces)
+        for made in (first, *others)
+    ]
     assert all(nmr.metrics.voxel_iou(grids[0], grid) < 0.7 for grid in grids[1:])
     assert all(made.silhouette_iou > 0.6 for made in others), "each explains the outline"
     table = reconstruct_picture(model, *shown, category="table")
@@ -75,12 +86,18 @@ def test_guesses_differ_and_a_known_category_is_obeyed(model: Model) -> None:
 
 
 def test_generated_shapes_of_a_training_set_become_templates(model: Model, tmp_path) -> None:
-    make_shards(DatasetConfig(tmp_path, "lamp", layout="around", procedural=8, test=1, val=1, shards=True))
+    make_shards(
+        DatasetConfig(tmp_path, "lamp", layout="around", procedural=8, test=1, val=1, shards=True)
+    )
     dataset = load_dataset("around", tmp_path, "lamp", "train")
     found = learn_templates(model.method, dataset)
     assert [f"lamp_{number:05d}" for number in found.numbers[0]] == list(dataset.object_names)
-    assert torch.allclose(found.axes[1:] @ found.axes[1:].T, torch.eye(len(found.axes) - 1), atol=1e-4)
-    others = dataclasses.replace(dataset, object_names=tuple(f"mine {name}" for name in dataset.object_names))
+    assert torch.allclose(
+        found.axes[1:] @ found.axes[1:].T, torch.eye(len(found.axes) - 1), atol=1e-4
+    )
+    others = dataclasses.replace(
+        dataset, object_names=tuple(f"mine {name}" for name in dataset.object_names)
+    )
     assert learn_templates(model.method, others) is None
 
 
@@ -92,41 +109,60 @@ def test_long_edges_are_divided_and_sharp_ones_stay_sharp() -> None:
     assert mesh.edges_unique_length.max() <= 0.1
     sharp = sharpen(Surface(vertices, faces, vertices.abs()))
     normals = nmr.vertex_normals(sharp.vertices, sharp.faces)
-    assert torch.allclose(normals.abs().amax(1), torch.ones(len(normals)), atol=1e-4), "along the axes"
-    assert torch.equal(sharp.colors, sharp.vertices.abs()) and torch.equal(sharp.vertices[sharp.faces], vertices[faces])
+    assert torch.allclose(normals.abs().amax(1), torch.ones(len(normals)), atol=1e-4), (
+        "along the axes"
+    )
+    assert torch.equal(sharp.colors, sharp.vertices.abs()) and torch.equal(
+        sharp.vertices[sharp.faces], vertices[faces]
+    )
 
 
 def painted() -> Surface:
     """A sphere and a thin box with a texture: the colour 0.5 + p at the point p. The vertices are black."""
-    mesh = trimesh.util.concatenate([trimesh.creation.box((0.9, 0.02, 0.1)), trimesh.creation.icosphere(2, 0.4)])
+    mesh = trimesh.util.concatenate(
+        [trimesh.creation.box((0.9, 0.02, 0.1)), trimesh.creation.icosphere(2, 0.4)]
+    )
     vertices, faces = divide(torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces), 0.1)
     return paint(
-        Surface(vertices, faces, 0 * vertices), lambda points, _: (0.5 + points, torch.full((len(points),), 1e3))
+        Surface(vertices, faces, 0 * vertices),
+        lambda points, _: (0.5 + points, torch.full((len(points),), 1e3)),
     )
 
 
 def test_every_place_of_a_texture_has_the_colour_of_its_point() -> None:
     surface = painted()
     image, uv = surface.texture
-    shares = torch.from_numpy(np.random.default_rng(0).dirichlet([0.3, 0.3, 0.3], (len(uv), 9))).float()
+    shares = torch.from_numpy(
+        np.random.default_rng(0).dirichlet([0.3, 0.3, 0.3], (len(uv), 9))
+    ).float()
     grid = (shares @ uv * 2 - 1) * torch.tensor([1.0, -1.0])
-    found = F.grid_sample(image.movedim(2, 0)[None], grid[None], align_corners=False)[0].movedim(0, 2)
+    found = F.grid_sample(image.movedim(2, 0)[None], grid[None], align_corners=False)[0].movedim(
+        0, 2
+    )
     wanted = 0.5 + shares @ surface.vertices[surface.faces]
     assert (found - wanted).abs().max() < 1e-4
     plain = surface._replace(colors=torch.full_like(surface.vertices, 0.3))
     image = paint(plain, lambda points, _: (points, torch.zeros(len(points)))).texture.image
-    assert torch.minimum((image - 0.3).abs(), 1 - image).max() < 1e-5, "the vertices', and unused texels"
+    assert torch.minimum((image - 0.3).abs(), 1 - image).max() < 1e-5, (
+        "the vertices', and unused texels"
+    )
 
 
 def test_a_glb_shows_the_texture() -> None:
     surface = painted()
-    mesh = trimesh.load(io.BytesIO(mesh_bytes(surface, "glb", "box")), file_type="glb", force="mesh", process=False)
+    mesh = trimesh.load(
+        io.BytesIO(mesh_bytes(surface, "glb", "box")), file_type="glb", force="mesh", process=False
+    )
     texture = np.asarray(mesh.visual.material.baseColorTexture)
     u, v = mesh.visual.uv[mesh.faces].mean(1).T
-    found = texture[((1 - v) * len(texture)).astype(int), (u * texture.shape[1]).astype(int), :3] / 255
+    found = (
+        texture[((1 - v) * len(texture)).astype(int), (u * texture.shape[1]).astype(int), :3] / 255
+    )
     assert np.abs(found - 0.5 - mesh.triangles_center @ mesh_to_object().T).max() < 0.02
     assert mesh.volume > 0 and mesh.visual.material.doubleSided
-    assert (mesh.vertex_normals[mesh.faces] * mesh.face_normals[:, None]).sum(2).min() > 0.5, "the surface's, outwards"
+    assert (mesh.vertex_normals[mesh.faces] * mesh.face_normals[:, None]).sum(2).min() > 0.5, (
+        "the surface's, outwards"
+    )
 
 
 def test_edges_are_rounded_and_flat_parts_stay() -> None:

@@ -36,7 +36,9 @@ QUICK = PoseOptions(steps=25, restarts=1, repeats=1, prototypes=3)
 
 
 def estimated(dataset: ViewDataset, **options: object) -> EstimatedViews:
-    return estimate_views([dataset], CameraOptions(), dataclasses.replace(QUICK, candidates=2, **options))
+    return estimate_views(
+        [dataset], CameraOptions(), dataclasses.replace(QUICK, candidates=2, **options)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +59,9 @@ def test_the_frame_is_free_and_turned_for_the_comparison(found: EstimatedViews) 
     """A data set whose azimuths are counted from another side gives the same poses, and another offset."""
     (dataset,), before = found.datasets, compare(found)
     poses = dataclasses.replace(dataset.poses, azimuth_deg=dataset.poses.azimuth_deg + 45)
-    after = compare(dataclasses.replace(found, datasets=(dataclasses.replace(dataset, poses=poses),)))
+    after = compare(
+        dataclasses.replace(found, datasets=(dataclasses.replace(dataset, poses=poses),))
+    )
     assert (after.offset_deg - before.offset_deg) % 360 == 45 and after.accuracy == before.accuracy
 
 
@@ -71,13 +75,21 @@ def test_a_seed_gives_the_same_bits() -> None:
 def test_ranges_of_elevations_and_unknown_cameras() -> None:
     quick, dataset = dataclasses.replace(QUICK, steps=3, candidates=3), darts(5)
     known = dataclasses.replace(dataset.poses, elevation_deg=20.0 * (torch.arange(120) % 3))
-    table = estimate_views([dataclasses.replace(dataset, poses=known)], CameraOptions(), quick).table
-    assert all(len(set(azimuths)) == 24 for azimuths in table.azimuth_deg)  # each azimuth once, at the known elevation
+    table = estimate_views(
+        [dataclasses.replace(dataset, poses=known)], CameraOptions(), quick
+    ).table
+    assert all(
+        len(set(azimuths)) == 24 for azimuths in table.azimuth_deg
+    )  # each azimuth once, at the known elevation
     assert np.array_equal(table.elevation_deg[:, 0], known.elevation_deg)
-    views = estimate_views([dataclasses.replace(darts(5), poses=None)], CameraOptions("0:30", 2.5, 31.0), quick)
+    views = estimate_views(
+        [dataclasses.replace(darts(5), poses=None)], CameraOptions("0:30", 2.5, 31.0), quick
+    )
     assert set(np.unique(views.table.elevation_deg)) <= {0.0, 15.0, 30.0}
     assert (views.table.distance == 2.5).all() and (views.table.half_fov_deg == 15.5).all()
-    with pytest.raises(ValueError, match=r"elevation must be degrees within -90 .. 90, or LOW:HIGH, got '30:x'"):
+    with pytest.raises(
+        ValueError, match=r"elevation must be degrees within -90 .. 90, or LOW:HIGH, got '30:x'"
+    ):
         CameraOptions("30:x").elevations()
     with pytest.raises(ValueError, match="--compare needs true poses"):
         compare(views)
@@ -93,7 +105,9 @@ def test_peaks_of_upper_outlines_tell_front_from_back(turns: int) -> None:
     prototype, azimuth = torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3])
     seen = torch.where(prototype == 1, (azimuth - turns) % 4, azimuth)
     data = Masks(masks.flatten(1), torch.ones(4, 1, dtype=torch.bool), torch.arange(4))
-    votes = _peak_votes(data, prototype, seen, 2, 4)[0, :, 0, 1]  # the first prototype stays as it is
+    votes = _peak_votes(data, prototype, seen, 2, 4)[
+        0, :, 0, 1
+    ]  # the first prototype stays as it is
     assert votes.argmax() == turns and votes[2 - turns] < 0
 
 
@@ -103,7 +117,9 @@ def test_prototypes_are_turned_into_one_frame(turns: int) -> None:
     dataset = darts(6)
     masks = torch.from_numpy(dataset.read_masks(np.arange(144))).float() / 255
     masks = torch.nn.functional.avg_pool2d(masks[:, None], 64 // SIZE).flatten(1)
-    data = Masks(masks, torch.ones(144, 1, dtype=torch.bool), torch.from_numpy(dataset.object_ids).long())
+    data = Masks(
+        masks, torch.ones(144, 1, dtype=torch.bool), torch.from_numpy(dataset.object_ids).long()
+    )
     azimuth, prototype = (dataset.poses.azimuth_deg / 15).round().long() % 24, data.objects % 2
     flipped = 12 * (torch.arange(144) % 3 == 0)
     for wrong in (0, flipped):
@@ -132,7 +148,10 @@ def test_ambiguous_poses_get_low_confidence() -> None:
     few.images[:4] = 0
     views = estimated(few, steps=3)
     assert views.table.confidence.max() < 0.5 and (views.table.confidence[:4] == 0).all()
-    assert views.warnings[0].startswith("4 images have an empty mask") and "20 training images" in views.warnings[1]
+    assert (
+        views.warnings[0].startswith("4 images have an empty mask")
+        and "20 training images" in views.warnings[1]
+    )
     few.images[:] = 0
     with pytest.raises(ValueError, match="all training masks are empty"):
         estimated(few)
@@ -142,12 +161,18 @@ def test_the_sheet_turns_images_and_prototypes_alike(tiny_set: ViewDataset) -> N
     count, step = len(tiny_set), TILE + MARGIN
     azimuth, *others = (np.full((count, 1), value, np.float32) for value in (0, 30, 1))
     azimuth[:, 0] = 30 * (np.arange(count) % 12) - 180
-    table = PoseTable(fingerprints(tiny_set), azimuth, *others, *np.float32([[2.7], [15], [1]]).repeat(count, 1))
+    table = PoseTable(
+        fingerprints(tiny_set), azimuth, *others, *np.float32([[2.7], [15], [1]]).repeat(count, 1)
+    )
     vertices, faces = nmr.icosphere(1)
     shape = vertices * torch.tensor([0.1, 0.2, 0.4]) * (1 - 0.8 * vertices[:, 2:])
-    estimate = Estimate(torch.ones(count, 24, 1), torch.ones(count), shape[None], faces, torch.ones(1), 1.0)
+    estimate = Estimate(
+        torch.ones(count, 24, 1), torch.ones(count), shape[None], faces, torch.ones(1), 1.0
+    )
     candidates = Candidates(torch.arange(24) * 15.0, torch.tensor([30.0]), 2.7, 15.0)
     views = EstimatedViews((tiny_set,), torch.arange(count), candidates, estimate, table)
-    before, after = (draw_pose_sheet(views, offset)[HEADER:, -COLUMNS * step :] for offset in (0.0, 90.0))
+    before, after = (
+        draw_pose_sheet(views, offset)[HEADER:, -COLUMNS * step :] for offset in (0.0, 90.0)
+    )
     assert np.array_equal(after, np.roll(before, 3 * step, axis=1))
     assert not np.array_equal(after[:TILE], before[:TILE])

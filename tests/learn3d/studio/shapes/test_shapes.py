@@ -48,7 +48,9 @@ def test_every_component_is_closed_and_outward_and_the_box_is_centred(category: 
         volumes = np.bincount(label, np.einsum("ij,ij->i", a, np.cross(b, c)))
         assert volumes.min() > 0, f"{category} {seed} has an inward component"
         lower, upper = mesh.bounds
-        np.testing.assert_allclose([*(lower + upper), (upper - lower).max()], [0, 0, 0, 1], atol=1e-9)
+        np.testing.assert_allclose(
+            [*(lower + upper), (upper - lower).max()], [0, 0, 0, 1], atol=1e-9
+        )
     counts = np.array([len(mesh.faces) for mesh in shapes(category)])
     assert 150 <= counts.min() and counts.max() <= 8500 and 400 <= np.median(counts) <= 6000
 
@@ -77,7 +79,9 @@ def test_shapes_are_connected(category: str) -> None:
     assert np.mean(pieces == 1) >= 0.96
 
 
-@pytest.mark.parametrize(("category", "limit"), [("airplane", -0.15), ("chair", -0.1), ("sofa", -0.05), ("car", -0.05)])
+@pytest.mark.parametrize(
+    ("category", "limit"), [("airplane", -0.15), ("chair", -0.1), ("sofa", -0.05), ("car", -0.05)]
+)
 def test_front_is_towards_positive_z_and_up_is_y(category: str, limit: float) -> None:
     """Fins of airplanes and backs of chairs and sofas are high and at -z; the bonnet of a car is low and at +z."""
     vertices = [np.asarray(mesh.vertices) for mesh in shapes(category)]
@@ -86,12 +90,16 @@ def test_front_is_towards_positive_z_and_up_is_y(category: str, limit: float) ->
 
 @pytest.mark.parametrize("category", ["airplane", "car", "chair"])
 def test_left_and_right_agree(category: str) -> None:
-    centroids = np.array([mesh.triangles_center.T @ mesh.area_faces / mesh.area for mesh in shapes(category)])
+    centroids = np.array(
+        [mesh.triangles_center.T @ mesh.area_faces / mesh.area for mesh in shapes(category)]
+    )
     assert np.abs(centroids[:, 0]).max() < 0.02
 
 
 def test_unknown_category_names_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"category must be one of airplane, .*table; got 'teapot'"):
+    with pytest.raises(
+        ValueError, match=r"category must be one of airplane, .*table; got 'teapot'"
+    ):
         make_shape("teapot", np.random.default_rng(0))
 
 

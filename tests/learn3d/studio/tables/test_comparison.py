@@ -38,32 +38,48 @@ def test_rows_name_variants_and_baselines() -> None:
     for table in TABLES.values():
         assert table.baseline in table.rows
         assert all(row.variant or row.printed for row in table.rows.values())
-    assert TABLES["kar"].rows["Proposed"].variant in {row.variant for row in TABLES["bins"].rows.values()}
+    assert TABLES["kar"].rows["Proposed"].variant in {
+        row.variant for row in TABLES["bins"].rows.values()
+    }
     assert "  w/o prior: without-prior, preset peng2020-kato, lambda_prior=0" in describe_tables()
     assert "  CSDM: quoted" in describe_tables()
 
 
-def test_the_page_shows_our_figures_beside_the_papers(make, request_for, read_report, tmp_path, capsys) -> None:
+def test_the_page_shows_our_figures_beside_the_papers(
+    make, request_for, read_report, tmp_path, capsys
+) -> None:
     """Objects have .40 to .48, and seeds differ by .01; the baseline has .1 less everywhere."""
     assert make(request_for(category="airplane,chair", seeds=3, workers=Workers(2))) == 0
     text = read_report()
-    assert "| Proposed | paper (kato18) | 0.565 | 0.415 | 0.490 |" in text, "the paper's mean over the same categories"
-    (line,) = (line for line in text.splitlines() if line.startswith("| Proposed | here (kato18) |"))
+    assert "| Proposed | paper (kato18) | 0.565 | 0.415 | 0.490 |" in text, (
+        "the paper's mean over the same categories"
+    )
+    (line,) = (
+        line for line in text.splitlines() if line.startswith("| Proposed | here (kato18) |")
+    )
     value, half, low, high = map(float, re.findall(NUMBER, line)[:4])
     assert (value, half) == (0.45, round(4.302653 * 0.01 / math.sqrt(3), 3))
     assert 0.42 < low < 0.45 < high < 0.48
-    assert "| Proposed | +0.100 ±0.000 [+0.100, +0.100] |" in text, "paired: every object and every seed gains .1"
+    assert "| Proposed | +0.100 ±0.000 [+0.100, +0.100] |" in text, (
+        "paired: every object and every seed gains .1"
+    )
     assert "| airplane/proposed-seed2 | step 6 | 6 | 4 | 120 | 0.4600 | 0.4100 |" in text
     assert "| 1.0 | 012345678 |" in text
     assert "learn3d train --preset peng2020-kato --data DATA --category CATEGORY" in text
     assert str(tmp_path) not in text
     tables = json.loads((tmp_path / "out" / "kato.json").read_text())
-    assert all(f"| {' | '.join(row)} |" in text for name in ("main", "differences", "runs") for row in tables[name])
+    assert all(
+        f"| {' | '.join(row)} |" in text
+        for name in ("main", "differences", "runs")
+        for row in tables[name]
+    )
     assert ["airplane/proposed-seed2", "val", "3", "0.2000", "-"] in tables["curves"]
     header, *rows = [line for line in capsys.readouterr().out.splitlines() if line]
     starts = [match.start() for match in re.finditer(r"\S+", header)]
     assert len(rows) == 6
-    assert all(row[start - 2 : start] == "  " and row[start] != " " for row in rows for start in starts[1:])
+    assert all(
+        row[start - 2 : start] == "  " and row[start] != " " for row in rows for start in starts[1:]
+    )
 
 
 def test_a_mean_over_other_categories_is_in_parentheses(make, request_for, read_report) -> None:
@@ -76,7 +92,9 @@ def test_mmd_is_compared_by_ratio(make, request_for, read_report) -> None:
     assert "| Proposed | -0.100 (x 0.86) |" in read_report("mmd")
 
 
-def test_results_on_different_objects_have_no_interval(tmp_path, make, request_for, read_report) -> None:
+def test_results_on_different_objects_have_no_interval(
+    tmp_path, make, request_for, read_report
+) -> None:
     make(request_for())
     path = tmp_path / "out/runs/airplane/proposed-seed0/test.json"
     path.write_text(path.read_text().replace('"a"', '"another"'))
@@ -84,13 +102,21 @@ def test_results_on_different_objects_have_no_interval(tmp_path, make, request_f
     assert "| Proposed | +0.100 | +0.100 |" in read_report()
 
 
-def test_quoted_rows_are_shown_and_never_trained(tmp_path, make, monkeypatch, request_for, read_report) -> None:
+def test_quoted_rows_are_shown_and_never_trained(
+    tmp_path, make, monkeypatch, request_for, read_report
+) -> None:
     table = TABLES["kato"]
     rows = {name: TABLES["pascal"].rows[name] for name in ("CSDM", "CMR")} | dict(table.rows)
     monkeypatch.setitem(TABLES, "kato", table._replace(rows=rows))
     assert make(request_for()) == 0
-    assert "| CSDM | paper (voxelizer not stated, quoted from Kar et al. 2015) | 0.398 | 0.398 |" in read_report()
-    assert "| CMR | paper (voxelizer not stated, quoted from Kanazawa et al. 2018) | 0.460 | 0.460 |" in read_report()
+    assert (
+        "| CSDM | paper (voxelizer not stated, quoted from Kar et al. 2015) | 0.398 | 0.398 |"
+        in read_report()
+    )
+    assert (
+        "| CMR | paper (voxelizer not stated, quoted from Kanazawa et al. 2018) | 0.460 | 0.460 |"
+        in read_report()
+    )
     assert len(list(tmp_path.glob("out/runs/*/*"))) == 2
 
 
@@ -111,8 +137,14 @@ def test_no_html_from_names_in_results() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        *(({name: value}, name) for name, value in {"iterations": "10", "images": True, "mmd": "low"}.items()),
-        *(({name: value}, name) for name, value in {"versions": {"commit": 5}, "objects": {}}.items()),
+        *(
+            ({name: value}, name)
+            for name, value in {"iterations": "10", "images": True, "mmd": "low"}.items()
+        ),
+        *(
+            ({name: value}, name)
+            for name, value in {"versions": {"commit": 5}, "objects": {}}.items()
+        ),
         ({"objects": [["a", 24, 10**200, None]]}, r"objects\.0"),
         ({"objects": [["a", 24, 0.5]]}, r"objects\.0"),
         ("{", "Invalid JSON"),
@@ -125,7 +157,9 @@ def test_damaged_results_are_named(changes, message: str, request_for) -> None:
     stored = stub_work.result().model_dump()
     text = changes if isinstance(changes, str) else json.dumps(stored | changes)
     (run.output / "test.json").write_text(text)
-    with pytest.raises(ValueError, match=rf"test.json is no measurement of a run .*{message}.*remove it"):
+    with pytest.raises(
+        ValueError, match=rf"test.json is no measurement of a run .*{message}.*remove it"
+    ):
         run_experiment(request_for(methods=("proposed",)), work=stub_work.fail_if_started)
 
 
@@ -140,5 +174,7 @@ def test_bootstrap_is_over_objects_not_images() -> None:
 def test_bootstrap_weighs_images_and_categories() -> None:
     one = resampled_means([np.array([3.0, 1.0])], [np.array([3.0, 2.0])])
     assert set(np.round(one, 6)) <= {1.0, 0.5, 0.8}, "mean over images: 3/3, 1/2 or 4/5"
-    both = resampled_means([np.array([1.0]), np.array([0.0, 0.0])], [np.array([1.0]), np.array([1.0, 1.0])])
+    both = resampled_means(
+        [np.array([1.0]), np.array([0.0, 0.0])], [np.array([1.0]), np.array([1.0, 1.0])]
+    )
     assert np.all(both == 0.5), "then over categories, however many objects they have"

@@ -62,7 +62,9 @@ def small_pictures(monkeypatch) -> None:
     monkeypatch.setattr(grids, "TILE_SIZE", TILE)
 
 
-def cell(grid: np.ndarray, row: int, column: int, *, top: int = HEADER, columns: int = 7) -> np.ndarray:
+def cell(
+    grid: np.ndarray, row: int, column: int, *, top: int = HEADER, columns: int = 7
+) -> np.ndarray:
     y, x = top + MARGIN + row * STEP, grid.shape[1] - (columns - column) * STEP
     return grid[y : y + TILE, x : x + TILE]
 
@@ -78,14 +80,18 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set, poses) -> No
     grid, batch = picture_grid(method, dataset, samples), dataset.batch(samples)
     assert grid.shape == (HEADER + 2 * STEP + MARGIN, 9 * STEP + MARGIN, 3)
     for row in (0, 1):
-        assert np.array_equal(cell(grid, row, 0, columns=9), resized(natural_colors(batch.images[row].numpy())))
+        assert np.array_equal(
+            cell(grid, row, 0, columns=9), resized(natural_colors(batch.images[row].numpy()))
+        )
         mask = np.rint(255 * batch.masks[row].numpy()).astype(np.uint8)
         assert np.array_equal(cell(grid, row, 1, columns=9)[..., 0], resized(mask))
         rendered = cell(grid, row, 2, columns=9)[..., 0] > 127
         shaded = (cell(grid, row, 3, columns=9) < 250).any(axis=2)
         assert 0.01 < rendered.mean() < 0.5 and (shaded == rendered).mean() > 0.95
     nothing = picture_grid(Ellipsoids(scale=0.0), dataset, samples)
-    assert (cell(nothing, 0, 2, columns=9) == 0).all() and np.array_equal(nothing[:, :STEP], grid[:, :STEP])
+    assert (cell(nothing, 0, 2, columns=9) == 0).all() and np.array_equal(
+        nothing[:, :STEP], grid[:, :STEP]
+    )
 
 
 @pytest.mark.parametrize("truth", [False, True])
@@ -109,8 +115,12 @@ def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth)
         for k, shapes in enumerate(shown):
             row = i * len(shown) + k
             views = draw_surface(shapes[i], orbit(pose, [0, 300], zoom=zoom), image_size=TILE)
-            assert np.array_equal(cell(grid, row, 1), views[0]) and np.array_equal(cell(grid, row, 6), views[1])
-            assert (cell(grid, row, 0) == 255).all() == (k > 0), "the input stands in the first row alone"
+            assert np.array_equal(cell(grid, row, 1), views[0]) and np.array_equal(
+                cell(grid, row, 6), views[1]
+            )
+            assert (cell(grid, row, 0) == 255).all() == (k > 0), (
+                "the input stands in the first row alone"
+            )
 
 
 def test_the_truth_must_be_known(tiny_set) -> None:
@@ -128,7 +138,9 @@ def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_s
     )
     assert strip.shape[0] == 3 * STEP + MARGIN
     codes = method.encode(batch.images)
-    way = torch.stack([torch.lerp(codes[k // 4], codes[min(2, k // 4 + 1)], k % 4 / 4) for k in range(9)])
+    way = torch.stack(
+        [torch.lerp(codes[k // 4], codes[min(2, k // 4 + 1)], k % 4 / 4) for k in range(9)]
+    )
     turns = [azimuth - float(azimuths_deg(batch.poses)[0]) for azimuth in (-135, -45)]
     shapes = method.decode(way).surfaces()
     zoom = common_zoom([(shape, orbit(batch.poses[:1], turns)) for shape in shapes], batch.masks)
@@ -156,7 +168,9 @@ def test_the_view_is_told_from_entangled_codes_alone() -> None:
     accuracy, chance = tsne.view_accuracy(entangled(0.95), VIEWS, OBJECTS)
     assert accuracy > 0.95 and chance == pytest.approx(1 / 12, abs=0.03)
     accuracy, _ = tsne.view_accuracy(entangled(0.0), VIEWS, OBJECTS)
-    assert 0.02 < accuracy < 0.17  # as often as by chance, not never: views of the same object do not count
+    assert (
+        0.02 < accuracy < 0.17
+    )  # as often as by chance, not never: views of the same object do not count
     assert tsne.view_accuracy(entangled(0.5)[:12], VIEWS[:12], OBJECTS[:12]) is None
     assert tsne.view_accuracy(entangled(0.5), 0 * VIEWS, OBJECTS) is None
 
@@ -172,7 +186,9 @@ def test_an_embedding_keeps_neighbours_and_is_always_the_same() -> None:
         tsne.embed(codes[:9])
 
 
-def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set, tmp_path, monkeypatch) -> None:
+def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(
+    tiny_set, tmp_path, monkeypatch
+) -> None:
     points = np.random.default_rng(0).normal(size=(72, 2)).astype(np.float32)
     monkeypatch.setattr(tsne, "embed", lambda codes: points)
     runs, wheel = (
@@ -191,7 +207,10 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(tiny_set,
     assert written == [tmp_path / "new" / "maps.png", tmp_path / "new" / "maps.svg"]
     assert Image.open(written[0]).size > (800, 400)
     text = written[1].read_text()
-    assert all(words in text for words in ("$\\bad$", "view told from the code: ", " % (chance 4 %)", "90°"))
+    assert all(
+        words in text
+        for words in ("$\\bad$", "view told from the code: ", " % (chance 4 %)", "90°")
+    )
     tsne.save_tsne(runs, tmp_path / "again")
     assert (tmp_path / "again.svg").read_text() == text
 
@@ -207,7 +226,11 @@ def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
 
 def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:
     chairs = dataclasses.replace(tiny_set, category="chair")
-    runs = [TrainedModel(label, Ellipsoids(), data) for data in (tiny_set, chairs) for label in ("a", "b")]
+    runs = [
+        TrainedModel(label, Ellipsoids(), data)
+        for data in (tiny_set, chairs)
+        for label in ("a", "b")
+    ]
     (one,) = grids.save_grid(runs[:2], tmp_path / "one", images=1)
     (two,) = grids.save_grid(runs, tmp_path / "2", images=1)
     assert Image.open(two).height == 2 * Image.open(one).height + 10
@@ -223,16 +246,22 @@ def call(command):
 
 
 def test_a_figure_from_a_run_to_a_file(call, finished_run, tmp_path) -> None:
-    code, out, err = call("tsne", "--runs", finished_run, "--output", tmp_path / "out" / "a", "--split", "train")
+    code, out, err = call(
+        "tsne", "--runs", finished_run, "--output", tmp_path / "out" / "a", "--split", "train"
+    )
     assert code == 0, err
     assert out.split() == [str(tmp_path / "out" / f"a.{kind}") for kind in ("png", "svg")]
     with Image.open(tmp_path / "out" / "a.png") as image:
-        assert 0.005 < (np.asarray(image.convert("L")) < 200).mean() < 0.7  # something is drawn on white
+        assert (
+            0.005 < (np.asarray(image.convert("L")) < 200).mean() < 0.7
+        )  # something is drawn on white
 
 
 def test_the_images_of_an_interpolation_can_be_chosen(call, finished_run, tmp_path) -> None:
     options = ("--split", "train", "--indices", 1, 30)
-    code, out, err = call("interpolation", "--runs", finished_run, "--output", tmp_path / "i.gif", *options)
+    code, out, err = call(
+        "interpolation", "--runs", finished_run, "--output", tmp_path / "i.gif", *options
+    )
     assert (code, out.split()) == (0, [str(tmp_path / "i.png")]), err
 
 
@@ -259,13 +288,19 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_data_are_shown_without_the_poses_of_the_training(tiny_config, tiny_set, tmp_path, monkeypatch) -> None:
+def test_other_data_are_shown_without_the_poses_of_the_training(
+    tiny_config, tiny_set, tmp_path, monkeypatch
+) -> None:
     configs, loaded = (
         {name: tiny_config(tmp_path, poses=tmp_path / name) for name in ("a", "b")},
         [],
     )
-    monkeypatch.setattr(checkpoint, "load_method", lambda path, which: (Ellipsoids(), configs[path.name], None))
-    monkeypatch.setattr(checkpoint, "load_dataset", lambda *_, poses=None, **__: loaded.append(poses) or tiny_set)
+    monkeypatch.setattr(
+        checkpoint, "load_method", lambda path, which: (Ellipsoids(), configs[path.name], None)
+    )
+    monkeypatch.setattr(
+        checkpoint, "load_dataset", lambda *_, poses=None, **__: loaded.append(poses) or tiny_set
+    )
     paths = [tmp_path / "a", tmp_path / "b"]
     for other in ({}, {"category": "airplane"}, {"data": tmp_path}):
         open_runs(paths, **other)

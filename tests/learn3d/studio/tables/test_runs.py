@@ -37,7 +37,9 @@ from learn3d.tasks import Workers
 
 
 def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
-    runs = plan_runs(Request("ablation", tmp_path, tmp_path / "out", category="chair,lamp", seeds=2))
+    runs = plan_runs(
+        Request("ablation", tmp_path, tmp_path / "out", category="chair,lamp", seeds=2)
+    )
     assert len({run.output for run in runs}) == len(runs) == 4 * 2 * 2
     run = next(run for run in runs if name_run(run) == "chair/without-adversarial-seed1")
     assert run.output == tmp_path / "out" / "runs" / "chair" / "without-adversarial-seed1"
@@ -57,7 +59,9 @@ def test_only_named_settings_differ_from_the_preset(tmp_path, request_for) -> No
         for run in plan_runs(Request(table, tmp_path, tmp_path, "chair", seeds=1)):
             variant = VARIANTS[variant_of(run)]
             usual = PRESETS[variant.preset].settings
-            changed = {name: value for name, value in variant.changes.items() if hasattr(usual, name)}
+            changed = {
+                name: value for name, value in variant.changes.items() if hasattr(usual, name)
+            }
             assert run.settings == dataclasses.replace(usual, **changed)
     (run,) = plan_runs(request_for("prgan", methods=("prgan",), iterations=2000))
     assert run.settings.encoder_from_step == 1001, "the second half, however long it is"
@@ -65,7 +69,9 @@ def test_only_named_settings_differ_from_the_preset(tmp_path, request_for) -> No
 
 def test_smaller_batches_show_as_many_images(tmp_path) -> None:
     def sizes(**asked: int) -> set[tuple[str, int, int, int]]:
-        request = Request("plus", tmp_path, tmp_path, "chair", ("proposed", "proposed-shared", "plus"), **asked)
+        request = Request(
+            "plus", tmp_path, tmp_path, "chair", ("proposed", "proposed-shared", "plus"), **asked
+        )
         runs = plan_runs(dataclasses.replace(request, seeds=1))
         return {(variant_of(r), r.iterations, r.batch_size, r.schedule.warmup_steps) for r in runs}
 
@@ -73,7 +79,9 @@ def test_smaller_batches_show_as_many_images(tmp_path) -> None:
     assert sizes() == {("proposed", 20_000, 128, 0)} | small
     short = {("proposed-shared", 200, 2, 20), ("plus", 200, 2, 20)}
     assert sizes(iterations=50, batch_size=8) == {("proposed", 50, 8, 0)} | short
-    with pytest.raises(ValueError, match="divides batches by 4: batch_size must be a multiple, got 6"):
+    with pytest.raises(
+        ValueError, match="divides batches by 4: batch_size must be a multiple, got 6"
+    ):
         sizes(batch_size=6)
     for table, plus, proposed in (
         ("kar", "kar-plus", "bins-15x20"),
@@ -96,7 +104,9 @@ def test_changes_reach_the_methods_that_they_name(request_for) -> None:
     for run in (vanilla, proposed):
         assert run.settings.lambda_smooth == 0.5
         assert (run.precision, run.augment) == ("fp32", ("flip-image", "channels"))
-    (run,) = plan_runs(request_for("prgan", methods=("PrGAN",), set=("prgan:discriminator_channels=8,16,32,64",)))
+    (run,) = plan_runs(
+        request_for("prgan", methods=("PrGAN",), set=("prgan:discriminator_channels=8,16,32,64",))
+    )
     assert run.settings.discriminator_channels == (8, 16, 32, 64)
 
 
@@ -127,7 +137,9 @@ def test_wrong_requests_are_named(given, message, request_for) -> None:
 @pytest.mark.parametrize("table", ["kato", "ablation", "bins", "prgan"])
 def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> None:
     changes = ("precision=fp32", "augment=flip-image,channels", "max_val_images=4")
-    changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("distance=2.5",)}.get(table, ("lambda_prior=0.25",))
+    changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("distance=2.5",)}.get(
+        table, ("lambda_prior=0.25",)
+    )
     asked = {"iterations": 7, "layout": "kar", "set": changes}
     for run in plan_runs(Request(table, tmp_path / "a b", tmp_path, "chair", **asked)):
         assert Train.parse("train", shlex.split(command_line(run))[2:]).config == run
@@ -160,17 +172,23 @@ def test_runs_made_by_hand_are_adopted_and_others_are_named(make, request_for) -
     assert find_conflict(run) == ""
     run.output.mkdir(parents=True)
     precision = resolve_precision("auto", "cpu")
-    config = dataclasses.replace(run, threads=7, iterations=3, val_split="test", precision=precision)
+    config = dataclasses.replace(
+        run, threads=7, iterations=3, val_split="test", precision=precision
+    )
     write_json(run.output / "config.json", config_to_dict(config))
     assert find_conflict(run) == "", "these options do not decide the result"
-    with pytest.raises(ValueError, match=r"batch_size: 4 in the run, 5 asked for(.|\n)*choose another --output"):
+    with pytest.raises(
+        ValueError, match=r"batch_size: 4 in the run, 5 asked for(.|\n)*choose another --output"
+    ):
         make(request_for(methods=("proposed",), batch_size=5))
     with pytest.raises(ValueError, match=r"lambda_prior: 1.0 in the run, 0.5 asked for"):
         make(request_for(methods=("proposed",), set=("lambda_prior=0.5",), report_only=True))
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys, request_for, read_report) -> None:
-    call = request_for(category="fails,airplane", methods=("vanilla",), threads=3, workers=Workers(2))
+    call = request_for(
+        category="fails,airplane", methods=("vanilla",), threads=3, workers=Workers(2)
+    )
     assert run_experiment(call, work=stub_work.work) == 1
     shown = capsys.readouterr().err
     assert "FAILED fails/vanilla-seed0; the end of its log:" in shown
@@ -188,7 +206,9 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, reque
 
     def interrupt() -> None:
         deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and not all(log.is_file() and "waiting" in log.read_text() for log in logs):
+        while time.monotonic() < deadline and not all(
+            log.is_file() and "waiting" in log.read_text() for log in logs
+        ):
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -201,7 +221,9 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, reque
 
 def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, read_report) -> None:
     """Two steps in a worker; then only the measurement; then a refusal to measure it on other data."""
-    given = Request("kato", tiny_folder, tmp_path / "out", "airplane", ("vanilla",), 2, 4, set=SMALL, threads=1)
+    given = Request(
+        "kato", tiny_folder, tmp_path / "out", "airplane", ("vanilla",), 2, 4, set=SMALL, threads=1
+    )
     assert run_experiment(given) == 0
     folder = tmp_path / "out" / "runs" / "airplane" / "vanilla-seed0"
     result = json.loads((folder / "test.json").read_text())
@@ -225,11 +247,15 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, read_report) 
         train_and_test(moved)
 
 
-def test_poses_are_estimated_for_the_runs_that_need_them(tmp_path, tiny_folder, monkeypatch) -> None:
+def test_poses_are_estimated_for_the_runs_that_need_them(
+    tmp_path, tiny_folder, monkeypatch
+) -> None:
     """Once; a report without training has their errors, and the IoUs of both runs."""
     quick = functools.partial(PoseOptions, steps=1, restarts=1, prototypes=2)
     monkeypatch.setattr(experiment, "PoseOptions", quick)
-    given = Request("poses", tiny_folder, tmp_path / "out", "airplane", (), 1, 8, seeds=1, set=SMALL, threads=1)
+    given = Request(
+        "poses", tiny_folder, tmp_path / "out", "airplane", (), 1, 8, seeds=1, set=SMALL, threads=1
+    )
     runs = plan_runs(given)
     assert all(map(train_and_test, runs))
     table, poses = tmp_path / "out/poses/airplane-seed0.npz", [run.poses for run in runs]
@@ -238,15 +264,21 @@ def test_poses_are_estimated_for_the_runs_that_need_them(tmp_path, tiny_folder, 
     experiment.estimate_poses(runs[1])
     assert run_experiment(dataclasses.replace(given, report_only=True)) == 0
     _, row = json.loads((tmp_path / "out/poses.json").read_text())["poses"]
-    known, estimated = (json.loads((run.output / "test.json").read_text())["voxel_iou"] for run in runs)
+    known, estimated = (
+        json.loads((run.output / "test.json").read_text())["voxel_iou"] for run in runs
+    )
     assert row[-3:] == [f"{value:.3f}" for value in (known, estimated, estimated / known)]
     errors = json.loads(table.with_suffix(".json").read_text())
     assert row[2:4] == [f"{errors[name]:.3f}" for name in ("accuracy", "updated_accuracy")]
     assert "--poses OUTPUT/poses/CATEGORY-seedSEED.npz" in (tmp_path / "out/poses.md").read_text()
 
 
-def test_a_run_goes_on_or_starts(finished_run, tiny_folder, request_for, tmp_path, monkeypatch) -> None:
-    given = dataclasses.replace(request_for(methods=("proposed",), iterations=9, set=SMALL), data=tiny_folder)
+def test_a_run_goes_on_or_starts(
+    finished_run, tiny_folder, request_for, tmp_path, monkeypatch
+) -> None:
+    given = dataclasses.replace(
+        request_for(methods=("proposed",), iterations=9, set=SMALL), data=tiny_folder
+    )
     (run,) = plan_runs(given)
     resumed = []
 
@@ -255,7 +287,9 @@ def test_a_run_goes_on_or_starts(finished_run, tiny_folder, request_for, tmp_pat
         return Summary(config.output, Progress(step=5), False, 0.0)
 
     monkeypatch.setattr(experiment, "train", train)
-    monkeypatch.setattr(experiment, "evaluate_runs", lambda *_, **__: pytest.fail("a stopped run is not measured"))
+    monkeypatch.setattr(
+        experiment, "evaluate_runs", lambda *_, **__: pytest.fail("a stopped run is not measured")
+    )
     assert not train_and_test(run)
     shutil.copytree(finished_run, run.output)
     assert not train_and_test(run)

@@ -38,8 +38,16 @@ _SMALL = ("encoder=conv-small", "generator=sphere-small")
 _VPL = ("discriminator_channels=8", "image_size=64", "silhouette_size=64")
 #: --set of every variant: its smallest networks.
 SMALLER = dict.fromkeys(VARIANTS, _SMALL) | {
-    **{name: (*_SMALL, "bank_size=4") for name in VARIANTS if name.startswith("plus") or name == "kar-plus"},
-    **{name: (*_SMALL, "warmup_steps=1") for name in VARIANTS if "schedule" in name or "shared" in name},
+    **{
+        name: (*_SMALL, "bank_size=4")
+        for name in VARIANTS
+        if name.startswith("plus") or name == "kar-plus"
+    },
+    **{
+        name: (*_SMALL, "warmup_steps=1")
+        for name in VARIANTS
+        if "schedule" in name or "shared" in name
+    },
     "vpl": ("discriminator_channels=8", "encoder=preact-resnet18"),
     "kar-vpl": _VPL,
     "pascal-vpl": (*_VPL, "generator=cube-conv"),
@@ -58,7 +66,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """
     folder = tmp_path_factory.mktemp("tables")
     for layout, options in DATA.items():
-        make_dataset(DatasetConfig(output=folder / layout, category="airplane", layout=layout, **options))
+        make_dataset(
+            DatasetConfig(output=folder / layout, category="airplane", layout=layout, **options)
+        )
     for name, table in TABLES.items():
         words = f"{name} --data {folder / table.layout} --output {folder / 'out'} --category airplane --iterations 2 "
         words += f"--batch-size 8 --jobs 2 --threads 1 --seeds {PASCAL_SEEDS if name == 'pascal' else 1} "
@@ -101,10 +111,18 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
                 "mmd_paper",
                 "chamfer_l1",
             ):
-                assert 0 <= result[measure] <= (1 if "iou" in measure or "score" in measure else math.inf), label
+                assert (
+                    0
+                    <= result[measure]
+                    <= (1 if "iou" in measure or "score" in measure else math.inf)
+                ), label
             assert result["voxel_iou"] > 0, "even an untrained shape overlaps with an airplane"
-            assert result["iterations"] == 2 * (BATCH_DIVISOR if VARIANTS[row.variant].small_batches_of else 1)
-            assert [point[1] for point in result["curve"]] == [result["iterations"]], "the last step is validated"
+            assert result["iterations"] == 2 * (
+                BATCH_DIVISOR if VARIANTS[row.variant].small_batches_of else 1
+            )
+            assert [point[1] for point in result["curve"]] == [result["iterations"]], (
+                "the last step is validated"
+            )
         mean = sum(result[table.measure] for result in results) / len(results)
         cell, mean_cell = cells["here (mmd)" if name == "mmd" else "here (kato18)"]
         assert cell == mean_cell and cell.startswith(f"{mean:.3f}"), label
@@ -112,7 +130,9 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
         if name != "mmd":
             low, high = map(float, re.search(r"\[(.*), (.*)\]", cell).groups())
             assert low - 1e-3 <= mean <= high + 1e-3
-        in_list = {line[1]: line[2:] for line in lines if line[0] == f"airplane/{row.variant}-seed0"}
+        in_list = {
+            line[1]: line[2:] for line in lines if line[0] == f"airplane/{row.variant}-seed0"
+        }
         assert f"{results[0]['chamfer_l1']:.4f}" in in_list[f"step {results[0]['step']}"]
 
 
@@ -126,5 +146,8 @@ def test_settings_of_rows_reach_their_runs(folder: Path) -> None:
         "15x15": 96,
         "10x10": 216,
     }
-    files = {widths: folder / f"out/runs/airplane/bins-{widths}-seed0/best.safetensors" for widths in wanted}
+    files = {
+        widths: folder / f"out/runs/airplane/bins-{widths}-seed0/best.safetensors"
+        for widths in wanted
+    }
     assert {widths: load_metadata(file).info.num_views for widths, file in files.items()} == wanted

@@ -84,7 +84,9 @@ def debs(tmp_path: Path) -> Path:
 
 
 def contents(folder: Path) -> dict[Path, bytes]:
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
 
 
 def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> None:
@@ -97,12 +99,17 @@ def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> 
     ]
     assert [row["author"] for row in rows] == ["B. Maker", "A. Maker", "A. Maker"]
     assert [row["licence"] for row in rows] == ["GPL-2+", "Free Art License 1.3", "CC0"]
-    assert {row["version"] for row in rows} == {"1:2.0-1"} and rows[1]["source"] == "Test.sh3f!/m/chair.obj"
+    assert {row["version"] for row in rows} == {"1:2.0-1"} and rows[1][
+        "source"
+    ] == "Test.sh3f!/m/chair.obj"
     reasons = {source.rpartition("/")[2]: reason for source, reason in report.dropped.items()}
     assert reasons.pop("copy.obj") == "near-duplicate of chair/test-chair (surface IoU 1.000)"
     assert reasons.pop("tall.obj").startswith("stretched near-duplicate of chair/test-chair")
     assert reasons.keys() == {"broken.obj", "lost.obj", "odd.dae"}
-    assert "chair        1 meshes\n" in report.summary() and "\n1 skipped: near-duplicate" in report.summary()
+    assert (
+        "chair        1 meshes\n" in report.summary()
+        and "\n1 skipped: near-duplicate" in report.summary()
+    )
     assert (tmp_path / "out/licences/sweethome3d-furniture.copyright").read_bytes() == b"Free-Art"
     for row in rows:
         mesh = trimesh.load(tmp_path / "out" / row["file"], process=False)
@@ -118,7 +125,9 @@ def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> 
 def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path) -> None:
     fetch(tmp_path / "out", debs)
     mesh = trimesh.load(tmp_path / "out/airplane/plane.ply", process=False)
-    assert mesh.vertices[mesh.vertices[:, 1].argmax(), 2] < -0.3  # the fin is at the tail: the nose is towards +z
+    assert (
+        mesh.vertices[mesh.vertices[:, 1].argmax(), 2] < -0.3
+    )  # the fin is at the tail: the nose is towards +z
     assert mesh.vertices[mesh.vertices[:, 1].argmin(), 0] > 0.3  # the left wing is at +x
     np.testing.assert_allclose(mesh.extents, [0.8, 0.4, 1.0], atol=1e-6)  # with the disc 0.801 in z
 
@@ -162,12 +171,16 @@ def test_packages_are_downloaded_if_they_are_not_there(
 def test_clean_mesh_welds_and_drops() -> None:
     corners, quads = box((0, 0, 0), (2, 1, 1))
     vertices = np.concatenate([corners[cut(corners, quads).faces].reshape(-1, 3), [[99, 99, 99]]])
-    mesh = clean_mesh(RawMesh(vertices, np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]])))
+    mesh = clean_mesh(
+        RawMesh(vertices, np.concatenate([np.arange(36).reshape(-1, 3), [[0, 0, 1]], [[2, 1, 0]]]))
+    )
     assert (mesh.vertices.shape, mesh.faces.shape, mesh.is_watertight) == ((8, 3), (12, 3), True)
     np.testing.assert_allclose(mesh.bounds, [[-0.5, -0.25, -0.25], [0.5, 0.25, 0.25]], atol=1e-12)
     for corner, message in (((2, 0, 0), "no face has an area"), ((0, 1, 0), "flat")):
         with pytest.raises(ValueError, match=message):
-            clean_mesh(RawMesh(np.array([[0, 0, 0], [1, 0, 0], corner], float), np.array([[0, 1, 2]])))
+            clean_mesh(
+                RawMesh(np.array([[0, 0, 0], [1, 0, 0], corner], float), np.array([[0, 1, 2]]))
+            )
 
 
 def test_surface_grid_of_a_box() -> None:
@@ -212,7 +225,9 @@ def test_airplane_files(path: str, whole: bool) -> None:
 
 
 def test_catalogue_text() -> None:
-    general, entries = read_catalogue("# x\nlicense=L\nempty=\nname#2=B\n name#1 = caf\\u00e9 = A\nmodel#1=/m\n")
+    general, entries = read_catalogue(
+        "# x\nlicense=L\nempty=\nname#2=B\n name#1 = caf\\u00e9 = A\nmodel#1=/m\n"
+    )
     assert general == {"license": "L", "empty": ""}
     assert entries == [{"name": "café = A", "model": "/m"}, {"name": "B"}]
 
@@ -243,13 +258,21 @@ def test_effects_are_found_by_shape() -> None:
 
 def test_ac3d_tree_names_and_transforms() -> None:
     child = ac_object("child", (0, 0, 0), (1, 1, 1)).replace("numvert", "loc 10 0 0\nnumvert")
-    turned = 'OBJECT group\nname "g"\ndata 5\nkids9\nrot 0 1 0 -1 0 0 0 0 1\nloc 0 0 5\nkids 1\n' + child
+    turned = (
+        'OBJECT group\nname "g"\ndata 5\nkids9\nrot 0 1 0 -1 0 0 0 0 1\nloc 0 0 5\nkids 1\n' + child
+    )
     blank = ac_object("blank", (0, 0, 0), (2, 2, 2)).replace("numsurf", "\nnumsurf")
     line = ac_object("line", (0, 0, 0), (1, 1, 1)).replace("0X30", "0x2")
-    blur = ac_object("Prop-Blur", (0, 0, 0), (1, 1, 1), "kids 1") + "\n" + ac_object("inner", (0, 0, 0), (1, 1, 1))
+    blur = (
+        ac_object("Prop-Blur", (0, 0, 0), (1, 1, 1), "kids 1")
+        + "\n"
+        + ac_object("inner", (0, 0, 0), (1, 1, 1))
+    )
     parts = read_ac3d(ac_text(turned, blank, line, blur), skip=lambda name: "Blur" in name)
     assert [one.vertices.max() for one in parts] == [11, 2]
-    np.testing.assert_allclose(parts[0].vertices.min(axis=0), [-1, 10, 5])  # row vectors: (x, y) -> (-y, x)
+    np.testing.assert_allclose(
+        parts[0].vertices.min(axis=0), [-1, 10, 5]
+    )  # row vectors: (x, y) -> (-y, x)
     assert len(parts[0].faces) == 12
 
 

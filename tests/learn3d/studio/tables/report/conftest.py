@@ -15,7 +15,9 @@ RATES = {"proposed": 1e-4, "vanilla": 0.03}  # so that their shapes differ
 
 
 @pytest.fixture(scope="module")
-def runs(tiny_run: Callable[..., TrainConfig], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def runs(
+    tiny_run: Callable[..., TrainConfig], tmp_path_factory: pytest.TempPathFactory
+) -> list[Path]:
     """Folders of runs of two methods on the tiny data."""
     pytest.importorskip("plotly")
     folders = [tmp_path_factory.mktemp("runs") / name for name in PRESETS]

@@ -16,17 +16,24 @@ from learn3d.studio.tables import report
 
 def write_metrics(folder: Path, records: list[object], tail: str = "") -> Path:
     folder.mkdir(exist_ok=True)
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records) + tail)
+    (folder / "metrics.jsonl").write_text(
+        "".join(json.dumps(record) + "\n" for record in records) + tail
+    )
     return folder
 
 
 def records(offset: float, steps: int = 4) -> list[dict]:
-    training = [{"step": 50 * k, "split": "train", "projection": 1 / k + offset, "total": 2.0} for k in range(1, steps)]
+    training = [
+        {"step": 50 * k, "split": "train", "projection": 1 / k + offset, "total": 2.0}
+        for k in range(1, steps)
+    ]
     return [*training, {"step": 100, "split": "val", "voxel_iou": 0.5 + offset, "seconds": 3}]
 
 
 def test_metrics_become_curves(tmp_path) -> None:
-    read = report.read_metrics(write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl'))
+    read = report.read_metrics(
+        write_metrics(tmp_path / "run", records(0.25), tail='{"step": 200, "spl')
+    )
     assert set(read) == {("train", "projection"), ("train", "total"), ("val", "voxel_iou")}
     assert read["train", "projection"] == pytest.approx({50: 1.25, 100: 0.75, 150: 1 / 3 + 0.25})
     titles = [plot["title"] for plot in report.draw_curves([read])]

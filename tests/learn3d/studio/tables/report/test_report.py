@@ -37,7 +37,9 @@ class Page(HTMLParser):
         self._open = tag
 
     def handle_data(self, text: str) -> None:
-        (self.scripts if self._open == "script" else self.texts).append(text) if text.strip() else None
+        (self.scripts if self._open == "script" else self.texts).append(
+            text
+        ) if text.strip() else None
 
     def handle_endtag(self, tag: str) -> None:
         self._open = None
@@ -50,11 +52,22 @@ def read(values: dict[str, str]) -> np.ndarray:
 
 def test_the_page_asks_for_nothing_from_elsewhere(page) -> None:
     found = Page(page)
-    addresses = [value for _, attributes in found.tags for name, value in attributes.items() if name in ("src", "href")]
+    addresses = [
+        value
+        for _, attributes in found.tags
+        for name, value in attributes.items()
+        if name in ("src", "href")
+    ]
     assert addresses and all(address.startswith("data:image/png;base64,") for address in addresses)
-    policies = [tag[1]["content"] for tag in found.tags if tag[1].get("http-equiv") == "Content-Security-Policy"]
+    policies = [
+        tag[1]["content"]
+        for tag in found.tags
+        if tag[1].get("http-equiv") == "Content-Security-Policy"
+    ]
     assert len(policies) == 1 and "default-src 'none'" in policies[0] and "http" not in policies[0]
-    assert "http" not in page.read_text("utf-8").replace(get_plotlyjs(), "").replace("http-equiv", "")
+    assert "http" not in page.read_text("utf-8").replace(get_plotlyjs(), "").replace(
+        "http-equiv", ""
+    )
     assert page.stat().st_size < 8e6
     assert not list(page.parent.glob(".*"))
 
@@ -67,9 +80,14 @@ def test_no_path_of_the_machine_is_in_it(page, runs, tiny_folder) -> None:
 
 
 def test_names_are_text(page, tmp_path, runs, tiny_set, monkeypatch) -> None:
-    assert "</script><b>one" in Page(page).texts and Page(page).data["runs"][0]["name"] == "</script><b>one"
+    assert (
+        "</script><b>one" in Page(page).texts
+        and Page(page).data["runs"][0]["name"] == "</script><b>one"
+    )
     assert page.read_text("utf-8").replace(get_plotlyjs(), "").lower().count("</script>") == 3
-    hostile = dataclasses.replace(tiny_set, object_names=("<img src=x onerror=a()>", "{{ 7 * 7 }}", "\u202eabc\x1b"))
+    hostile = dataclasses.replace(
+        tiny_set, object_names=("<img src=x onerror=a()>", "{{ 7 * 7 }}", "\u202eabc\x1b")
+    )
     monkeypatch.setattr(checkpoint, "load_data", lambda *_, **__: hostile)
     write_report(runs, tmp_path / "page.html")
     found = Page(tmp_path / "page.html")
@@ -82,7 +100,9 @@ def test_names_are_text(page, tmp_path, runs, tiny_set, monkeypatch) -> None:
 
 def test_figures_are_those_of_evaluate(page, runs) -> None:
     wanted, found = evaluate_runs(runs, split="train"), Page(page)
-    rows = re.findall(r"<b>(.+)</b> \[(.+), (.+)\]</td>\n<td>[^<]*</td><td>([^<]+)</td>", page.read_text())
+    rows = re.findall(
+        r"<b>(.+)</b> \[(.+), (.+)\]</td>\n<td>[^<]*</td><td>([^<]+)</td>", page.read_text()
+    )
     assert len(rows) == 2 and rows[0] != rows[1]
     for (iou, low, high, mmd), result in zip(rows, wanted, strict=True):
         assert (iou, mmd) == (f"{result.voxel_iou:.3f}", f"{result.mmd:.3f}")
@@ -95,7 +115,9 @@ def test_figures_are_those_of_evaluate(page, runs) -> None:
         assert item["ious"][0] == pytest.approx(ious[item["index"]], abs=1e-4)
         assert item["means"][0] == pytest.approx(own.mean(), abs=1e-4)
     by_view = found.data["views"][0]
-    assert len(by_view["azimuths"]) == 24 and np.mean(by_view["ious"]) == pytest.approx(ious.mean(), abs=1e-4)
+    assert len(by_view["azimuths"]) == 24 and np.mean(by_view["ious"]) == pytest.approx(
+        ious.mean(), abs=1e-4
+    )
 
 
 def test_objects_go_from_the_best_to_the_worst(page) -> None:
@@ -106,37 +128,57 @@ def test_objects_go_from_the_best_to_the_worst(page) -> None:
         page.read_text(),
     )
     assert len(items) == 2 and means[0] > means[1]
-    assert [bool(shown) for shown, _ in rows] == [True, False, True], "the best and the worst of three have shapes"
+    assert [bool(shown) for shown, _ in rows] == [True, False, True], (
+        "the best and the worst of three have shapes"
+    )
     assert [rows[0][1], rows[2][1]] == [item["name"] for item in items]
 
 
 def test_meshes_are_those_of_the_networks_seen_as_in_mesh_files(page, runs) -> None:
     item = Page(page).data["items"][0]
     method, config, _ = checkpoint.load_method(runs[1] / "last.safetensors")
-    shape = method.decode(method.encode(checkpoint.load_data(config, "train").batch([item["index"]]).images))
+    shape = method.decode(
+        method.encode(checkpoint.load_data(config, "train").batch([item["index"]]).images)
+    )
     mesh = item["meshes"][1]
     points = np.stack([read(mesh[axis]) for axis in "xyz"], axis=1) * UNIT
     x, y, z = shape.vertices[0].numpy().T
-    assert np.allclose(points, np.stack([-z, x, y], axis=1), atol=UNIT), "z is up, x the front, right-handed"
+    assert np.allclose(points, np.stack([-z, x, y], axis=1), atol=UNIT), (
+        "z is up, x the front, right-handed"
+    )
     triangles = np.stack([read(mesh[axis]) for axis in "ijk"], axis=1)
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
     assert (a * np.cross(b, c)).sum() > 0, "a volume: normals point outwards"
     assert len(item["meshes"]) == 3
     dataset = checkpoint.load_data(config, "train")
     voxels = dataset.convention.to_object(dataset.batch([item["index"]]).voxels)[0].numpy()
-    sides = np.array([np.ptp(np.flatnonzero(voxels.any(axis=other))) + 1 for other in ((1, 2), (0, 2), (0, 1))]) / 32
+    sides = (
+        np.array(
+            [
+                np.ptp(np.flatnonzero(voxels.any(axis=other))) + 1
+                for other in ((1, 2), (0, 2), (0, 1))
+            ]
+        )
+        / 32
+    )
     found = [np.ptp(read(item["meshes"][2][axis])) * UNIT for axis in "xyz"]
-    assert np.allclose(found, sides[[2, 0, 1]], atol=0.02), "the true shape is the surface of its voxels, smoothed"
+    assert np.allclose(found, sides[[2, 0, 1]], atol=0.02), (
+        "the true shape is the surface of its voxels, smoothed"
+    )
 
 
-def test_data_without_truth_or_poses_and_files_without_a_log(tmp_path, runs, tiny_set, monkeypatch) -> None:
+def test_data_without_truth_or_poses_and_files_without_a_log(
+    tmp_path, runs, tiny_set, monkeypatch
+) -> None:
     blind = dataclasses.replace(tiny_set, voxels=None)
     monkeypatch.setattr(checkpoint, "load_data", lambda *_, **__: blind)
     write_report([runs[0] / "last.safetensors"], tmp_path / "page.html")
     found = Page(tmp_path / "page.html")
     assert found.data["kind"] == "silhouette IoU" and len(found.data["items"][0]["meshes"]) == 1
     assert found.data["curves"] == []
-    monkeypatch.setattr(checkpoint, "load_data", lambda *_, **__: dataclasses.replace(blind, poses=None))
+    monkeypatch.setattr(
+        checkpoint, "load_data", lambda *_, **__: dataclasses.replace(blind, poses=None)
+    )
     write_report(runs, tmp_path / "page.html")
     found = Page(tmp_path / "page.html")
     assert found.data["views"] == [] and found.data["items"][0]["ious"] == [None, None]
@@ -147,7 +189,9 @@ def test_curves_are_those_of_the_log(page, runs, read_metrics) -> None:
     logged = [line for line in read_metrics(runs[1]) if line["split"] == "val"]
     assert next(iter(curves)) == "voxel IoU, val"
     assert curves["voxel IoU, val"]["steps"][1] == [line["step"] for line in logged] == [2, 4, 6]
-    assert curves["voxel IoU, val"]["values"][1] == pytest.approx([line["voxel_iou"] for line in logged], rel=1e-4)
+    assert curves["voxel IoU, val"]["values"][1] == pytest.approx(
+        [line["voxel_iou"] for line in logged], rel=1e-4
+    )
     assert curves["prior loss, train"]["steps"][1] is None, "the second method has no such loss"
 
 
@@ -179,10 +223,16 @@ def test_mistakes_are_one_clear_line(words: str, message: str, runs, tmp_path, c
         ({"object_names": ("other",)}, {}, "read different images"),
     ],
 )
-def test_runs_that_cannot_be_compared_are_told(runs, tmp_path, monkeypatch, change, config, message) -> None:
+def test_runs_that_cannot_be_compared_are_told(
+    runs, tmp_path, monkeypatch, change, config, message
+) -> None:
     first, second = report.open_runs(runs)
-    metadata = dataclasses.replace(second.metadata, config=dataclasses.replace(second.metadata.config, **config))
-    other = dataclasses.replace(second, dataset=dataclasses.replace(second.dataset, **change), metadata=metadata)
+    metadata = dataclasses.replace(
+        second.metadata, config=dataclasses.replace(second.metadata.config, **config)
+    )
+    other = dataclasses.replace(
+        second, dataset=dataclasses.replace(second.dataset, **change), metadata=metadata
+    )
     monkeypatch.setattr(report, "open_runs", lambda *_, **__: [first, other])
     with pytest.raises(ValueError, match=message):
         write_report(runs, tmp_path / "page.html")

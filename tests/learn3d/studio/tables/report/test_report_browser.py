@@ -75,7 +75,9 @@ def changed(before: np.ndarray, after: np.ndarray) -> float:
     return float((np.abs(before.astype(int) - after).max(axis=2) > 8).mean())
 
 
-def test_a_mesh_is_saved_as_reconstruct_writes_it(page, runs, tiny_folder, browser, tmp_path) -> None:
+def test_a_mesh_is_saved_as_reconstruct_writes_it(
+    page, runs, tiny_folder, browser, tmp_path
+) -> None:
     tab = browser.new_page()
     tab.goto(page.as_uri())
     with tab.expect_download() as download:
@@ -83,9 +85,13 @@ def test_a_mesh_is_saved_as_reconstruct_writes_it(page, runs, tiny_folder, brows
     download.value.save_as(tmp_path / "saved.obj")
     index = tab.evaluate("page.items[0].index")
     tab.close()
-    paths = reconstruct_dataset(runs[0], tmp_path, tiny_folder, [index], split="train", mesh_format="obj")
+    paths = reconstruct_dataset(
+        runs[0], tmp_path, tiny_folder, [index], split="train", mesh_format="obj"
+    )
     saved, wanted = (trimesh.load(path) for path in (tmp_path / "saved.obj", paths[0]))
-    assert len(saved.faces) == len(wanted.faces) and np.allclose(saved.bounds, wanted.bounds, atol=2e-4)
+    assert len(saved.faces) == len(wanted.faces) and np.allclose(
+        saved.bounds, wanted.bounds, atol=2e-4
+    )
     assert saved.volume == pytest.approx(wanted.volume, rel=0.01)
 
 
@@ -157,12 +163,16 @@ def test_it_can_be_read_in_narrow_and_wide_windows_in_light_and_dark(page, visit
         tab.emulate_media(color_scheme=scheme)
         picture(tab)
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
-        for place in tab.locator(".mesh, .mesh canvas, .plot, .plot .main-svg >> nth=0, #picture").all():
+        for place in tab.locator(
+            ".mesh, .mesh canvas, .plot, .plot .main-svg >> nth=0, #picture"
+        ).all():
             box = place.bounding_box()
             assert 120 <= box["width"] and box["x"] >= 0 and box["x"] + box["width"] <= width
         assert (picture(tab).std(axis=(0, 1)) > 5).all()
         ground, text = (brightness(tab, name) for name in ("backgroundColor", "color"))
-        assert (ground > 0.9 and text < 0.4) if scheme == "light" else (ground < 0.15 and text > 0.6)
+        assert (
+            (ground > 0.9 and text < 0.4) if scheme == "light" else (ground < 0.15 and text > 0.6)
+        )
 
 
 def brightness(tab: Any, attribute: str) -> float:
