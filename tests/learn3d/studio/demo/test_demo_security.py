@@ -138,7 +138,7 @@ def test_thirty_visitors_at_once_all_get_their_mesh_and_see_their_place(server, 
 
 
 def test_words_of_a_visitor_reach_the_terminal_written_out(monkeypatch, capsys) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise RuntimeError("\x1b]0;title\x07")
 
     class Server(serving.uvicorn.Server):
