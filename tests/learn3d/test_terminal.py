@@ -80,12 +80,16 @@ def test_a_lost_result_is_an_error_and_lost_progress_is_none(
 @pytest.mark.parametrize(
     "program", [["-c", PROGRAM.format(call="say")], ["-m", "learn3d", "train", "--help"]]
 )
-def test_an_output_that_nobody_reads_is_no_error(program: list[str]) -> None:
+def test_an_output_that_nobody_reads_is_no_error(program: list[str], tmp_path) -> None:
     """As with `| head`."""
     reading, writing = os.pipe()
     os.close(reading)
     result = subprocess.run(
-        [sys.executable, *program], stdout=writing, stderr=subprocess.PIPE, timeout=120
+        [sys.executable, *program],
+        stdout=writing,
+        stderr=subprocess.PIPE,
+        timeout=120,
+        cwd=tmp_path,
     )
     os.close(writing)
     assert (result.returncode, result.stderr) == (0, b"")
