@@ -27,6 +27,8 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
     and ValueError if it needs an extension that is not supported.
     """
     text, binary = _chunks(content) if content[:4] == b"glTF" else (content, None)
+    if not text.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        raise ValueError("it begins with neither glTF nor {")
     if not text.rstrip().endswith(b"}"):
         raise EOFError("its JSON does not end")
     tree = parse_json(text)

@@ -398,6 +398,7 @@ REFUSED = {
         "triangle strips",
     ),
     "web.off": ("<html></html>", "does not begin with OFF"),
+    "web.glb": ("<html></html>", "begins with neither glTF nor {"),
     "web.ply": ("<html></html>", "does not begin with the line `ply`"),
     "corner.off": (
         "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1\n",
