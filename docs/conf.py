@@ -20,19 +20,19 @@ release = nmr.__version__
 html_title = f"nmr + learn3d {release}"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "sphinx_copybutton"]
+# show_gallery has the gallery; logs are downloads
 exclude_patterns = [
     "_build",
     "examples/README.md",
     "log",
-]  # show_gallery has the gallery; logs are downloads
+]
 default_role = "literal"  # `name` in a docstring
 
 highlight_language = "none"  # blocks without a language are drawings and tables
 myst_heading_anchors = 4  # [text](page.md#a-heading), as in the repository's view
 nb_merge_streams = True
-nb_execution_mode = (
-    "off"  # notebooks are shown with the outputs that they carry; tests/test_examples.py runs them
-)
+# notebooks are shown with the outputs that they carry; tests/test_examples.py runs them
+nb_execution_mode = "off"
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -94,9 +94,8 @@ def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
     for link in list(doctree.findall(addnodes.pending_xref)):
         if link.get("refdomain") != "doc" or link["reftarget"] in app.env.found_docs:
             continue
-        target = (
-            Path(app.srcdir) / f"{link['reftarget']}.md"
-        )  # outside of docs, the target is absolute
+        # outside of docs, the target is absolute
+        target = Path(app.srcdir) / f"{link['reftarget']}.md"
         if target.is_file():
             relative = os.path.relpath(target, Path(app.env.doc2path(link["refdoc"])).parent)
             link.replace_self(
@@ -138,11 +137,9 @@ def _hashable(entry: Parameter) -> Parameter:
 
 
 def setup(app: Sphinx) -> None:
-    app.connect(
-        "autodoc-process-docstring", explain_all_parameters, priority=400
-    )  # before numpydoc
+    # before numpydoc
+    app.connect("autodoc-process-docstring", explain_all_parameters, priority=400)
     app.connect("source-read", show_gallery)
     app.connect("source-read", offer_colab)
-    app.connect(
-        "doctree-read", hand_out_files, priority=400
-    )  # before Sphinx collects the downloads
+    # before Sphinx collects the downloads
+    app.connect("doctree-read", hand_out_files, priority=400)

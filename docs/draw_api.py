@@ -79,9 +79,8 @@ def main(output: Path = Path("output")) -> None:
     look = {"colors": colors, "lights": lights, "background": 1.0} | square
     near, far = 2.3, 3.2
     normals = nmr.render(*mesh, outputs=("normals", "alpha"), **square)
-    voxels = (
-        nmr.voxelize(vertices + 0.5, faces).flip(-1).sum(-1).clamp(max=12) / 12
-    )  # [1, x, y]: seen along z
+    # [1, x, y]: seen along z
+    voxels = nmr.voxelize(vertices + 0.5, faces).flip(-1).sum(-1).clamp(max=12) / 12
     side = voxels[0].T.flip(0).repeat_interleave(SIZE // 32, 0).repeat_interleave(SIZE // 32, 1)
     light = {"lights": lights, "background": 1.0}
     spheres = [nmr.icosphere(level) for level in (1, 3)]

@@ -22,9 +22,8 @@ METHODS = {
     "proposed": ("Proposed", "#00798c"),
     "plus": ("Plus", "#7a7a7a"),
 }
-Curves = dict[
-    str, dict[str, dict[str, np.ndarray]]
-]  # by panel, method and seed; rows of step, IoU and MMD
+# by panel, method and seed; rows of step, IoU and MMD
+Curves = dict[str, dict[str, dict[str, np.ndarray]]]
 
 
 def read_curves(files: list[str]) -> Curves:

@@ -31,12 +31,13 @@ class Picture:
     result: str  # what it leaves there: a path in {folder} or in the repository, the last match of a pattern; or
     # NOTEBOOK#K: picture K of its outputs, made small
     sources: tuple[str, ...]  # files that decide what it shows
+    # left, top, right and bottom of the part that is kept
     box: tuple[float, float, float, float] = (
         0,
         0,
         1,
         1,
-    )  # left, top, right and bottom of the part that is kept
+    )
     small: bool = False  # made to fit into 320 x 240 pixels
 
 

@@ -15,9 +15,8 @@ from learn3d.settings import Count, FilePath, Items, Step, checked
 
 T = TypeVar("T")
 _MAY_DIFFER = "a resumed run may have another value"
-MayDiffer = Annotated[
-    T, _MAY_DIFFER
-]  # an option that changes how a run computes or reports, not its result
+# an option that changes how a run computes or reports, not its result
+MayDiffer = Annotated[T, _MAY_DIFFER]
 
 
 @checked
@@ -139,9 +138,8 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
     updates = "pose_updates" if config.poses is not None and config.pose_updates > 0 else ""
     varies = schedule or config.settings.varies_over_run or updates
-    allowed = (_MAY_DIFFER_NAMES | {"preset"}) - (
-        {"iterations"} if varies else set()
-    )  # a preset only sets defaults
+    # a preset only sets defaults
+    allowed = (_MAY_DIFFER_NAMES | {"preset"}) - ({"iterations"} if varies else set())
     return [
         f"{name}: {old.get(name)!r} in the run, {new.get(name)!r} asked for"
         + f" ({varies} depends on it)" * (name == "iterations")

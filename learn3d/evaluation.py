@@ -49,12 +49,10 @@ class Evaluation:
 
     object_ids: Tensor  # int64 [M]
     view_ids: Tensor  # int64 [M]
-    values: dict[
-        str, Tensor
-    ]  # float64 [M] by the names of `MEASURED`; NaN if undefined or not asked for
-    means: dict[
-        str, float
-    ]  # means without NaN, and "mmd", "mmd_paper"; undefined ones are left out
+    # float64 [M] by the names of `MEASURED`; NaN if undefined or not asked for
+    values: dict[str, Tensor]
+    # means without NaN, and "mmd", "mmd_paper"; undefined ones are left out
+    means: dict[str, float]
 
     @property
     def voxel_iou(self) -> float | None:

@@ -60,9 +60,8 @@ class Task:
     """A function call in its own process."""
 
     name: str  # for messages
-    function: Callable[
-        ..., bool
-    ]  # importable; returns False if SIGTERM stopped it and it can be resumed
+    # importable; returns False if SIGTERM stopped it and it can be resumed
+    function: Callable[..., bool]
     arguments: tuple[Any, ...]
     log: Path  # file to which its output is appended
 

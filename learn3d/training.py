@@ -56,9 +56,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")
         }
         method = create_method(config.settings, info, **options)
-        empty_masks = (
-            train_set.check_masks()
-        )  # it may raise, like the next line, before `begin` removes an older run
+        # it may raise, like the next line, before `begin` removes an older run
+        empty_masks = train_set.check_masks()
         rows = distributed.own_rows(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
         method.check_batch(next(batches(train_set, config, rows=rows)))
         run = Run(config, method, info, describe_images(train_set), train_set.candidates)
@@ -89,9 +88,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                 )
                 if chosen := threads.after_step(time.monotonic() - step_began):
                     log.say(f"step {step}: {chosen}")
-                recent = (
-                    progress.losses | losses
-                )  # the last two steps: some methods alternate between two networks
+                # the last two steps: some methods alternate between two networks
+                recent = progress.losses | losses
                 state = {"step": step, "losses": losses, "threads": threads.chosen}
                 progress = dataclasses.replace(
                     progress, **state, seconds=before + time.monotonic() - started

@@ -14,9 +14,8 @@ from ._validate import cast_under_autocast, check_faces, check_vertices, describ
 # A farther point counts as not finite: products of three coordinates, and with gradients, could overflow in float32.
 LARGEST_COORDINATE = 1e12
 
-Values = (
-    Tensor | tuple[Tensor, ...]
-)  # result of check_values: a tensor with a batch axis, or one tensor per mesh
+# result of check_values: a tensor with a batch axis, or one tensor per mesh
+Values = Tensor | tuple[Tensor, ...]
 
 
 class MeshBatch(NamedTuple):
@@ -24,9 +23,8 @@ class MeshBatch(NamedTuple):
 
     vertices: Tensor
     faces: Tensor  # int64; vertex numbers count from the mesh's own first vertex
-    starts: Tensor | None = (
-        None  # packed: int64 [B + 1, 2] on the host, first vertex and face of each mesh, then N, M
-    )
+    # packed: int64 [B + 1, 2] on the host, first vertex and face of each mesh, then N, M
+    starts: Tensor | None = None
     vertex_counts: tuple[int, ...] = ()  # packed: V of each mesh
     face_counts: tuple[int, ...] = ()  # packed: F of each mesh
 

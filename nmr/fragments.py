@@ -75,9 +75,8 @@ class Fragments:
     anti_aliasing: bool
     eps: float
     _drawn: MeshBatch  # the meshes as drawn: faces that cross the near plane are cut
-    _drawn_face_index: (
-        Tensor | None
-    )  # None: surfaces behind others, or blurred, which have no edge gradient
+    # None: surfaces behind others, or blurred, which have no edge gradient
+    _drawn_face_index: Tensor | None
     distances: Tensor | None = None
 
     @property

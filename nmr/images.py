@@ -35,9 +35,8 @@ class Images:
     fragments: Fragments
 
     def __init__(self, outputs: dict[str, Tensor | Fragments]) -> None:
-        object.__setattr__(
-            self, "_names", tuple(outputs)
-        )  # torch.compile cannot follow self.__dict__ in every torch
+        # torch.compile cannot follow self.__dict__ in every torch
+        object.__setattr__(self, "_names", tuple(outputs))
         for name, value in outputs.items():
             object.__setattr__(self, name, value)
 

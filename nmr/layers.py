@@ -140,9 +140,8 @@ def _blend(
     sigma, gamma, zero = sigma.to(colors), gamma.to(colors), colors.new_zeros(())
     covers = torch.where(fragments.covered, torch.sigmoid(-fragments.distances / sigma), zero)
     closeness = (far - fragments.depth) / (far - near)
-    nearest = (
-        closeness.detach().amax(-1, keepdim=True).clamp_min(least)
-    )  # the result does not depend on it
+    # the result does not depend on it
+    nearest = closeness.detach().amax(-1, keepdim=True).clamp_min(least)
     share = covers * torch.exp((closeness - nearest) / gamma)
     behind = torch.exp((least - nearest) / gamma)
     colors = torch.where(fragments.covered.unsqueeze(-1), colors, zero)

@@ -21,9 +21,8 @@ class Obj(NamedTuple):
     """The triangles of an OBJ file, in the order of its polygons. Indices count from 0."""
 
     vertices: np.ndarray  # float64 [V, 3]
-    colors: (
-        np.ndarray | None
-    )  # float64 [V, 3] as written, NaN at vertices without; None if no vertex has a colour
+    # float64 [V, 3] as written, NaN at vertices without; None if no vertex has a colour
+    colors: np.ndarray | None
     uv: np.ndarray  # float64 [T, 2]
     faces: np.ndarray  # int32 [F, 3]
     uv_faces: np.ndarray  # int32 [F, 3]; -1, -1, -1 at a face without texture coordinates
@@ -139,9 +138,8 @@ class _Lines:
         first = np.flatnonzero(np.diff(rows, prepend=-1))  # the words that begin a line
         keys, rows = words[first], rows[first]
         counts = np.diff(first, append=len(words)) - 1  # words behind the keyword
-        a, b, _ = (
-            content[np.minimum(keys + i, len(content) - 1)] | 32 for i in range(3)
-        )  # in lower case
+        # in lower case
+        a, b, _ = (content[np.minimum(keys + i, len(content) - 1)] | 32 for i in range(3))
         one, two = (gap[np.minimum(keys + i, len(content) - 1)] for i in (1, 2))
         is_vertex = (a == ord("v")) & one
         is_uv = (a == ord("v")) & (b == ord("t")) & two & self.with_uv
@@ -355,9 +353,8 @@ def _cut(points: np.ndarray) -> np.ndarray:
     for shift in range(min(size, 8)):
         turned = np.roll(points[left], -shift, axis=1)
         turned -= turned[:, :1].copy()
-        areas = np.cross(
-            turned[:, 1:-1], turned[:, 2:]
-        )  # their sum is Newell's normal, right for concave polygons
+        # their sum is Newell's normal, right for concave polygons
+        areas = np.cross(turned[:, 1:-1], turned[:, 2:])
         folded = (np.einsum("pij,pj->pi", areas, areas.sum(axis=1)) < 0).any(axis=1)
         triangles[left[~folded]] = (fan + shift) % size
         left = left[folded]

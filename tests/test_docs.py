@@ -44,10 +44,11 @@ def test_readme_fits_a_mesh_that_is_right_from_all_sides(tmp_path, monkeypatch, 
     names = run(README)
     assert capsys.readouterr().out.startswith("IoU of the silhouettes: 0.9")
     nmr, vertices, faces = names["nmr"], names["vertices"].detach(), names["faces"]
+    # cameras that the fit did not have
     sides = (
         [0.0, 60.0, -5.0] * 5,
         [24.0 * k + 11 for k in range(15)],
-    )  # cameras that the fit did not have
+    )
     new = nmr.LookAt.from_angles(2.732, *sides, half_fov_deg=12.0, right_handed=True)
     ours = nmr.render_silhouette(vertices, faces, new, fill_back=False, image_size=128)
     theirs = nmr.render_silhouette(names["points"], names["triangles"], new, image_size=128)
@@ -97,9 +98,8 @@ def test_from_pytorch3d_draws_the_same_picture_both_ways():
     exec(
         re.findall(r"^uv = \(.*$", MIGRATING["pytorch3d"].read_text(), flags=re.MULTILINE)[0], names
     )
-    texels = (
-        names["uv"] * torch.tensor([128, 64]) - 0.5
-    )  # a texel centre of align_corners=True is one of ours
+    # a texel centre of align_corners=True is one of ours
+    texels = names["uv"] * torch.tensor([128, 64]) - 0.5
     torch.testing.assert_close(
         texels, torch.tensor([[0.0, 0.0], [127.0, 63.0], [3.0, 5.0]]), atol=1e-4, rtol=0
     )
@@ -112,9 +112,8 @@ def test_from_nvdiffrast_draws_the_same_picture_three_ways():
     torch.testing.assert_close(names["same"], image, atol=0, rtol=0)
     assert (names["also"] - image).abs().max(-1).values.gt(1e-3).float().mean() < 1e-3
     assert names["dr"].__name__ == "nmr.nvdiffrast.torch" and names["pos"].grad.abs().sum() > 0
-    assert (
-        names["drawn"][0, 30, 30].argmax() == 0 and names["drawn"][0, 200, 30].argmax() == 2
-    )  # row 0 is the bottom
+    # row 0 is the bottom
+    assert names["drawn"][0, 30, 30].argmax() == 0 and names["drawn"][0, 200, 30].argmax() == 2
     assert names["zeros"].device.type == "cpu"
 
 

@@ -62,15 +62,13 @@ def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> d
     cameras = [
         nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0) for azimuth in turn
     ]
-    shown = [
-        min(steps, round(steps * (2 * frame / frames) ** 2)) for frame in range(frames)
-    ]  # slowly at first
+    # slowly at first
+    shown = [min(steps, round(steps * (2 * frame / frames) ** 2)) for frame in range(frames)]
     sphere_faces, columns, ious = nmr.icosphere(4)[1], [], {}
     for category, seed in OBJECTS.items():
         mesh = make_shape(category, np.random.default_rng([seed, 0, 0]))
-        vertices = torch.as_tensor(
-            np.asarray(mesh.vertices) * (1, 1, -1), dtype=torch.float32
-        )  # left-handed
+        # left-handed
+        vertices = torch.as_tensor(np.asarray(mesh.vertices) * (1, 1, -1), dtype=torch.float32)
         faces = torch.as_tensor(np.asarray(mesh.faces))
         masks = nmr.render_silhouette(vertices, faces, views, image_size=96)
         shapes = fit(masks, views, steps)

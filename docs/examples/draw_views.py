@@ -85,9 +85,8 @@ def main(output: Path = Path("output"), views: int = 4, image_size: int = 180) -
         smooth=True,
     )
     alpha = images.alpha[..., None]
-    depth = ((images.depth - near) / (far - near))[..., None].expand_as(
-        images.rgb
-    )  # background: white
+    # background: white
+    depth = ((images.depth - near) / (far - near))[..., None].expand_as(images.rgb)
     normals = (images.normals + alpha) / 2 + (1 - alpha)  # from [-1, 1] to [0, 1], on white
     rows = [torch.cat(list(row), dim=1) for row in (images.rgb, depth, normals)]
     picture = (torch.cat(rows).clamp(0, 1) * 255).round().byte()

@@ -36,9 +36,8 @@ def main(
     def draw(eyes: Tensor) -> Tensor:
         """The images of eight guesses, in two rows: uint8 [height, width, 3]."""
         camera = nmr.LookAt(eyes, half_fov_deg=13.0)
-        lights = nmr.Lights(
-            0.4, 0.7, torch.nn.functional.normalize(eyes, dim=1).unsqueeze(1)
-        )  # at the camera
+        # at the camera
+        lights = nmr.Lights(0.4, 0.7, torch.nn.functional.normalize(eyes, dim=1).unsqueeze(1))
         rgb, alpha = nmr.render(
             vertices,
             faces,

@@ -32,9 +32,8 @@ def make_folder(folder: Path, sides: int = 12, height: int = 90, width: int = 12
         eye = np.array([2.5 * np.cos(angle), up, 2.5 * np.sin(angle)])
         forward = -eye / np.linalg.norm(eye)
         right = np.cross(forward, [0, 1, 0]) / np.linalg.norm(np.cross(forward, [0, 1, 0]))
-        R = np.stack(
-            [right, np.cross(forward, right), forward]
-        )  # OpenCV's axes: x right, y down, z forward
+        # OpenCV's axes: x right, y down, z forward
+        R = np.stack([right, np.cross(forward, right), forward])
         camera = {
             "mask": f"{side:02}.png",
             "K": [[200, 0, width / 2], [0, 200, height / 2], [0, 0, 1]],

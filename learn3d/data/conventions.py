@@ -35,9 +35,8 @@ class VoxelConvention:
     name: str
     swap: tuple[int, int]  # dimensions of [B, x, y, z] to exchange
     flip: tuple[int, ...]  # dimensions to reverse after that
-    cube_side: float = (
-        1.0  # side of the cube of the grid, centred at the origin of the object frame
-    )
+    # side of the cube of the grid, centred at the origin of the object frame
+    cube_side: float = 1.0
     kato18_scale: float = 1.0  # scale of meshes before the kato18 voxelizer, whose rays are on the grid's corner lines
 
     def to_axes(self, grid: Tensor) -> Tensor:
@@ -87,13 +86,11 @@ class LayoutProperties:
     voxels: bool  # True if there is ground truth for the voxel IoU
     inverted: bool  # True if colours are stored as 255 - colour, see `ViewDataset.inverted`
     convention: VoxelConvention = KATO  # axes of the voxels
-    validation: bool = (
-        True  # True if there is a split "val"; otherwise networks are validated on "test"
-    )
+    # True if there is a split "val"; otherwise networks are validated on "test"
+    validation: bool = True
     angles: bool = True  # True if poses have azimuth and elevation, as cells of view classes need
-    stretched: bool = (
-        False  # True if images are boxes of photographs with background, stretched to squares
-    )
+    # True if images are boxes of photographs with background, stretched to squares
+    stretched: bool = False
     options: tuple[str, ...] = ()  # those of image_size and views_per_object that the reader takes
 
     def about(self, category: str, split: str) -> dict[str, Any]:

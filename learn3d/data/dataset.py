@@ -37,12 +37,10 @@ class DatasetInfo:
     pose_features: Annotated[int, Field(ge=0, le=64)] = (
         3  # length of `features` of a pose; 0 if poses are unknown
     )
-    mirror_plane_deg: float | None = (
-        None  # result of `data.mirror_plane`; None if none was found or looked for
-    )
-    cube_side: float | None = (
-        None  # side of the cube, centred at the origin, that holds all objects; None if unknown
-    )
+    # result of `data.mirror_plane`; None if none was found or looked for
+    mirror_plane_deg: float | None = None
+    # side of the cube, centred at the origin, that holds all objects; None if unknown
+    cube_side: float | None = None
     solidity: float | None = None  # result of `ViewDataset.solidity`; None if not computed
 
 
@@ -56,13 +54,11 @@ class Batch:
     view_ids: Tensor  # int64 [B] in 0 .. K-1: view classes
     object_ids: Tensor  # int64 [B]: the object in each view, by its number in the split
     class_ids: Tensor  # int64 [B]: the category of each object; 0 if there is only one
-    voxels: (
-        Tensor | None
-    )  # bool [B, 32, 32, 32]: ground truth in the data set's axes; None if unknown
+    # bool [B, 32, 32, 32]: ground truth in the data set's axes; None if unknown
+    voxels: Tensor | None
     crops: Crops | None = None  # original images for the augmentation "crop"; None if unknown
-    depth: Tensor | None = (
-        None  # float32 [B, 64, 64]: along the optical axis, 0: no surface; None if unknown
-    )
+    # float32 [B, 64, 64]: along the optical axis, 0: no surface; None if unknown
+    depth: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -89,27 +85,22 @@ class ViewDataset:
     view_names: tuple[str, ...]  # K names of the view classes
     object_ids: np.ndarray  # int64 (int32 if on disk) [M] in 0 .. N-1: the object in each view
     object_names: tuple[str, ...]  # N names from the files
-    voxels: (
-        Array | None
-    )  # bool [N, 32, 32, 32] ground truth in the data set's own axes; None if unknown
+    # bool [N, 32, 32, 32] ground truth in the data set's own axes; None if unknown
+    voxels: Array | None
     convention: VoxelConvention  # axes of the voxels
     inverted: bool  # True if colours are stored as 255 - colour, so that a white background is 0 (Kato's form)
-    masks: Array | None = (
-        None  # uint8 [M, 64, 64] ground truth silhouettes; None: the images' fourth channel
-    )
+    # uint8 [M, 64, 64] ground truth silhouettes; None: the images' fourth channel
+    masks: Array | None = None
     depth: Array | None = None  # uint8 [M, 64, 64], see `depth_levels`; None if unknown
-    class_ids: np.ndarray | None = (
-        None  # int64 [N]: category of each object; None for a single category
-    )
+    # int64 [N]: category of each object; None for a single category
+    class_ids: np.ndarray | None = None
     class_names: tuple[str, ...] = ()  # names of the categories; () for a single one
-    points: Array | None = (
-        None  # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
-    )
+    # float32 [N, P, 3]: points on the true surfaces in the object frame; None if unknown
+    points: Array | None = None
     crops: Crops | None = None  # M original images for the augmentation "crop"; None if unknown
     stored_sizes: np.ndarray | None = None  # float32 [M]: `object_sizes`; None if not computed
-    candidates: PoseCandidates | None = (
-        None  # M sets of poses for training to draw from; None: `poses` alone
-    )
+    # M sets of poses for training to draw from; None: `poses` alone
+    candidates: PoseCandidates | None = None
 
     def __post_init__(self) -> None:
         m, n, side = len(self.images), self.num_objects, self.images.shape[-1]
@@ -179,9 +170,8 @@ class ViewDataset:
         samples = indices.numpy()
         if len(samples) and not 0 <= samples.min() <= samples.max() < len(self):
             given = f"{samples.min()} .. {samples.max()}"
-            raise ValueError(
-                f"indices must lie in 0 .. {len(self) - 1}, got {given}"
-            )  # --indices of commands
+            # --indices of commands
+            raise ValueError(f"indices must lie in 0 .. {len(self) - 1}, got {given}")
         images = self.images[samples]
         masks = images[:, 3] if self.masks is None else self.masks[samples]
         poses = None if self.poses is None else self.poses[indices]
@@ -294,9 +284,8 @@ class ViewDataset:
         Raises ValueError if no object has `count` views.
         """
         order = np.random.default_rng(0).permutation(len(self))
-        order = order[
-            np.argsort(self.object_ids[order], kind="stable")
-        ]  # sorted by object, shuffled within it
+        # sorted by object, shuffled within it
+        order = order[np.argsort(self.object_ids[order], kind="stable")]
         _, starts, sizes = np.unique(self.object_ids[order], return_index=True, return_counts=True)
         if not 1 <= count <= sizes.max(initial=0):
             raise ValueError(
@@ -327,9 +316,8 @@ class ViewDataset:
         return dataclasses.replace(self, **chosen)
 
 
-DEPTH_REACH = (
-    0.9  # the corners of a cube of side 1 are 0.87 from its centre, at which the cameras look
-)
+# the corners of a cube of side 1 are 0.87 from its centre, at which the cameras look
+DEPTH_REACH = 0.9
 
 
 def depth_levels(depth: Tensor, poses: LookAtPoses) -> Tensor:

@@ -22,10 +22,11 @@ from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
 MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
+# shifts of the smallest crop (the box) and of the largest
 SMALLEST, LARGEST = (
     np.full(4, -1.0),
     np.ones(4),
-)  # shifts of the smallest crop (the box) and of the largest
+)
 
 
 def read_photo(
@@ -120,12 +121,10 @@ class Crops:
     """M images, reduced to the largest possible crops: the object's box plus 30 % a side (Kato and Harada 2019)."""
 
     pixels: Sequence[np.ndarray]  # M regions uint8 [h, w, 3]
-    regions: (
-        np.ndarray
-    )  # int64 [M, 4]: left, top, right, bottom in the image's pixels; right and bottom are excluded
-    boxes: (
-        np.ndarray
-    )  # float64 [M, 4]: left, top, width, height of the object's box in the image's pixels
+    # int64 [M, 4]: left, top, right, bottom in the image's pixels; right and bottom are excluded
+    regions: np.ndarray
+    # float64 [M, 4]: left, top, width, height of the object's box in the image's pixels
+    boxes: np.ndarray
     size: int  # side of the input images
 
     def __len__(self) -> int:

@@ -13,13 +13,11 @@ from learn3d.data.poses import LookAtPoses
 SECTOR_DEG = 15.0  # width of the azimuth sectors whose masks are averaged; candidate planes are half of it apart
 _SECTORS = round(360 / SECTOR_DEG)
 _MIN_IMAGES, _MAX_IMAGES = 4, 2048  # images of a sector: fewer are ignored, of more a part is used
-_MIN_SECTORS = (
-    _SECTORS // 2
-)  # pairs of mirrored sectors that a candidate needs, or all if fewer sectors have images
+# pairs of mirrored sectors that a candidate needs, or all if fewer sectors have images
+_MIN_SECTORS = _SECTORS // 2
 _MIN_PLANES = 6  # candidate planes that are needed, or one for each sector with images
-_MAX_RATIO = (
-    0.1  # largest ratio of the difference at the mirror plane to the median over all candidates
-)
+# largest ratio of the difference at the mirror plane to the median over all candidates
+_MAX_RATIO = 0.1
 
 
 def find_mirror_plane(dataset: ViewDataset) -> float | None:

@@ -35,9 +35,8 @@ class PoseTable:
     weights: np.ndarray  # float32 [N, C]: probabilities; each row sums to 1
     distance: np.ndarray  # float32 [N]
     half_fov_deg: np.ndarray  # float32 [N]
-    confidence: (
-        np.ndarray
-    )  # float32 [N]: probability that the best azimuth is within 30 degrees of the truth
+    # float32 [N]: probability that the best azimuth is within 30 degrees of the truth
+    confidence: np.ndarray
 
     def __post_init__(self) -> None:
         count, shape = len(self.fingerprint), self.azimuth_deg.shape

@@ -67,9 +67,8 @@ class AngleBins:
         """The class of every pose, int64 [M] in 0 .. K-1."""
         azimuths, elevations = self.shape
         azimuth = poses.azimuth_deg.double()
-        turn = (
-            torch.where(azimuth == 180, azimuth, wrap_deg(azimuth)) + 180
-        )  # the upper end belongs to the last cell
+        # the upper end belongs to the last cell
+        turn = torch.where(azimuth == 180, azimuth, wrap_deg(azimuth)) + 180
         a = (turn / self.azimuth_width_deg).floor().long().clamp(0, azimuths - 1)
         elevation = torch.as_tensor(poses.elevation_deg, dtype=torch.float32).double()
         e = (

@@ -10,6 +10,7 @@ import numpy as np
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile, faults_of, open_file, read_bytes
 
+# the last two need further packages
 EXTENSIONS = (
     ".obj",
     ".off",
@@ -19,7 +20,7 @@ EXTENSIONS = (
     ".gltf",
     ".3mf",
     ".dae",
-)  # the last two need further packages
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +127,8 @@ def read_state_dict(path: Path) -> dict[str, np.ndarray]:
     No code in the file is executed (weights_only). Raises DamagedFile if it is not a state dict.
     """
     with open_file(path, limits.WEIGHTS_BYTES, "weights of ResNet-18") as file:
-        sandbox.allow(
-            3 * 2**28 + 4 * os.fstat(file.fileno()).st_size, 25.0
-        )  # most of it for importing torch
+        # most of it for importing torch
+        sandbox.allow(3 * 2**28 + 4 * os.fstat(file.fileno()).st_size, 25.0)
     import torch
     from safetensors.torch import load_file
 

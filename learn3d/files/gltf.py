@@ -65,9 +65,8 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
                 raise ValueError(
                     f"a face refers to vertex {indices.max()}, but its mesh has {len(points)}"
                 )
-            used, indices = np.unique(
-                indices, return_inverse=True
-            )  # primitives may share one large array
+            # primitives may share one large array
+            used, indices = np.unique(indices, return_inverse=True)
             faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
             vertices.append(points[used])
             total += len(used)
@@ -224,9 +223,8 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     quaternion = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
     x, y, z, w = quaternion / (np.linalg.norm(quaternion) or 1.0)
-    cross = np.array(
-        [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    )  # cross @ v is the cross product of (x, y, z) with v
+    # cross @ v is the cross product of (x, y, z) with v
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
     matrix = np.eye(4)
     matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)

@@ -7,9 +7,8 @@ MIB, GIB = 2**20, 2**30
 
 # Text and JSON
 TEXT_BYTES = 16 * MIB  # list of ids, table or config.json; all ids of ShapeNet: 2 MB
-PHOTO_TABLE_BYTES = (
-    4 * MIB
-)  # poses.csv, for about 60,000 photographs; it takes 80 times as much memory
+# poses.csv, for about 60,000 photographs; it takes 80 times as much memory
+PHOTO_TABLE_BYTES = 4 * MIB
 JSON_BYTES = 16 * MIB  # splits.json: 2 MB; test.json of a run on 10,000 objects: 1 MB
 METRICS_BYTES = 256 * MIB  # metrics.jsonl; a million lines
 CURVES = 100  # curves in metrics.jsonl, each a panel of a figure; ours: 20
@@ -31,9 +30,8 @@ MASK_SIZE = 64  # side of stored silhouettes in pixels, as published
 RENDER_SIDE = 2048  # pixels, for renderings of a data set; published ones: up to 224
 
 # Meshes
-MESH_FILE_BYTES = (
-    256 * MIB
-)  # mesh file, and each file that it refers to; the largest of ShapeNet: 100 MB
+# mesh file, and each file that it refers to; the largest of ShapeNet: 100 MB
+MESH_FILE_BYTES = 256 * MIB
 
 # Weights
 WEIGHTS_BYTES = GIB  # pretrained weights; ResNet-18: 45 MB

@@ -136,10 +136,8 @@ def _member(
     ):  # other versions are for large or non-ASCII headers
         raise ValueError(f"npy format {version[0]}.{version[1]} is not supported, only 1.0")
     with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Reading `.npy`"
-        )  # Python 2's headers have numbers such as 12L
-        header = np.lib.format.read_array_header_1_0(
-            file, max_header_size=1000
-        )  # deep nesting could crash Python
+        # Python 2's headers have numbers such as 12L
+        warnings.filterwarnings("ignore", message="Reading `.npy`")
+        # deep nesting could crash Python
+        header = np.lib.format.read_array_header_1_0(file, max_header_size=1000)
     return file, info.file_size, header

@@ -23,10 +23,11 @@ class _FileError(Exception):
         self.path, self.message = path, message
 
     def __reduce__(self) -> tuple[type, tuple[Path, str]]:
+        # for pickle, which passes only the text by default
         return type(self), (
             self.path,
             self.message,
-        )  # for pickle, which passes only the text by default
+        )
 
 
 class DamagedFile(_FileError, ValueError):
@@ -100,9 +101,8 @@ def faults_of(path: Path | str, wanted: str, advice: str = FETCH_AGAIN) -> Itera
         elif type(error) not in (ValueError, EOFError):
             reason = f"{type(error).__name__}: {reason}".removesuffix(": ")
         advice = FETCH_AGAIN if isinstance(error, EOFError) else advice
-        end = (
-            "" if getattr(error, "errno", None) or not advice else f". {advice}"
-        )  # errno: the system names the cause
+        # errno: the system names the cause
+        end = "" if getattr(error, "errno", None) or not advice else f". {advice}"
         raise DamagedFile(
             Path(path), f"cannot be read ({reason}); expected {wanted}{end}"
         ) from error

@@ -36,9 +36,8 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
         return image
 
 
-View = tuple[
-    np.ndarray, np.ndarray, int
-]  # image uint8 [4, S, S], mask uint8 [64, 64], largest value of the mask
+# image uint8 [4, S, S], mask uint8 [64, 64], largest value of the mask
+View = tuple[np.ndarray, np.ndarray, int]
 
 
 def read_with_alpha(path: Path, size: int) -> View:

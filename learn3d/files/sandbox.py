@@ -88,9 +88,8 @@ class _Worker:
         self.connection, theirs = Pipe()
         paths, end = [str(Path(__file__).parents[2]), *sys.path], theirs.fileno()
         code = f"import sys; sys.path[:] = {paths!r}; from learn3d.files import sandbox; sandbox._serve({end})"
-        silent = dict.fromkeys(
-            ("stdin", "stdout", "stderr"), subprocess.DEVNULL
-        )  # libraries print warnings
+        # libraries print warnings
+        silent = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
         with theirs:  # -S -E: skip the start-up files of site-packages
             command = [sys.executable, "-S", "-E", "-c", code]
             self.process = subprocess.Popen(
@@ -143,9 +142,8 @@ def _finish(worker: _Worker, calls: list[Call]) -> list[Any]:
 _workers: set[_Worker] = set()  # all living workers
 _idle: list[_Worker] = []
 atexit.register(lambda: [worker.end() for worker in list(_workers)])
-os.register_at_fork(
-    after_in_child=lambda: (_workers.clear(), _idle.clear())
-)  # they belong to the original
+# they belong to the original
+os.register_at_fork(after_in_child=lambda: (_workers.clear(), _idle.clear()))
 
 
 # The rest runs in workers.
@@ -175,9 +173,8 @@ def _serve(end: int) -> None:
             folder, calls = connection.recv()
             os.chdir(folder)
             results, buffers = [_attempt(call) for call in calls], []
-            data = pickle.dumps(
-                results, 5, buffer_callback=buffers.append
-            )  # arrays are sent without copies
+            # arrays are sent without copies
+            data = pickle.dumps(results, 5, buffer_callback=buffers.append)
             buffers = [buffer.raw() for buffer in buffers]
             connection.send(
                 (data, [buffer.nbytes for buffer in buffers], _memory() - start > _GROWTH)

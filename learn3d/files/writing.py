@@ -23,14 +23,12 @@ def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[P
     path = Path(path)
     _require_regular(path)
     temporary = path.with_name(f".{path.name}{writer}.partial")
-    temporary.unlink(
-        missing_ok=True
-    )  # a killed process may have left a hard link, which must not be overwritten
+    # a killed process may have left a hard link, which must not be overwritten
+    temporary.unlink(missing_ok=True)
     try:
         temporary.touch()
-        mode = (
-            temporary.stat().st_mode
-        )  # as the umask says; safetensors would let only the owner read its files
+        # as the umask says; safetensors would let only the owner read its files
+        mode = temporary.stat().st_mode
         temporary.unlink()
         yield temporary
         temporary.chmod(mode)

@@ -22,9 +22,8 @@ from learn3d.networks.generators import GENERATORS, GeneratorName, MeshGenerator
 from learn3d.networks.resnet import load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
 
-AZIMUTHS = AngleBins(
-    15.0, 180.0, -90.0, 90.0
-)  # classes of the view classifier: the azimuth cells of `fitting.fit`
+# classes of the view classifier: the azimuth cells of `fitting.fit`
+AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)
 MIN_COMPACT_SOLIDITY = 0.8  # objects count as compact if the data's solidity is at least this
 CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts a face on the border (0.5) as outside
 
@@ -103,9 +102,8 @@ class MeshMethod(Method):
     A subclass may add a network that classifies the azimuth of an image (`create_view_classifier`, `view_loss`).
     """
 
-    averages_mirror_images: ClassVar[bool] = (
-        False  # whether a code is the mean over an image and its mirror image
-    )
+    # whether a code is the mean over an image and its mirror image
+    averages_mirror_images: ClassVar[bool] = False
     settings: MeshSettings
     encoder: nn.Module
     generator: MeshGenerator
@@ -113,10 +111,11 @@ class MeshMethod(Method):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        # for the renderer
         self.faces, self.edges = (
             self.generator.faces.cpu(),
             self.generator.edges.cpu(),
-        )  # for the renderer
+        )
 
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = ENCODERS[self.settings.encoder](self.info.inverted)

@@ -36,9 +36,8 @@ class TrainingSchedule:
         """
         if step <= self.warmup_steps:
             return step / self.warmup_steps
-        done = (step - 1 - self.warmup_steps) / (
-            self.iterations - self.warmup_steps
-        )  # 0 .. below 1
+        # 0 .. below 1
+        done = (step - 1 - self.warmup_steps) / (self.iterations - self.warmup_steps)
         if self.lr_schedule == "linear":
             return 1 - done
         if self.lr_schedule == "cosine":

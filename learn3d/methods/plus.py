@@ -96,9 +96,8 @@ class Plus(PoseInvariant):
     def create_networks(self) -> dict[str, nn.Module]:
         networks = super().create_networks()
         if self.settings.uses_discriminator and networks["generator"].mirror is not None:
-            networks["discriminator"] = pose_discriminator(
-                2 * self.info.num_views
-            )  # flipped views are other views
+            # flipped views are other views
+            networks["discriminator"] = pose_discriminator(2 * self.info.num_views)
         if self.settings.lambda_novel_view > 0:
             networks["mask_bank"] = MaskBank(self.settings.bank_size)
         return networks | self.create_view_classifier()

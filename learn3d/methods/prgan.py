@@ -188,9 +188,8 @@ class PrGAN(Method):
         with self.autocast():
             estimate = self.encoder(images)
         difference = estimate.float() - z.to(self.device, non_blocking=True)
-        return (
-            size() * difference.square().sum()
-        )  # the sum over all ranks, whose losses are averaged
+        # the sum over all ranks, whose losses are averaged
+        return size() * difference.square().sum()
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> Tensor:

@@ -169,9 +169,8 @@ class VPL(MeshMethod):
         is_baseline = settings.lambda_discriminator == 0
         others = own[:0] if is_baseline else other_views(whole, settings.other_views)[own]
         vertices = self.predict(batch.images)[1].cpu()
-        both = torch.cat(
-            [vertices, vertices[: len(others)]]
-        )  # both views of each shape in one call
+        # both views of each shape in one call
+        both = torch.cat([vertices, vertices[: len(others)]])
         silhouettes, elsewhere = self.render(
             both, whole.poses[torch.cat([own, others])]
         ).tensor_split([len(batch)])

@@ -117,10 +117,11 @@ def centre(images: Tensor, object_size: float = CENTRED_SIZE) -> Tensor:
     extents, middles = [], []
     for axis in (1, 2):
         touched = inside.any(axis)
+        # `last` is excluded
         first, last = (
             touched.int().argmax(1),
             size - touched.flip(1).int().argmax(1),
-        )  # `last` is excluded
+        )
         extents.append(last - first)
         middles.append((first + last) / size - 1)
     scale = torch.maximum(*extents) / (size * object_size)

@@ -29,9 +29,8 @@ class MeshGenerator(nn.Module):
     faces: Tensor  # int64 [F,3]
     edges: Tensor  # int64 [E,4]: the table of `nmr.edge_table`
     mirror: Tensor | None  # int64 [V]: index of each vertex's mirror image; None without symmetry
-    rotation: (
-        Tensor | None
-    )  # float32 [3,3]: turns the plane z = 0 to the plane `symmetry`; None if they are the same
+    # float32 [3,3]: turns the plane z = 0 to the plane `symmetry`; None if they are the same
+    rotation: Tensor | None
 
     def __init__(self, points: Tensor, faces: Tensor, symmetry: Symmetry | None) -> None:
         super().__init__()
@@ -41,10 +40,11 @@ class MeshGenerator(nn.Module):
             tables["mirror"] = torch.cdist(mirrored.double(), points.double()).argmin(dim=1)
         if symmetry not in (None, "z"):
             angle = math.radians(0.0 if symmetry == "x" else symmetry)
+            # exact for quarter turns
             sine, cosine = (
                 round(math.sin(angle), 12),
                 round(math.cos(angle), 12),
-            )  # exact for quarter turns
+            )
             # The x axis is turned towards the eye, in direction (sin a, -cos a) of (x, z).
             tables["rotation"] = torch.tensor(
                 [[sine, 0.0, -cosine], [0.0, 1.0, 0.0], [cosine, 0.0, sine]]
@@ -56,9 +56,8 @@ class MeshGenerator(nn.Module):
         """Turn vertices that are symmetric about z = 0 to the plane `symmetry`."""
         if self.rotation is None:
             return vertices
-        return (vertices[..., None] * self.rotation).sum(
-            -2
-        )  # autocast would round a matrix product to bf16
+        # autocast would round a matrix product to bf16
+        return (vertices[..., None] * self.rotation).sum(-2)
 
     def symmetrized(self, vertices: Tensor) -> Tensor:
         """The mean of placed vertices [B,V,3] and their mirror images; `vertices` without symmetry."""

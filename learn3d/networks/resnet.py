@@ -93,10 +93,11 @@ def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
 
     Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has weights of another network.
     """
+    # here, as a training without pretrained weights reads no such file
     from learn3d.files import (
         formats,
         sandbox,
-    )  # here, as a training without pretrained weights reads no such file
+    )
 
     read = sandbox.read(formats.read_state_dict, path, wanted="weights of torchvision's resnet18")
     weights = {

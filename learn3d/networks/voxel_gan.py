@@ -230,9 +230,8 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     return 1 - torch.exp(-tau * thickness).reshape(-1, size, size)
 
 
-Table = tuple[
-    Tensor, Tensor, Tensor
-]  # a sparse matrix by rows: columns int32, row starts int32, values float32
+# a sparse matrix by rows: columns int32, row starts int32, values float32
+Table = tuple[Tensor, Tensor, Tensor]
 
 
 @functools.lru_cache(maxsize=64)

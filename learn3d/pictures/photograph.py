@@ -10,11 +10,12 @@ from trimesh.graph import connected_component_labels
 
 import nmr
 
+# towards the light, object frame (x right, y up, -z towards the camera of view 0)
 KEY_LIGHT = (
     0.45,
     0.8,
     -0.4,
-)  # towards the light, object frame (x right, y up, -z towards the camera of view 0)
+)
 BACK_LIGHT = 0.35  # strength of the light from the opposite side, relative to the key light
 
 

@@ -108,9 +108,8 @@ def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.
     rgb uint8 [n, S, S, 3] over white, alpha uint8 [n, S, S], voxels bool [32, 32, 32] with axes (x, y, z), z = away.
     """
     thickness = voxels.sum(axis=2).T[::-1]
-    ink = np.where(
-        thickness > 0, 60 + 195 * thickness / max(1, thickness.max()), 15
-    )  # the grid's own square is grey
+    # the grid's own square is grey
+    ink = np.where(thickness > 0, 60 + 195 * thickness / max(1, thickness.max()), 15)
     pictures = [*map(Image.fromarray, rgb[_shown_views(len(rgb))]), Image.fromarray(255 - alpha[0])]
     pictures.append(Image.fromarray(255 - ink.astype(np.uint8)))
     return [

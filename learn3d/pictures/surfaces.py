@@ -15,11 +15,12 @@ from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.pictures.photograph import photograph, studio_lights
 
 CLAY = (0.62, 0.68, 0.78)
+# towards the light: left of, above and behind the camera, in its axes (y is down)
 _LIGHT = (
     -0.5,
     -0.45,
     -0.75,
-)  # towards the light: left of, above and behind the camera, in its axes (y is down)
+)
 _FAR = 5.0  # distance of orthographic cameras, outside of any object: faces behind a camera would be lit from behind
 
 Cameras = Sequence[nmr.LookAt | nmr.Orthographic]  # each of one view
@@ -106,10 +107,11 @@ def common_zoom(shapes: Iterable[tuple[Surface, Cameras]], masks: Tensor) -> flo
     masks: float [B, S, S] of the input images. A mask that touches the border allows no magnification.
     """
     inside = torch.nonzero(masks > 0.5)[:, 1:]
+    # 1 is the border
     farthest = [
         0.05,
         *((2 * inside + 1) / masks.shape[-1] - 1).abs().flatten().tolist(),
-    ]  # 1 is the border
+    ]
     for surface, cameras in shapes:
         corners = surface.vertices[surface.faces.unique()][None]
         farthest += [

@@ -82,9 +82,8 @@ class Progress:
     best_step: AnyStep = 0  # step of best_iou
     seconds: NonNegative = 0.0  # training time, over all resumptions
     object_share: Share = 0.0  # `ViewDataset.mean_object_size` of the training images
-    threads: Count | None = (
-        None  # CPU threads that the run has chosen; None: fixed, or not chosen yet
-    )
+    # CPU threads that the run has chosen; None: fixed, or not chosen yet
+    threads: Count | None = None
     losses: dict[str, float] = dataclasses.field(default_factory=dict)  # losses of the last step
 
 

@@ -21,9 +21,8 @@ from learn3d.data.dataset import Batch
 from learn3d.terminal import stop_on_signal
 
 TIMEOUT = timedelta(seconds=50)  # time that a rank waits in a step for the others
-PATIENCE = timedelta(
-    minutes=30
-)  # time that it waits for others that read data or save a checkpoint
+# time that it waits for others that read data or save a checkpoint
+PATIENCE = timedelta(minutes=30)
 
 
 def size() -> int:
@@ -234,10 +233,11 @@ def _batch_norm(norm: nn.Module, x: Tensor) -> Tensor:
     if not norm.training:
         return type(norm).forward(norm, x)
     with torch.no_grad():
+        # given so that the results are float32, too
         running = (
             norm.running_mean.clone(),
             norm.running_var.clone(),
-        )  # given so that the results are float32, too
+        )
         mean, variance = (
             values.double() for values in torch.batch_norm_update_stats(x, *running, 0.0)
         )

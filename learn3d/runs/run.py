@@ -59,9 +59,8 @@ class Run:
     method: Method
     info: DatasetInfo
     data: str  # `describe_images` of the training images
-    candidates: PoseCandidates | None = (
-        None  # estimated poses of the training images, whose weights change
-    )
+    # estimated poses of the training images, whose weights change
+    candidates: PoseCandidates | None = None
     versions: dict[str, str | None] = field(default_factory=versions)
 
     def begin(
@@ -141,9 +140,8 @@ class Run:
         if config.device == "cuda" and "random.cuda" in tensors:
             torch.cuda.set_rng_state(tensors["random.cuda"])
         if (before.val_split, before.max_val_images) != (config.val_split, config.max_val_images):
-            return dataclasses.replace(
-                metadata.progress, best_iou=-1.0, best_step=0
-            )  # measured on other images
+            # measured on other images
+            return dataclasses.replace(metadata.progress, best_iou=-1.0, best_step=0)
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog) -> None:

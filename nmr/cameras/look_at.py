@@ -23,9 +23,8 @@ from .projection import (
 
 Scalars = float | Sequence[float] | Tensor
 
-_UNIT = (
-    1 - 1e-6
-)  # a vector whose squared length is smaller was shorter than 1e-5, and not stretched (look_at.cpp)
+# a vector whose squared length is smaller was shorter than 1e-5, and not stretched (look_at.cpp)
+_UNIT = 1 - 1e-6
 _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 
@@ -117,9 +116,8 @@ class _Placed(SquarePixels):
         rows = ops.look_at(
             *(x.double() for x in parameters), self._along, False, self.perspective, True
         )
-        sideways = (
-            rows[:, :3].square().sum(1)
-        )  # 1, but less if up x forward is too short to be stretched
+        # 1, but less if up x forward is too short to be stretched
+        sideways = rows[:, :3].square().sum(1)
         if holds_for_all(sideways > _UNIT):
             return
         warn_if_not_finite(self, *names)

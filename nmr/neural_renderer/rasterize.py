@@ -26,9 +26,8 @@ class _Cubes:
     """Colours of texture cubes, times the light on the faces."""
 
     textures: Tensor | None  # [B or 1, F, ts, ts, ts, C]
-    light: (
-        Tensor | None
-    )  # [B or 1, F, 3]; [B or 1, 2F, 3] has another value for each face seen from behind
+    # [B or 1, F, 3]; [B or 1, 2F, 3] has another value for each face seen from behind
+    light: Tensor | None
 
     def sample(self, fragments: Fragments) -> Tensor:
         if self.textures is None:

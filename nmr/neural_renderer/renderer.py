@@ -70,11 +70,12 @@ class Renderer(torch.nn.Module):
     >>> rgb, depth, alpha = renderer(vertices, faces, textures)
     """
 
+    # an attribute of the class: renderers saved whole by the published code lack it
     camera_up = (
         0,
         1,
         0,
-    )  # an attribute of the class: renderers saved whole by the published code lack it
+    )
 
     def __init__(
         self,
@@ -115,9 +116,8 @@ class Renderer(torch.nn.Module):
         self.orig_size = orig_size
         self.perspective = perspective
         self.viewing_angle = viewing_angle
-        tangent = math.tan(
-            math.radians(viewing_angle)
-        )  # 0 is possible for cameras that do not use the angle
+        # 0 is possible for cameras that do not use the angle
+        tangent = math.tan(math.radians(viewing_angle))
         self.eye = [0, 0, -(1 / tangent + 1)] if tangent else None
         self.camera_direction = camera_direction
         self.near = near

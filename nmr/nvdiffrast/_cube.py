@@ -37,9 +37,8 @@ def places(directions: Tensor, derivatives: Tensor | None) -> Places:
     slopes = None
     if derivatives is not None:
         derivatives = torch.where(valid.unsqueeze(-1), derivatives, 0).unflatten(-1, (3, 2))
-        onto = (
-            (frame.unsqueeze(-1) * derivatives).sum(-2).movedim(0, -2)
-        )  # [B, H, W, (column, row), (X, Y)]
+        # [B, H, W, (column, row), (X, Y)]
+        onto = (frame.unsqueeze(-1) * derivatives).sum(-2).movedim(0, -2)
         forward = derivatives.gather(
             -2, axis[..., None, None].expand(*axis.shape, 1, 2)
         ) * along.sign().unsqueeze(-1)

@@ -432,9 +432,8 @@ def _filtered(mip: _Mip, place: _cube.Places, level: Tensor | None, boundary_mod
     if boundary_mode in ("wrap", "clamp"):
         texels, grids = mip.pack()
         wrap = "repeat" if boundary_mode == "wrap" else "clamp"
-        upright = torch.stack(
-            [place.at[..., 0], 1 - place.at[..., 1]], dim=-1
-        )  # row 0 of the kernel is v = 1
+        # row 0 of the kernel is v = 1
+        upright = torch.stack([place.at[..., 0], 1 - place.at[..., 1]], dim=-1)
 
         def sample(level: Tensor | None) -> Tensor:
             return sample_places(texels, grids, level, upright, wrap)
@@ -461,9 +460,8 @@ def _with_borders(mip: _Mip, place: _cube.Places) -> Callable[[Tensor | None], T
         for image in mip.levels
     ]
     texels, grids = _Mip(padded, None).pack()
-    sizes = place.at.new_tensor(
-        [image.shape[-3:-1][::-1] for image in mip.levels]
-    )  # [L, 2]: width, height
+    # [L, 2]: width, height
+    sizes = place.at.new_tensor([image.shape[-3:-1][::-1] for image in mip.levels])
 
     def sample(level: Tensor | None) -> Tensor:
         size = sizes[0] if level is None else sizes[level.long()]

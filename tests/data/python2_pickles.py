@@ -37,9 +37,8 @@ def python2_pickle(images: list[np.ndarray]) -> bytes:
         return b"cnumpy\ndtype\n" + short_string(code) + b"K\x00K\x01\x87R" + state
 
     def array(shape: tuple[int, ...], kind: bytes, data: bytes) -> bytes:
-        sizes = (
-            b"(" + b"".join(b"\x8a" + bytes([2]) + struct.pack("<h", n) for n in shape) + b"t"
-        )  # Python 2's longs
+        # Python 2's longs
+        sizes = b"(" + b"".join(b"\x8a" + bytes([2]) + struct.pack("<h", n) for n in shape) + b"t"
         make = (
             b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85"
             + short_string(b"b")

@@ -142,7 +142,6 @@ def _watch(folder: str, kill_at: int | None, half: bool) -> list[int]:
 
 
 if __name__ == "__main__":
-    signal.signal(
-        signal.SIGHUP, signal.SIG_DFL
-    )  # under nohup it is ignored, also by what is tested
+    # under nohup it is ignored, also by what is tested
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     serve()

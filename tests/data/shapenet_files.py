@@ -111,9 +111,8 @@ def write_dvr(folder: Path, lists: dict[str, list[str]], world: np.ndarray | Non
             shown = draw(eye, right, np.tan(np.radians(15)), 64, boxes)
             save(root / "image" / f"{k:04d}.png", rgb(shown))
             save(root / "mask" / f"{k:04d}.png", np.where(shown, 255, 0).astype(np.uint8))
-            rotation = np.stack(
-                [right, np.cross(unit(-eye), right), unit(-eye)]
-            )  # x right, y down, z away
+            # x right, y down, z away
+            rotation = np.stack([right, np.cross(unit(-eye), right), unit(-eye)])
             matrix = np.eye(4)
             matrix[:3, :3], matrix[:3, 3] = rotation @ world.T, -rotation @ eye
             cameras[f"world_mat_{k}"], cameras[f"world_mat_inv_{k}"] = matrix, np.linalg.inv(matrix)

@@ -173,9 +173,8 @@ def test_silhouette_pyramid_of_equal_and_of_empty_images() -> None:
         None
     ]
     empty = torch.zeros(1, 64, 64, requires_grad=True)
-    assert float(silhouette_pyramid_loss(disc / 2, disc)) == pytest.approx(
-        0, abs=1e-10
-    )  # the grey does not count
+    # the grey does not count
+    assert float(silhouette_pyramid_loss(disc / 2, disc)) == pytest.approx(0, abs=1e-10)
     loss = silhouette_pyramid_loss(empty, disc)
     assert loss.item() == pytest.approx(5)
     loss.backward()

@@ -319,9 +319,8 @@ def random_arguments(
     vertices = torch.rand(1 if shared else batch, num_vertices, 3, dtype=torch.float64) - 0.5
     matrix, intrinsics = torch.randn(batch, 3, 4), torch.randn(batch, 2, 3)
     matrix[:, 2] = torch.tensor([0.1, -0.2, 1.0, 3.0])
-    distortion = (
-        0.01 * torch.randn(batch, 5) if distorted else None
-    )  # all vertices are within its reach
+    # all vertices are within its reach
+    distortion = 0.01 * torch.randn(batch, 5) if distorted else None
     arguments = (
         vertices,
         matrix,

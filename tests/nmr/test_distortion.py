@@ -12,11 +12,12 @@ import nmr
 from nmr.cameras import from_opencv
 
 SIZE = 64
+# from corner to corner more than 90 degrees
 K = [
     [30.0, 0.0, 32.0],
     [0.0, 30.0, 32.0],
     [0.0, 0.0, 1.0],
-]  # from corner to corner more than 90 degrees
+]
 EYE3, ZERO = torch.eye(3, dtype=torch.float64), [0.0, 0.0, 0.0]
 MODELS = {
     "5": [-0.2, 0.03, 0.002, -0.001, 0.01],
@@ -115,9 +116,8 @@ def undistorted(name: str) -> torch.Tensor:
         short = distort(name, q / radius * middle).norm(dim=1, keepdim=True) < radius
         low, high = torch.where(short, middle, low), torch.where(short, high, middle)
     rays = q / radius * low
-    turn = 1 / math.sqrt(
-        3 * 0.2
-    )  # r of "barrel" and the angle of "turning fisheye" at which they turn back
+    # r of "barrel" and the angle of "turning fisheye" at which they turn back
+    turn = 1 / math.sqrt(3 * 0.2)
     reach = {"barrel": turn, "turning fisheye": math.tan(turn)}.get(name, math.inf)
     rays[low[:, 0] > reach] = float("nan")
     return rays.reshape(SIZE, SIZE, 2)

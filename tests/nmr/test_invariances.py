@@ -249,9 +249,8 @@ def test_float32_is_close_to_float64(name):
     for a, b in zip((*single[0], *single[1]), (*double[0], *double[1]), strict=True):
         assert b.dtype == torch.float64 or not b.is_floating_point()
         error = (a.double() - b).abs().flatten()
-        assert (
-            error.quantile(0.98) <= 1e-3 * b.abs().max()
-        )  # a pixel at an edge may belong to the other side
+        # a pixel at an edge may belong to the other side
+        assert error.quantile(0.98) <= 1e-3 * b.abs().max()
 
 
 @NAMES
@@ -362,6 +361,7 @@ def test_there_is_no_second_derivative(name):
             grad.square().sum().backward(retain_graph=True)
 
 
+# the others share their code
 OUTSIDE = (
     "silhouette",
     "local",
@@ -373,7 +373,7 @@ OUTSIDE = (
     "vertices",
     "cubes",
     "mipmaps",
-)  # the others share their code
+)
 
 
 @pytest.mark.parametrize(
@@ -430,10 +430,11 @@ def call_everything(dtype, packed):
     )
     (loss + pinhole.transform(vertices).sum() + angles.transform(vertices).sum()).backward()
     nmr.voxelize(vertices, faces, 4)
+    # in clip space
     positions, triangles = (
         torch.cat([vertices, vertices[..., :1] + 3], dim=-1),
         faces.int(),
-    )  # in clip space
+    )
     rast, slopes = dr.rasterize(dr.RasterizeCudaContext(), positions, triangles, (6, 7))
     (dr.antialias(rast, rast, positions, triangles).sum() + slopes.sum()).backward()
 
@@ -553,6 +554,5 @@ def mostly_refused(kernels, calls):
                     accepted += 1
                 except ValueError:
                     refused += 1
-    return (
-        refused > 2000 and accepted < 0.1 * refused
-    )  # such as fewer faces, or old values of an output
+    # such as fewer faces, or old values of an output
+    return refused > 2000 and accepted < 0.1 * refused

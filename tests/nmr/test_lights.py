@@ -179,9 +179,8 @@ def room_cameras(kind, count, g, right_handed):
         return nmr.LookAt(eye, eye + forward, half_fov_deg=75.0, right_handed=right_handed), eye
     R = torch.linalg.qr(torch.randn(count, 3, 3, generator=g)).Q
     R = R * torch.linalg.det(R).view(-1, 1, 1)  # some other sign of the axes
-    R = torch.where(
-        torch.rand(count, 1, 1, generator=g) < 0.5, R, -R
-    )  # half of the cameras mirror the world
+    # half of the cameras mirror the world
+    R = torch.where(torch.rand(count, 1, 1, generator=g) < 0.5, R, -R)
     t = -(R @ eye.unsqueeze(-1)).squeeze(-1)
     K = [[60.0, 0.0, 50.0], [0.0, 60.0, 50.0], [0.0, 0.0, 1.0]]
     return nmr.Pinhole(K, R, t, orig_size=100), eye

@@ -196,10 +196,11 @@ def colors_gradient(
 @pytest.mark.parametrize("own_background", [False, True])
 def test_colors_equal_the_slow_definition(name, anti_aliasing, own_background):
     vertices, faces, perspective = scene_of(name)
+    # in one block of rows, and in several
     size, batch = (
         (10, 14) if perspective else (100, 140),
         len(vertices),
-    )  # in one block of rows, and in several
+    )
     raster = tuple(n * (1 + anti_aliasing) for n in size)
     index = nmr.ops.rasterize(vertices, faces, None, *raster, True, 0.1, 100.0, perspective)
     image, upstream = noise(batch, *raster, 3), noise(batch, *size, 3, seed=1)

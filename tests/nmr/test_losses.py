@@ -226,9 +226,8 @@ def test_published_losses(key, dtype):
     if key == "laplacian":
         loss = laplacian_loss(vertices, nmr.unique_edges(faces))
     elif key == "edge":
-        loss = 2 * edge_length_loss(
-            vertices, nmr.unique_edges(faces)
-        )  # published: once for each face of an edge
+        # published: once for each face of an edge
+        loss = 2 * edge_length_loss(vertices, nmr.unique_edges(faces))
     else:
         loss = inflation_loss(vertices, faces)  # published: sqrt(|n|^2 + 1e-5), which is 5e-6 more
     loss.backward()

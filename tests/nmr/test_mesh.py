@@ -59,9 +59,8 @@ def test_edge_table_of_an_open_mesh_holds_the_inner_edges():
 def test_unique_edges():
     _, faces = nmr.icosphere(2)
     assert torch.equal(nmr.unique_edges(faces), nmr.edge_table(faces)[:, :2])
-    fan = torch.tensor(
-        [[1, 0, 2], [1, 0, 3], [0, 1, 4], [5, 5, 0]]
-    )  # three faces at one edge; no face at all
+    # three faces at one edge; no face at all
+    fan = torch.tensor([[1, 0, 2], [1, 0, 3], [0, 1, 4], [5, 5, 0]])
     expected = [[0, 1], [0, 2], [0, 3], [0, 4], [0, 5], [1, 2], [1, 3], [1, 4]]
     assert nmr.unique_edges(fan.int()).tolist() == expected
 
@@ -106,9 +105,8 @@ def test_normals_gradcheck(function):
 def test_normals_of_degenerate_and_of_tiny_and_huge_faces_are_finite(function, size):
     vertices = size * torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [7, 7, 7]])
     vertices.requires_grad_()
-    faces = torch.tensor(
-        [[0, 1, 2], [0, 1, 3], [0, 0, 3]]
-    )  # right-angled, collinear, two corners equal
+    # right-angled, collinear, two corners equal
+    faces = torch.tensor([[0, 1, 2], [0, 1, 3], [0, 0, 3]])
     normals = function(vertices, faces)
     normals.sum().backward()
     expected = torch.tensor([0.0, 0, 1 if size > 1e-18 else 0])  # the area of 1e-60 is 0 in float32

@@ -122,11 +122,12 @@ def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -
     outline = np.array(OUTLINES[name])[:: -1 if turned else 1]
     for start in range(len(outline)):
         flat = np.roll(outline, start, axis=0)
+        # in a slanted plane, at UTM coordinates
         vertices = np.column_stack([flat, flat[:, 0]]) + [
             4.5e6,
             5e5,
             100,
-        ]  # in a slanted plane, at UTM coordinates
+        ]
         faces = triangulate(vertices, np.arange(len(flat)), np.array([len(flat)]))
         whole = np.cross(vertices - vertices[0], np.roll(vertices - vertices[0], -1, axis=0)).sum(0)
         parts = area(vertices, faces)

@@ -102,9 +102,8 @@ def test_swapped_scenes_are_transposes(size, anti_aliasing):
     for shape in (size, size[::-1]):
         leaf = (vertices.clone() if shape == size else across(vertices)).requires_grad_()
         tint = values.clone().requires_grad_()
-        winding = (
-            faces if shape == size else faces.flip(-1)
-        )  # the transposed picture is a mirror image
+        # the transposed picture is a mirror image
+        winding = faces if shape == size else faces.flip(-1)
         settings = dict(
             colors=nmr.VertexColors(tint), background=background, anti_aliasing=anti_aliasing
         )

@@ -139,9 +139,8 @@ def test_published_renderer(name):
         )
         loss = loss + (image * torch.from_numpy(v[f"upstream_{output}"])).sum()
     loss.backward()
-    least = (
-        1e-4 if side > 0 else 2e-3
-    )  # our projection rounds otherwise, and 1 / distance amplifies
+    # our projection rounds otherwise, and 1 / distance amplifies
+    least = 1e-4 if side > 0 else 2e-3
     for name, leaf in {"vertices": vertices, "textures": textures, **leaves}.items():
         key = f"grad_{name}"
         if key in v and (own or leaf is not textures):
@@ -335,9 +334,8 @@ def test_colours_move_through_weights_only_on_request():
     assert leaf.grad is None or not leaf.grad.any()
     rgb(leaf, colors, True).square().sum().backward()
     assert leaf.grad.any()
-    cubes = nmr.TextureCubes(
-        torch.rand(1, 2, 2, 2, 3, dtype=torch.float64)
-    )  # as published, not even on request
+    # as published, not even on request
+    cubes = nmr.TextureCubes(torch.rand(1, 2, 2, 2, 3, dtype=torch.float64))
     image = nmr.render_rgb(leaf, faces, colors=cubes, image_size=3, interpolation_gradient=True)
     assert not torch.autograd.grad(image.square().sum(), leaf)[0].any()
 

@@ -220,9 +220,8 @@ def test_a_face_shows_its_colour_beyond_its_border_and_the_background_behind():
     assert torch.equal(
         row[x > reach], torch.tensor([[0.0, 0.0, 1.0]]).expand(int((x > reach).sum()), 3).double()
     )
-    soft, _ = nmr.render_soft(
-        vertices, faces, gamma=0.5, **how
-    )  # now D counts: more blue farther out
+    # now D counts: more blue farther out
+    soft, _ = nmr.render_soft(vertices, faces, gamma=0.5, **how)
     assert (soft[0, 50, near_border, 2].diff() > 0).all() and soft[0, 50, 25, 2] < 0.3
 
 

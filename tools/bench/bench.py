@@ -212,9 +212,8 @@ def deodr(work: Work) -> Callable[[Tensor], Tensor]:
     """A function that draws vertices with deodr: one mesh at a time, on one thread, without anti-aliasing."""
     from deodr.triangulated_mesh import TriMeshAdjacencies
 
-    mesh = TriMeshAdjacencies(
-        work.faces.numpy().astype(np.uint32), clockwise=True
-    )  # nmr's world is left-handed
+    # nmr's world is left-handed
+    mesh = TriMeshAdjacencies(work.faces.numpy().astype(np.uint32), clockwise=True)
     return lambda vertices: DeodrImages.apply(
         work.camera.transform(vertices), work.size, mesh, work.output
     )

@@ -31,9 +31,8 @@ from learn3d.files.sandbox import Call
 
 POINTS = 10_000  # points that are kept of each object's 100,000, which are in random order
 _EYE_TOLERANCE = 0.01  # largest error of a camera position, in units of the object frame
-_MIN_COSINE = (
-    0.9995  # least cosine of the angle between an image axis or a viewing direction and Kato's
-)
+# least cosine of the angle between an image axis or a viewing direction and Kato's
+_MIN_COSINE = 0.9995
 _MATRICES = [f"world_mat_{k}" for k in range(NUM_VIEWS)]
 _CAMERAS = "an npz file with world_mat_0 .. world_mat_23, 4x4, from the world to Kato's 24 cameras"
 _CLOUD = "an npz file with the array 'points' [P, 3]: finite, within the unit cube"
@@ -117,9 +116,8 @@ def _fit_world(path: Path, cameras: list[np.ndarray]) -> np.ndarray:
     true_eyes = poses.features().double().numpy()
     u, _, v = np.linalg.svd(true_eyes.T @ eyes)
     to_object = u @ v
-    true_rotations = (
-        poses.cameras().projection().matrix[:, :, :3].numpy()
-    )  # rows: right, down, forward
+    # rows: right, down, forward
+    true_rotations = poses.cameras().projection().matrix[:, :, :3].numpy()
     cosines = (rotations @ to_object.T * true_rotations).sum(axis=2)[:, [0, 2]].min(axis=1)
     off = np.linalg.norm(eyes @ to_object.T - true_eyes, axis=1)
     fault = np.maximum(off / _EYE_TOLERANCE, (1 - cosines) / (1 - _MIN_COSINE))

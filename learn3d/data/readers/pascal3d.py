@@ -43,9 +43,8 @@ _SHAPES = {  # other arrays -> shape of an item
     "rotation_matrices": (3, 3),
     "voxels": (VOXEL_SIZE,) * 3,
 }
-_ROTATION_BYTES = (
-    200_000 * 72
-)  # largest size of a file's rotations; Pascal3D+ has 5,000 photographs
+# largest size of a file's rotations; Pascal3D+ has 5,000 photographs
+_ROTATION_BYTES = 200_000 * 72
 
 
 def load(

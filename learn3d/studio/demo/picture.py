@@ -37,9 +37,8 @@ class Picture(NamedTuple):
 
     colors: np.ndarray  # uint8 [H, W, 3]
     mask: np.ndarray  # uint8 [H, W], above 127: object; 255 everywhere if unknown
-    strokes: np.ndarray | None = (
-        None  # corrections of the mask, uint8 [H, W], see `cutting.correct`
-    )
+    # corrections of the mask, uint8 [H, W], see `cutting.correct`
+    strokes: np.ndarray | None = None
     box: Box | None = None  # box around the object
 
 

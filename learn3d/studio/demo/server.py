@@ -46,9 +46,8 @@ from learn3d.studio.picture_to_mesh.several import MOST_PICTURES
 from learn3d.terminal import plain, say
 
 MOST_BYTES = 5 * SIDE**2  # largest body of a request
-VISITORS = (
-    200  # pictures that are received or wait, 260 MB in all; the browser of a later one tries again
-)
+# pictures that are received or wait, 260 MB in all; the browser of a later one tries again
+VISITORS = 200
 OF_ADDRESS = 40  # pictures of one address among them
 CONNECTIONS = 400  # connections of one address; further ones are closed at once
 PATIENCE = 30  # seconds in which a picture must arrive
@@ -299,9 +298,8 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
             f"cannot open a page at {host}:{port}; give another --port or --host"
         ) from error
     errors = logging.StreamHandler()
-    errors.format = lambda record: plain(
-        logging.Handler.format(errors, record)
-    )  # it may contain a visitor's text
+    # it may contain a visitor's text
+    errors.format = lambda record: plain(logging.Handler.format(errors, record))
     logging.getLogger("uvicorn").addHandler(errors)
     jobs = JobQueue()
     limits = {"timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}

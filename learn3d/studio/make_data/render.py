@@ -156,9 +156,10 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
     """
     writer, rng = WRITERS[config.layout], np.random.default_rng([config.seed, 1, item.number, copy])
     scale = rng.uniform(*SCALE_RANGE, size=3)
+    # light grey
     color = np.clip(rng.uniform(0.55, 0.9) + rng.uniform(-0.2, 0.2, size=3), 0.35, 1.0).astype(
         np.float32
-    )  # light grey
+    )
     turned = mesh.vertices @ mesh_to_object(config.up, config.front_axis).T
     placed = fit_to_box(fit_to_box(turned) * (scale if copy else 1.0)) @ writer.turn.T
     if writer.diagonal is not None:

@@ -23,17 +23,18 @@ PLAIN = 0.9  # least share of the border with one colour in pictures with a plai
 TOLERANCE = 0.12  # largest difference from the background's colour, in 0 .. 1
 JPEG_NOISE = 6  # levels by which compression changes the background near an object
 PLAIN_HOLE = 0.5  # a hole of the mask shows the background if more than this share of it has the background's colour,
+# and its size, as a share of the object, lies between these; larger ones are often white table
+# tops
 HOLES = (
     0.001,
     0.4,
-)  # and its size, as a share of the object, lies between these; larger ones are often white table tops
+)
 KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
 _ROUNDS, _ROUNDS_FROM_GUESS, _ROUNDS_IN_STROKES = 5, 3, 2
 _AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
 
-_BANDS = (
-    12  # bands of rows; a pixel is compared with the background of its own band and its neighbours
-)
+# bands of rows; a pixel is compared with the background of its own band and its neighbours
+_BANDS = 12
 _SAMPLES = 600  # pixels of the background in a band
 _SHADES = 0.88, 0.76, 0.65, 0.55, 0.46  # brightness of the background in shadows of different depth
 _SHADED_FROM = 0.4  # height in the picture, from the top, below which there are shadows
@@ -45,20 +46,23 @@ _TOUCHED = 0.03  # share of a side of the picture, from which the object touches
 _PREFERRED = 0.05  # by which GrabCut from the whole region must be judged better
 _FILLED = 0.75  # share of its box, below which an object in a given box is not the whole one
 _PROBABLE = -0.6  # mark of an object that is probably the right one
+# share of its box that an upright rectangle fills; by which its mark is worse
 _RECTANGLE, _UNLIKELY = (
     0.9,
     0.3,
-)  # share of its box that an upright rectangle fills; by which its mark is worse
+)
+# least areas of a picture on the wall, over those of the mask and of its own box
 _FRAME, _FRAME_FILL = (
     0.05,
     0.7,
-)  # least areas of a picture on the wall, over those of the mask and of its own box
+)
 _FRAME_WIDTH = 5  # pixels
 _OFF_CENTRE = 0.6  # weight of the distance from the centre against the judgement
+# parts that may be the object, and their least area over that of the largest
 _PARTS, _PART = (
     3,
     0.1,
-)  # parts that may be the object, and their least area over that of the largest
+)
 _RAGGED = 600  # squared length of an outline over its area, in pixels; a thin-legged chair has 200
 
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels

@@ -17,18 +17,20 @@ IMAGES = 4000  # training images whose codes are clustered
 MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
 OTHER = 2.0  # logit of the network above which a picture is unknown
 NEAR = 0.55  # distance to a category below which a picture is of it, whatever the network says
+# names of the tensors of `KnownCodes` in a checkpoint
 KNOWN_CODES = (
     "known_codes",
     "hidden_layer",
     "output_layer",
-)  # names of the tensors of `KnownCodes` in a checkpoint
+)
 _NEAREST = 3  # centres whose mean distance is compared
+# sizes of the classifiers, whose logits are averaged
 _HIDDEN, _MEMBERS, _DROPOUT, _STEPS = (
     64,
     2,
     0.3,
     300,
-)  # sizes of the classifiers, whose logits are averaged
+)
 _SCALE = 10.0  # length of the codes that they see
 
 
@@ -36,9 +38,8 @@ class KnownCodes(NamedTuple):
     """Cluster centres (k-means) of normalised codes, and a network that knows codes of other objects."""
 
     kinds: Tensor  # float [N, K, C]: centres of the training images of N categories
-    hidden: Tensor | None = (
-        None  # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
-    )
+    # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
+    hidden: Tensor | None = None
     output: Tensor | None = None  # float [H + 1]: weights of its logit, the bias last
 
     def nearest_kind(self, code: Tensor) -> int:

@@ -43,9 +43,8 @@ _ADAM = {
 }
 
 Meshes = Tensor | Sequence[Tensor]
-Progress = Callable[
-    [str, float], object
-]  # called with the name of each stage and the share (0 .. 1) that is done
+# called with the name of each stage and the share (0 .. 1) that is done
+Progress = Callable[[str, float], object]
 
 
 class View(NamedTuple):

@@ -45,16 +45,13 @@ MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
 SMALL_MODEL = Path(__file__).with_name("small.safetensors")  # the model in the package
 STRIP_SIZE = 192  # side of each picture in a strip, in pixels
-_OVERSAMPLING = (
-    4  # pixels of a photograph, along each axis, per pixel of the prepared image, at least
-)
-_SEARCHED_SIDE = (
-    1024  # side in pixels to which a photograph is reduced before its object is searched
-)
+# pixels of a photograph, along each axis, per pixel of the prepared image, at least
+_OVERSAMPLING = 4
+# side in pixels to which a photograph is reduced before its object is searched
+_SEARCHED_SIDE = 1024
 _COLORED = 256  # side in pixels of the picture that gives the colours
-_LONGEST_EDGE = (
-    0.1  # longest edge of a coloured template, since hidden parts have the colours of its vertices
-)
+# longest edge of a coloured template, since hidden parts have the colours of its vertices
+_LONGEST_EDGE = 0.1
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
@@ -348,13 +345,11 @@ def prepare_image(
     pad = math.ceil(
         max(0, half - x, half - y, x + half - planes.shape[2], y + half - planes.shape[1])
     )
-    planes = np.pad(
-        planes, ((0, 0), (pad, pad), (pad, pad))
-    )  # 0 is the background of inverted colours
+    # 0 is the background of inverted colours
+    planes = np.pad(planes, ((0, 0), (pad, pad), (pad, pad)))
     box = (x - half + pad, y - half + pad, x + half + pad, y + half + pad)
-    filter = (
-        Image.Resampling.BOX if 2 * half >= size else Image.Resampling.BILINEAR
-    )  # mean of the covered pixels
+    # mean of the covered pixels
+    filter = Image.Resampling.BOX if 2 * half >= size else Image.Resampling.BILINEAR
     prepared = np.stack(
         [np.asarray(Image.fromarray(plane).resize((size, size), filter, box)) for plane in planes]
     )
@@ -369,12 +364,10 @@ class Reconstruction(NamedTuple):
     surface: Surface  # object frame; with the picture's colours if it was fitted
     stored: np.ndarray  # uint8 [4, S, S]: the input of the network
     azimuth_deg: float  # estimated azimuth of the picture's camera
-    silhouette_iou: float | None = (
-        None  # IoU of the fitted shape's silhouette and the mask; None without a fit
-    )
-    kind: str | None = (
-        None  # predicted category; None without a fit, or without templates if the model has only one
-    )
+    # IoU of the fitted shape's silhouette and the mask; None without a fit
+    silhouette_iou: float | None = None
+    # predicted category; None without a fit, or without templates if the model has only one
+    kind: str | None = None
     warning: str | None = None  # a reason to doubt the shape; None without a fit
 
 
@@ -626,9 +619,8 @@ def _finish_materials(tree: dict) -> None:
         material["doubleSided"] = True
     for texture in tree.get("textures", ()):
         texture["sampler"] = 0
-        tree["samplers"] = [
-            {"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}
-        ]  # linear, clamped
+        # linear, clamped
+        tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]
     for mesh in tree.get("meshes", ()):  # an empty shape has none
         for primitive in mesh["primitives"]:
             primitive["material"] = 0

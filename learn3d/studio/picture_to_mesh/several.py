@@ -48,12 +48,10 @@ NEEDED = 0.9  # share of the largest probability on a line of sight from which a
 SHARPNESS = 0.1  # differences of two shapes' scores that make one e times as likely
 CARVINGS = (1, 0)  # width in pixels by which the outlines are widened in each round
 CAMERA_STEPS = 15  # steps of the cameras between two rounds
-STRAIGHT = (
-    0.85  # mean outline IoU from which the bent template is taken, which has straighter parts
-)
-ALIKE = (
-    0.5  # cosine of a picture's code and the mean of the others below which it shows something else
-)
+# mean outline IoU from which the bent template is taken, which has straighter parts
+STRAIGHT = 0.85
+# cosine of a picture's code and the mean of the others below which it shows something else
+ALIKE = 0.5
 LEVEL = 0.03  # cost of a camera that stands a level of `ELEVATIONS_DEG` above or below the others
 WORSE = 0.15  # a picture is left out if its outline IoU is so much below the median of all
 

@@ -23,9 +23,8 @@ class Comparison:
     mean_deg: float
     flips: float  # share of errors of at least 150 degrees
     objects_flipped: float  # share of the objects with flips in most of their images
-    calibration: tuple[
-        tuple[float, float, int], ...
-    ]  # mean confidence, accuracy and number of images, by confidence
+    # mean confidence, accuracy and number of images, by confidence
+    calibration: tuple[tuple[float, float, int], ...]
 
     def text(self) -> str:
         """Lines for the terminal."""

@@ -141,9 +141,8 @@ def estimate(data: Masks, fitted: Tensor, candidates: Candidates, options: PoseO
     alike = pairs > 0 and int(_near(views, best).sum()) - len(views) > 0.5 * pairs  # from all sides
     if len(fitted) < MIN_IMAGES or alike:
         confidence = confidence.clamp(max=2 * NEAR_DEG / 360)
-    k = max(
-        range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum())
-    )  # the most typical one
+    # the most typical one
+    k = max(range(len(parts)), key=lambda k: float((posteriors[k] * posterior).sum()))
     shapes[k].turns = (shapes[k].turns + shifts[k] * TURNS // options.azimuths) % TURNS
     votes = sum(front_votes) / len(parts)
     return Estimate(
@@ -232,9 +231,8 @@ class Shapes:
         scale = torch.exp(torch.empty(3).uniform_(np.log(0.3), 0.0, generator=rng))
         self.base = 0.5 * self.network.place(self.network.sphere) * (scale - 1)
         self.codes = torch.zeros(1, CODE_SIZE)
-        self.turns = torch.zeros(
-            1, dtype=torch.int64
-        )  # azimuth 0 of shape m is the common azimuth 90 * turns[m]
+        # azimuth 0 of shape m is the common azimuth 90 * turns[m]
+        self.turns = torch.zeros(1, dtype=torch.int64)
 
     def vertices(self) -> Tensor:
         """Vertices float32 [M, V, 3], before any turn."""

@@ -27,12 +27,10 @@ class Planform:
     dihedral_deg: float  # rise of the wing towards the tip
     z: float  # position of the leading edge in the middle
     y: float  # height of the wing in the middle
-    kink: float = (
-        0.0  # share of the half span at which the trailing edge bends; 0 for a straight one
-    )
-    shape: str = (
-        "straight"  # "straight", "elliptic", "kinked" (constant chord, then tapered) or "gull"
-    )
+    # share of the half span at which the trailing edge bends; 0 for a straight one
+    kink: float = 0.0
+    # "straight", "elliptic", "kinked" (constant chord, then tapered) or "gull"
+    shape: str = "straight"
     thickness: float = 0.12  # thickness over chord
 
     def at(self, share: float) -> tuple[float, float, float, float]:

@@ -39,9 +39,8 @@ def car(draw: Draw, kind: str) -> Part:
     _, least, greatest = _KINDS[kind]
     limits = dict(zip(_FIELDS, zip(least, greatest, strict=True), strict=True))
     body = SimpleNamespace(**draw.measures(**limits), has_bed=kind == "pickup")
-    body.shoulder = max(
-        body.belt * body.height, 2 * body.wheel + 0.15
-    )  # height of the shoulder line, above the wheels
+    # height of the shoulder line, above the wheels
+    body.shoulder = max(body.belt * body.height, 2 * body.wheel + 0.15)
     # Distances of the axles from the front bumper.
     body.axles = body.wheel + 0.48, body.length - body.wheel - 0.44
     part = _hull(body)
@@ -49,9 +48,8 @@ def car(draw: Draw, kind: str) -> Part:
     x = (body.width - TYRE) / 2 - 0.02
     y = body.wheel
     dish = draw(0.1, 0.6)
-    rim = np.array(
-        [(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)]
-    )  # of a wheel with a dished hub
+    # of a wheel with a dished hub
+    rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])
     profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
     pair = revolve(profile).rotated("z", 90).moved(x, y).both_sides() + crossbar((-x, y, 0), 0.1)
     part += join(pair.moved(z=body.length / 2 - s) for s in body.axles)
@@ -99,9 +97,8 @@ def _hull(body: SimpleNamespace) -> Part:
     length = body.length
     belt = body.shoulder
     boot = min(body.window * length, length - 0.12)
-    bed = (
-        (boot + 0.06, length - 0.08) if body.has_bed else (length, length)
-    )  # start and end of the open box
+    # start and end of the open box
+    bed = (boot + 0.06, length - 0.08) if body.has_bed else (length, length)
 
     # The upper edge of the body seen from the side: distance from the front bumper, and height.
     cowl = body.bonnet * length
@@ -151,15 +148,13 @@ def _hull(body: SimpleNamespace) -> Part:
         cut = np.where(np.abs(s - axle) < arch, np.maximum(cut, over_wheel), cut)
     shoulder = np.minimum(belt, top - 0.03)
     middle = np.maximum(0.55 * floor + 0.45 * shoulder, 0.5 * (cut + shoulder))
-    edge = np.maximum(
-        top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01
-    )  # rim of the roof
+    # rim of the roof
+    edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)
     roof = np.maximum(0.96 * width - 0.03 - body.lean * (edge - shoulder), 0.45 * width)
     rim = shoulder + 0.02  # of the bed
     bottom = np.full_like(s, belt - 0.38)  # of the bed
-    hump = np.maximum(
-        bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03)
-    )  # the wheel arch seen from the bed
+    # the wheel arch seen from the bed
+    hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))
 
     # The right half of each cross-section: points (x, y) from the middle of the floor outwards
     # and up to the middle.

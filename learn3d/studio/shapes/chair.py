@@ -116,9 +116,8 @@ def _join_chair(
 ) -> Part:
     back_height = throne or back_height
     cushioned = cushioned or family is OFFICE
-    exponent = draw.pick(
-        {8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1}
-    )  # outline of the seat: 2 = ellipse ... 8 = rectangle
+    # outline of the seat: 2 = ellipse ... 8 = rectangle
+    exponent = draw.pick({8.0: 4, 5.0: 2, 3.0: 1.5, 2.0: 1})
     thickness = draw(0.07, 0.13) if cushioned else draw(0.025, 0.05)
     taper = draw.of(Perhaps(0.4, (0.8, 1.0), 1.0))  # narrower at the rear
     outline = ellipse(width, depth, 24, exponent)
@@ -135,9 +134,8 @@ def _join_chair(
 
     angular = exponent > 4
     stile_x = 0.5 * width * taper - 0.03 if angular else 0.36 * width
-    rear_edge = (
-        depth / 2 * (1 - (2 * stile_x / width) ** exponent) ** (1 / exponent)
-    )  # -z of the seat at x = stile_x
+    # -z of the seat at x = stile_x
+    rear_edge = depth / 2 * (1 - (2 * stile_x / width) ** exponent) ** (1 / exponent)
     curve = max(0.0 if angular else depth / 2 - rear_edge, draw.of(Perhaps(0.6, (0.0, 0.08))))
     back, bulge = _back(draw, family, stile_x, back_height, curve)
     part += back.rotated("x", -recline).moved(y=height - 0.5 * thickness, z=-depth / 2 + 0.03)

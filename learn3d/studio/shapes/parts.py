@@ -225,9 +225,8 @@ def wing(sections: Sequence[Sequence[float]], upright: bool = False) -> Part:
     The span is along x and the rise along y; `upright` swaps them, for a fin. The airfoil is a
     symmetric four-digit NACA profile with a blunt trailing edge.
     """
-    c = 0.5 * (
-        1.0 - np.cos(np.linspace(0.0, np.pi, 7))
-    )  # dense at the leading edge (0) and the trailing edge (1)
+    # dense at the leading edge (0) and the trailing edge (1)
+    c = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, 7)))
     half = (
         5.0 * (0.2969 * np.sqrt(c) - 0.1260 * c - 0.3516 * c**2 + 0.2843 * c**3 - 0.1015 * c**4)
         + 0.02

@@ -164,9 +164,8 @@ def curved_sofa(
     """A sofa on an arc, or a tub sofa: the back continues into the arms."""
     turn = np.radians(turn_deg)
     angle = np.linspace(-turn, turn, 31)
-    forward = (1 - np.cos(angle)) / (
-        1 - np.cos(turn)
-    )  # 0 in the middle of the back, 1 at the ends of the arms
+    # 0 in the middle of the back, 1 at the ends of the arms
+    forward = (1 - np.cos(angle)) / (1 - np.cos(turn))
     sine = np.sin(angle) / np.sin(turn)
     x = (half - thick / 2) * np.sign(sine) * np.abs(sine) ** power  # flatter than a circle's arc
     z = -depth / 2 + thick / 2 + (depth - thick) * forward

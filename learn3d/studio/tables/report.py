@@ -147,15 +147,13 @@ def _measure(
     ids = dataset.object_ids
     sums = np.stack([np.bincount(ids, np.nan_to_num(row), len(names)) for row in ious])
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
-    means = np.divide(
-        sums, counts, out=np.full_like(sums, np.nan), where=counts > 0
-    )  # run by object
+    # run by object
+    means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
 
     of_objects = _mean(means, axis=0)
     numbers = np.unique(ids)
-    ranked = numbers[
-        np.argsort(-np.nan_to_num(of_objects[numbers], nan=-1.0), kind="stable")
-    ]  # the best object first
+    # the best object first
+    ranked = numbers[np.argsort(-np.nan_to_num(of_objects[numbers], nan=-1.0), kind="stable")]
     shown = _typical_images(_mean(ious, axis=0), of_objects, ids, ranked, objects)
     items = pack_shapes(runs, shown)
     for item, sample in zip(items, shown, strict=True):
@@ -287,9 +285,8 @@ def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[di
 def _mesh(surface: Surface) -> dict[str, Any]:
     """A surface in plotly's encoding of arrays."""
     points = np.rint(surface.vertices.double().numpy() @ _TO_PAGE / UNIT).clip(-32767, 32767)
-    corners = surface.faces.numpy()[
-        :, [0, 2, 1]
-    ]  # reversed, because the object frame is left-handed
+    # reversed, because the object frame is left-handed
+    corners = surface.faces.numpy()[:, [0, 2, 1]]
     kind = "<u2" if len(points) <= 2**16 else "<u4"
     arrays = dict(zip("xyzijk", [*points.T.astype("<i2"), *corners.T.astype(kind)], strict=True))
     packed = {

@@ -25,21 +25,16 @@ class Variant:
     """A preset with changes. Its name is that of its run folders, so equal names mean the same runs in every table."""
 
     preset: str
-    changes: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # settings of the method and options of the training
-    checkpoint: Literal["last", "best"] = (
-        "last"  # networks to test: the last ones, or the best on the validation split
-    )
-    small_batches_of: str = (
-        ""  # preset that sees as many images, in BATCH_DIVISOR times larger batches; "" for none
-    )
-    batch_factor: int = (
-        1  # multiplies the batch size, if a batch also has images that are not encoded
-    )
-    estimates_poses: bool = (
-        False  # azimuths are estimated with the run's seed, and turned into the data's frame
-    )
+    # settings of the method and options of the training
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    # networks to test: the last ones, or the best on the validation split
+    checkpoint: Literal["last", "best"] = "last"
+    # preset that sees as many images, in BATCH_DIVISOR times larger batches; "" for none
+    small_batches_of: str = ""
+    # multiplies the batch size, if a batch also has images that are not encoded
+    batch_factor: int = 1
+    # azimuths are estimated with the run's seed, and turned into the data's frame
+    estimates_poses: bool = False
 
 
 class Row(NamedTuple):
@@ -47,9 +42,8 @@ class Row(NamedTuple):
 
     variant: str | None  # name in `VARIANTS`; None: a quoted row, never trained here
     about: str  # the voxelizer of the printed figures, and their source if they are quoted
-    printed: dict[
-        str, float
-    ]  # the paper's figures by category, and their "mean"; without those that it lacks
+    # the paper's figures by category, and their "mean"; without those that it lacks
+    printed: dict[str, float]
 
 
 _PLUS = PlusSettings()

@@ -59,9 +59,8 @@ def draw_tsne(runs: Sequence[TrainedModel]) -> Figure:
         codes = torch.cat(batches).numpy()
         points = embed(codes)
         color = wheel(azimuths_deg(dataset.poses)[samples].numpy() / 360 % 1.0)
-        order = np.random.default_rng(0).permutation(
-            len(points)
-        )  # so that no view covers all others
+        # so that no view covers all others
+        order = np.random.default_rng(0).permutation(len(points))
         size = float(np.clip(7000 / len(points), 4, 16))
         axes = figure.add_subplot(grid[index // columns, index % columns])
         axes.scatter(*points[order].T, c=color[order], s=size, linewidths=0)
@@ -90,9 +89,8 @@ def draw_tsne(runs: Sequence[TrainedModel]) -> Figure:
     axes.pcolormesh(
         edges, [0.58, 1.0], middles, cmap=wheel, vmin=0, vmax=2 * np.pi, rasterized=True
     )
-    axes.set_theta_zero_location(
-        "S"
-    )  # seen from above: the camera of azimuth 0 is below, that of 90 to the right
+    # seen from above: the camera of azimuth 0 is below, that of 90 to the right
+    axes.set_theta_zero_location("S")
     axes.set(ylim=(0, 1), yticks=[])
     axes.set_thetagrids([0, 90, 180, 270], ["0°", "90°", "180°", "270°"], fontsize=8)
     axes.tick_params(pad=-1)

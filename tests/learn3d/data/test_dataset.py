@@ -119,9 +119,8 @@ def test_several_categories_become_one_set_with_classes() -> None:
     assert torch.equal(batch.images[1], alone.images[0])
     assert torch.equal(batch.voxels[1], alone.voxels[0])
     assert torch.equal(batch.cameras.eye[1], alone.cameras.eye[0])
-    near = dataclasses.replace(
-        jars, poses=dataclasses.replace(jars.poses, distance=2.0)
-    )  # one number for all
+    # one number for all
+    near = dataclasses.replace(jars, poses=dataclasses.replace(jars.poses, distance=2.0))
     distances = concatenate([cups, near]).poses.distance
     assert torch.equal(distances, torch.cat([cups.poses.distance, torch.full((6,), 2.0)]))
     assert concatenate([cups]) is cups
@@ -300,9 +299,8 @@ def test_methods_that_need_poses_say_so(preset: str) -> None:
 def test_few_views_of_every_object(tiny_set) -> None:
     few = tiny_set.with_few_views(2)
     assert few.object_ids.tolist() == [0, 0, 1, 1, 2, 2]
-    assert (
-        len({tuple(few.view_ids[i : i + 2]) for i in (0, 2, 4)}) == 3
-    )  # not the same views of every object
+    # not the same views of every object
+    assert len({tuple(few.view_ids[i : i + 2]) for i in (0, 2, 4)}) == 3
     np.testing.assert_array_equal(few.view_ids, tiny_set.with_few_views(2).view_ids)
     for sample in range(6):
         of_all = 24 * few.object_ids[sample] + few.view_ids[sample]
@@ -310,13 +308,14 @@ def test_few_views_of_every_object(tiny_set) -> None:
         assert few.poses.azimuth_deg[sample] == tiny_set.poses.azimuth_deg[of_all]
     assert len(tiny_set.with_few_views(24)) == len(tiny_set)
     uneven = tiny_set.select(np.array([0, 1, 2, 24, 50, 51]))
+    # those that have fewer keep them
     assert uneven.with_few_views(2).object_ids.tolist() == [
         0,
         0,
         1,
         2,
         2,
-    ]  # those that have fewer keep them
+    ]
     for wrong in (0, 25):
         with pytest.raises(ValueError, match=r"views_per_object must lie in 1 \.\. 24"):
             tiny_set.with_few_views(wrong)

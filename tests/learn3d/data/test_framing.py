@@ -50,9 +50,8 @@ def test_the_photo_keeps_its_camera(shape: tuple[int, int]) -> None:
     assert image.shape == (4, 96, 96) and image.dtype == small.dtype == np.uint8
     for found, wanted in ((image[3], silhouette(96)), (small, silhouette(64))):
         assert share_that_differs(found, wanted) < 0.02
-        assert (
-            share_that_differs(found, np.roll(wanted, 1, axis=1)) > 0.03
-        )  # it would notice a pixel's shift
+        # it would notice a pixel's shift
+        assert share_that_differs(found, np.roll(wanted, 1, axis=1)) > 0.03
 
 
 def test_colours_have_katos_form() -> None:

@@ -69,9 +69,8 @@ def test_mesh_to_object_puts_up_up_and_front_to_the_first_camera() -> None:
             matrix = mesh_to_object(up, front)
             np.testing.assert_array_equal(matrix @ axes[up], [0, 1, 0])
             np.testing.assert_array_equal(matrix @ axes[front], [0, 0, -1])
-            assert np.linalg.det(matrix) == pytest.approx(
-                -1
-            )  # right-handed files, left-handed renderer
+            # right-handed files, left-handed renderer
+            assert np.linalg.det(matrix) == pytest.approx(-1)
     np.testing.assert_array_equal(mesh_to_object() @ [1, 2, 3], [-3, 2, -1])
     with pytest.raises(ValueError, match="one of"):
         mesh_to_object("w")

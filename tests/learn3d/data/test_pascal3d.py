@@ -115,9 +115,8 @@ def test_training_is_train_and_imagenet(folder: Path, contents: dict[str, dict])
     assert not dataset.inverted and dataset.convention is conventions.PASCAL3D
     np.testing.assert_array_equal(dataset.voxels[3:], contents["imagenet"]["voxels"])
     assert dataset.num_views == 4 and sorted(set(dataset.view_ids)) == [0, 1, 2, 3]
-    np.testing.assert_array_equal(
-        dataset.view_ids[[1, 2]], dataset.view_ids[[3, 4]]
-    )  # the same rotations
+    # the same rotations
+    np.testing.assert_array_equal(dataset.view_ids[[1, 2]], dataset.view_ids[[3, 4]])
 
 
 def test_the_image_is_the_padded_clipped_stretched_box(
@@ -204,10 +203,11 @@ def test_rotation_cells_are_45_degrees_of_scipys_yzx_angles() -> None:
     cells = pascal3d.rotation_cells(np.stack([rotation(*a) for a in angles]))
     wanted = [(0, 4, 4), (0, 4, 4), (1, 4, 4), (4, 2, 4), (4, 4, 4), (4, 4, 5), (7, 4, 4)]
     got = [(c // 64, c // 8 % 8, c % 8) for c in cells.tolist()]
+    # -180 and 180 are the same rotation
     assert got[1:] == wanted[1:] and got[0] in [
         (0, 4, 4),
         (7, 4, 4),
-    ]  # -180 and 180 are the same rotation
+    ]
     noise = np.random.default_rng(0).normal(0, 1e-7, (50, 3, 3))
     assert len(set(pascal3d.rotation_cells(np.eye(3) + noise))) == 1
     ids, names = pascal3d.view_classes(np.eye(3)[None], np.stack([np.eye(3), rotation(100, 0, 0)]))

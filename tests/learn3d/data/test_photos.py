@@ -101,9 +101,8 @@ def refused(chairs: Path, message: str, kind: type = ValueError, split: str = "t
 def test_the_examples_folder_is_read(made: Path) -> None:
     sets = {split: photos.load(made, "chair", split) for split in ("train", "val", "test")}
     assert [(len(s), s.num_objects) for s in sets.values()] == [(6, 2), (3, 1), (3, 1)]
-    assert (
-        len({name for s in sets.values() for name in s.object_names}) == 4
-    )  # no object is in two splits
+    # no object is in two splits
+    assert len({name for s in sets.values() for name in s.object_names}) == 4
     train = sets["train"]
     assert (
         train.voxels is None and train.masks is None and train.inverted and train.image_size == 64

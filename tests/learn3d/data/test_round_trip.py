@@ -112,9 +112,8 @@ def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
     status, _, said = command("convert-dataset", *words)
     assert status == 0, said
     before = load_dataset(made.layout, made.folder, "chair", "train")
-    before = before.select(
-        np.argsort(before.object_ids, kind="stable")
-    )  # as they come in shards of one object
+    # as they come in shards of one object
+    before = before.select(np.argsort(before.object_ids, kind="stable"))
     after = load_dataset(made.layout, tmp_path, "chair", "train")
     assert isinstance(after.images, DiskArray) and after.info() == before.info()
     for name in ("view_names", "object_names", "convention", "image_size"):

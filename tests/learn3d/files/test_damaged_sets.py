@@ -91,9 +91,8 @@ def attack(target: Target, seed: int) -> None:
     sound = {each: (target.folder / each).read_bytes() for each in target.damaged}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # of Pillow and NumPy about odd values, of zipfile about doubled names
+            # of Pillow and NumPy about odd values, of zipfile about doubled names
+            warnings.simplefilter("ignore")
             (target.folder / name).write_bytes(target.damaged[name](rng, sound[name]))
             with bounded():
                 target.read(target.folder)

@@ -58,9 +58,8 @@ def bounded() -> Iterator[None]:
         done.set()
         thread.join()
     used = time.process_time() - start
-    assert used < SECONDS, (
-        f"it took {used:.1f} s"
-    )  # of this process; a worker has its own limit, below that
+    # of this process; a worker has its own limit, below that
+    assert used < SECONDS, f"it took {used:.1f} s"
     assert most[0] < BYTES, f"it took {most[0] / 1e6:.0f} MB"
 
 

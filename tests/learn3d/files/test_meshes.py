@@ -302,9 +302,8 @@ def compare(parts: Parts, corners: np.ndarray) -> None:
     assert len(corners) == sum(len(one) - 2 for one in polygons)
     for one in polygons:
         points = vertices[one]
-        distance = (
-            np.abs(corners[:, :, None] - points).max(axis=3).min(axis=2).max(axis=1)
-        )  # to its nearest corner
+        # to its nearest corner
+        distance = np.abs(corners[:, :, None] - points).max(axis=3).min(axis=2).max(axis=1)
         inside = np.flatnonzero((distance < 2e-4 * scale) & ~used)[: len(one) - 2]
         assert len(inside) == len(one) - 2
         used[inside] = True

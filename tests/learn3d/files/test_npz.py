@@ -129,9 +129,8 @@ def same(arrays: list[np.ndarray], images: list[np.ndarray]) -> None:
 
 def test_python_2s_object_arrays_are_read(tmp_path):
     content = python2_pickle(IMAGES)
-    same(
-        pickle.loads(content, encoding="latin1"), IMAGES
-    )  # the bytes of this test are a pickle for Python, too
+    # the bytes of this test are a pickle for Python, too
+    same(pickle.loads(content, encoding="latin1"), IMAGES)
     for header in (
         None,
         b"{'descr': '|O8', 'fortran_order': False, 'shape': (2,), }",

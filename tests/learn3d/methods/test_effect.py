@@ -65,7 +65,6 @@ def test_pose_confusion_takes_the_view_out_of_the_codes(
     assert loss.item() < 0.4 * np.log(len(SIDES))  # it has learnt to tell them apart
     sure = confusion(method, batch)
     for _ in range(30):
-        take_step(
-            method, batch, 2
-        )  # even steps train the encoder against the discriminator, which stays as it is
+        # even steps train the encoder against the discriminator, which stays as it is
+        take_step(method, batch, 2)
     assert (confusion(method, batch) < 0.1 * sure) == unsure

@@ -130,9 +130,8 @@ def test_discriminator_rests_while_it_is_too_good(monkeypatch: pytest.MonkeyPatc
 def test_accuracy_is_the_mean_probability_of_being_right(monkeypatch: pytest.MonkeyPatch) -> None:
     method, batch = small_prgan(), make_batch(4)
     monkeypatch.setattr(method, "generate", lambda z: torch.zeros(len(z), 64, 64))
-    monkeypatch.setattr(
-        method, "discriminator", lambda images: 4 * images.amax((1, 2)) - 1
-    )  # 3 and -1
+    # 3 and -1
+    monkeypatch.setattr(method, "discriminator", lambda images: 4 * images.amax((1, 2)) - 1)
     probability = torch.tensor([3.0, 1.0]).sigmoid().mean()
     assert float(method.accuracy(batch.masks, method.sample_z(4))) == pytest.approx(
         float(probability)

@@ -22,9 +22,8 @@ def test_surface_of_a_ball_is_where_the_ball_is() -> None:
     grid = nmr.voxelize(0.25 * sphere + centre + 0.5, faces, size=64)[0].float()
     vertices, found, *_ = grid_surface(grid)
     distance = (vertices - centre).norm(dim=1)
-    assert (
-        0.24 < distance.min() < distance.max() < 0.28
-    )  # the cells that the surface touches count as inside
+    # the cells that the surface touches count as inside
+    assert 0.24 < distance.min() < distance.max() < 0.28
     assert torch.allclose(vertices.mean(0), centre, atol=0.02)
     normals = nmr.face_normals(vertices, found)
     outwards = vertices[found].mean(1) - centre

@@ -255,9 +255,8 @@ def test_input_mask_is_the_target_at_its_size() -> None:
     wrong = replace(batch, masks=torch.zeros(2, 64, 64))
     losses = [take_step(create(settings), b, 1)["projection"] for b in (batch, wrong)]
     assert losses[0] == losses[1]
-    faint = replace(
-        batch, images=torch.where(batch.images == 0, 25, batch.images)
-    )  # 25 / 255 is below 0.1
+    # 25 / 255 is below 0.1
+    faint = replace(batch, images=torch.where(batch.images == 0, 25, batch.images))
     method = create(settings)
     method.predict = lambda images: VPL.predict(method, batch.images)
     assert take_step(method, faint, 1)["projection"] == losses[0]

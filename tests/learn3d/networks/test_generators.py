@@ -34,9 +34,8 @@ def narrow(name: str, symmetry: Symmetry | None) -> MeshGenerator:
 def reflected(points: Tensor, azimuth_deg: float) -> Tensor:
     """Points mirrored at the plane through the y axis and the eye of a camera at this azimuth."""
     angle = math.radians(azimuth_deg)
-    normal = torch.tensor(
-        [math.cos(angle), 0.0, math.sin(angle)]
-    )  # across the eye's (sin a, 0, -cos a)
+    # across the eye's (sin a, 0, -cos a)
+    normal = torch.tensor([math.cos(angle), 0.0, math.sin(angle)])
     return points - 2 * (points @ normal)[..., None] * normal
 
 

@@ -101,7 +101,6 @@ def test_views_are_those_of_katos_cameras() -> None:
     image = project(density, ids, views, TAU)
     assert iou(image, exact).min() > 0.95
     assert iou(image, masks).min() > 0.75
-    assert (
-        iou(project(density, (24 - ids) % 24, views, TAU), masks).max() < 0.72
-    )  # azimuths of the other sign
+    # azimuths of the other sign
+    assert iou(project(density, (24 - ids) % 24, views, TAU), masks).max() < 0.72
     assert iou(image.flip(1), masks).max() < 0.6

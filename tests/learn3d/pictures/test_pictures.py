@@ -131,9 +131,8 @@ def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
         a, b = shaded[drawn], silhouettes[pose].numpy()
         return float((a & b).sum() / (a | b).sum())
 
-    assert (
-        min(overlap(0, 0), overlap(1, 1), overlap(3, 2)) > 0.97
-    )  # the second pose is 35 degrees on
+    # the second pose is 35 degrees on
+    assert min(overlap(0, 0), overlap(1, 1), overlap(3, 2)) > 0.97
     assert overlap(2, 1) < 0.8
 
 
@@ -176,9 +175,8 @@ def test_common_zoom_fills_the_picture_with_the_largest_shape_or_mask(egg) -> No
     zoom = common_zoom([(egg, cameras), (small, cameras)], no_masks)
     picture = draw_surface(egg, orbit(pose, turns, zoom=zoom), image_size=100)[0]
     columns = np.flatnonzero((picture < 250).any(axis=(0, 2)))
-    assert (
-        1 <= columns[0] <= 4 and columns[-1] == 99 - columns[0]
-    )  # 5 % of the half side are left free
+    # 5 % of the half side are left free
+    assert 1 <= columns[0] <= 4 and columns[-1] == 99 - columns[0]
     masks = no_masks.clone()
     masks[0, 16:48, 20:56] = 1.0  # reaches 24 / 32 of the half side
     assert common_zoom([(small, cameras)], masks) == pytest.approx(0.95 / (23.5 / 32), rel=1e-6)

@@ -217,9 +217,8 @@ def test_tensorboard_shows_every_step_once_after_a_kill(
     def kill() -> None:
         raise Killed
 
-    monkeypatch.setattr(
-        log.RunLog, "__exit__", lambda *arguments: None
-    )  # a killed process closes nothing
+    # a killed process closes nothing
+    monkeypatch.setattr(log.RunLog, "__exit__", lambda *arguments: None)
     before_step(monkeypatch, 6, kill)
     with pytest.raises(Killed):
         train(tiny_run(run_folder))

@@ -86,9 +86,8 @@ def test_killed_at_any_place(server, uninterrupted, wanted: int) -> None:
         config = dataclasses.replace(
             killed, output=killed.output.with_name(f"chain{wanted}-{chain}")
         )
-        first = (
-            1 + (chain - 1) * things * 3 // wanted % things
-        )  # from the start again where chains were shorter
+        # from the start again where chains were shorter
+        first = 1 + (chain - 1) * things * 3 // wanted % things
         for place in (first, rng.randint(1, things // 2), rng.randint(1, things)):
             resume = (config.output / "config.json").exists()
             answer = server(config, resume=resume, kill_at=place, half=rng.random() < 0.5)
@@ -142,9 +141,8 @@ def test_signals_at_any_time(server, uninterrupted) -> None:
 @pytest.mark.slow
 def test_the_command_killed_at_any_time(uninterrupted, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(training, "PICTURE_ROWS", 8)  # as the command draws them
-    gentle = dataclasses.replace(
-        uninterrupted[0].settings, learning_rate=1e-4
-    )  # networks of the usual size
+    # networks of the usual size
+    gentle = dataclasses.replace(uninterrupted[0].settings, learning_rate=1e-4)
     reference = dataclasses.replace(
         uninterrupted[0], settings=gentle, output=tmp_path / "uninterrupted"
     )

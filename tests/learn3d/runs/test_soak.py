@@ -26,9 +26,8 @@ pytestmark = [
 ]
 
 STEPS, EVERY = 10_000, 100
-MEMORY_GROWTH = (
-    1e6  # bytes between the middles of the first and the last third; a leaked scalar per step: 3e6
-)
+# bytes between the middles of the first and the last third; a leaked scalar per step: 3e6
+MEMORY_GROWTH = 1e6
 TIME_GROWTH = 1.3
 
 

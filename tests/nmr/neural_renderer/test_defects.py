@@ -87,9 +87,8 @@ def test_textures_of_more_than_two_to_the_31_numbers():
         pytest.skip("the system promises no 8 GB")
     assert textures.size > 2**31
     textures[0, 0, -2:, :2, :2] = 1
-    far_away = torch.tensor(
-        [[[[0.0, 0, 2], [1e6, -1, 2], [1e6, 1, 2]]]]
-    )  # the centre of pixel (2, 1) is all of corner 0
+    # the centre of pixel (2, 1) is all of corner 0
+    far_away = torch.tensor([[[[0.0, 0, 2], [1e6, -1, 2], [1e6, 1, 2]]]])
     image = nr.rasterize(far_away, torch.from_numpy(textures), image_size=3, anti_aliasing=False)
     assert image[0, :, 1, 1].tolist() == [1, 1, 1]
 

@@ -15,9 +15,8 @@ def read_ac3d(text: str, skip: Callable[[str], object]) -> list[RawMesh]:
     children. Frame of FlightGear's models: nose towards -x, y up, left wing towards +z. Raises
     ValueError if the text is not AC3D or incomplete.
     """
-    lines = (
-        line for line in map(str.strip, text.splitlines()) if line
-    )  # some exporters add blank lines
+    # some exporters add blank lines
+    lines = (line for line in map(str.strip, text.splitlines()) if line)
     if not next(lines, "").startswith("AC3D"):
         raise ValueError("not an AC3D file: it does not start with AC3D")
     try:

@@ -66,9 +66,8 @@ def furniture_category(name: str, section: str = "") -> str | None:
 
 def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
     """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
-    entries: defaultdict[int, dict[str, str]] = defaultdict(
-        dict
-    )  # N -> entry; general properties under 0
+    # N -> entry; general properties under 0
+    entries: defaultdict[int, dict[str, str]] = defaultdict(dict)
     for key, number, value in re.findall(
         r"^\s*(\w+)(?:#(\d+))?\s*=[^\S\n]*(.*)$", text, re.MULTILINE
     ):
@@ -144,9 +143,8 @@ EFFECTS = re.compile(
     re.IGNORECASE,
 )
 MIN_DISC = 0.09  # diameter of a propeller disc over the longest side of the airplane
-DETACHED = (
-    2e-3  # distance, over the longest side, at which a quadrilateral is not joined to other parts
-)
+# distance, over the longest side, at which a quadrilateral is not joined to other parts
+DETACHED = 2e-3
 
 
 def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:

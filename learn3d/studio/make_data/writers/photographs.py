@@ -67,9 +67,8 @@ def _pascal3d_views(vertices: np.ndarray, count: int, rng: np.random.Generator) 
     cos, sin = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
     roll = np.tile(np.eye(3), (count, 1, 1))
     roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = cos, -sin, sin, cos
-    return RotationPoses(
-        roll @ upright @ WORLD_FROM_OBJECT.T
-    )  # rows: the right, up and away of the image
+    # rows: the right, up and away of the image
+    return RotationPoses(roll @ upright @ WORLD_FROM_OBJECT.T)
 
 
 def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -83,9 +82,8 @@ def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndar
     if not len(rows):
         rows = columns = np.array([0, side - 1])  # the object vanished when the image was reduced
     size = np.array([columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1])
-    corner = rng.integers(
-        0, np.array([width, height]) - size + 1
-    )  # the whole object is in the photograph
+    # the whole object is in the photograph
+    corner = rng.integers(0, np.array([width, height]) - size + 1)
     left, top = corner[0] - columns[0], corner[1] - rows[0]
     photo = Image.fromarray(photo_background(height, width, rng))
     photo.paste(small, (int(left), int(top)), small)

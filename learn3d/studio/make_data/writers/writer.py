@@ -73,12 +73,10 @@ class Writer:
     fixed: tuple[str, ...] = ()  # options (views, test) that must have their default values
     shared: tuple[str, ...] = ()  # files with entries for all categories of the folder
     convention: VoxelConvention = KATO
-    turn: np.ndarray = field(
-        default_factory=lambda: np.eye(3)
-    )  # frame of `mesh_to_object` to layout's object frame
-    diagonal: float | None = (
-        None  # diagonal of an object's bounding box; None if its longest side is 1
-    )
+    # frame of `mesh_to_object` to layout's object frame
+    turn: np.ndarray = field(default_factory=lambda: np.eye(3))
+    # diagonal of an object's bounding box; None if its longest side is 1
+    diagonal: float | None = None
     natural: bool = False  # True for everyday colours and lights; else objects are light grey
 
 

@@ -147,9 +147,8 @@ def find_workers(where: str) -> list[int]:
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             if "tasks._child" in " ".join(process.cmdline()) and process.cwd() == os.getcwd():
-                worker = (
-                    process if where == "here" else process.parent()
-                )  # an orphan's is not a worker
+                # an orphan's is not a worker
+                worker = process if where == "here" else process.parent()
                 if where == "here" or "multiprocessing" in " ".join(worker.cmdline()):
                     found.append(worker.pid)
     return found
@@ -159,9 +158,8 @@ def find_workers(where: str) -> list[int]:
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 def test_a_killed_call_is_continued(config, here, tmp_path, monkeypatch) -> None:
     """Killed with its workers, or stopped, at several moments, the same command ends with the same files."""
-    config = dataclasses.replace(
-        config, procedural=24
-    )  # enough that no call ends before its signal
+    # enough that no call ends before its signal
+    config = dataclasses.replace(config, procedural=24)
     whole = dataclasses.replace(config, output=tmp_path / "whole")
     assert render.make_shards(whole) == 0
     monkeypatch.undo()

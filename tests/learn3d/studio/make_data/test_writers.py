@@ -128,9 +128,8 @@ def test_kar(tmp_path, folder):
         rgba = read_image(root / f"render_{i}.png")
         assert_same_mask(rgba[..., 3], silhouette(vertices, faces, camera, 224))
         assert (rgba[rgba[..., 3] == 0] == 0).all() and rgba[rgba[..., 3] > 0][:, :3].min() > 20
-        assert (
-            not rgba[[0, -1], :, 3].any() and not rgba[:, [0, -1], 3].any()
-        )  # the whole object is seen
+        # the whole object is seen
+        assert not rgba[[0, -1], :, 3].any() and not rgba[:, [0, -1], 3].any()
         depth = np.asarray(Image.open(root / f"depth_{i}.png"))
         hard = silhouette(vertices, faces, camera, 224, anti_aliasing=False)
         assert_same_mask(255.0 * (depth < 250), hard)
@@ -180,9 +179,8 @@ def test_photos(tmp_path, folder):
     for row in rows[:3]:
         vertices, faces = true_mesh(folder, row["object"])
         azimuth, elevation, distance, fov = map(float, list(row.values())[1:5])
-        a, e = np.deg2rad(
-            [azimuth, elevation]
-        )  # anti-clockwise from the front, seen from above: x is front, -z right
+        # anti-clockwise from the front, seen from above: x is front, -z right
+        a, e = np.deg2rad([azimuth, elevation])
         eye = distance * np.array([np.cos(e) * np.cos(a), np.sin(e), -np.cos(e) * np.sin(a)])
         mask = read_image(tmp_path / "chair" / "masks" / row["file"])
         camera = opencv_camera(eye, 128 / np.tan(np.deg2rad(fov / 2)), 256)

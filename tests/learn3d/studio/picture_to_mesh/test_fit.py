@@ -127,9 +127,8 @@ def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_m
 ):
     vertices, faces = arrow()
     centres = vertices[faces].mean(1)
-    paint = np.where(
-        centres[:, 1:2] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]]
-    )  # red above, blue below
+    # red above, blue below
+    paint = np.where(centres[:, 1:2] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]])
     view = frame_view(vertices[None], torch.tensor([20.0]), torch.tensor([10.0]))
     lights = nmr.Lights(1.0, 0.0)
     rgb, alpha = photograph(
@@ -153,9 +152,8 @@ def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
     box, faces = map(
         torch.tensor, (trimesh.creation.box((0.1, 0.4, 0.1)).vertices, trimesh.creation.box().faces)
     )
-    places = torch.tensor(
-        [(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)]
-    )  # two legs, and another part near
+    # two legs, and another part near
+    places = torch.tensor([(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)])
     vertices, faces = (
         (box + places[:, None]).flatten(0, 1),
         torch.cat([faces, faces + 8, faces + 16]),
@@ -215,9 +213,8 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     known = KnownCodes(known[None], *learn_others(known, other[:20]))
     assert all(known.is_strange(7 * code) for code in other[20:])
     assert not any(known.is_strange(7 * code) for code in (*first[20:], *second[20:]))
-    wrong = known._replace(
-        output=torch.tensor([0.0] * len(known.hidden) + [9.0])
-    )  # calls everything another thing
+    # calls everything another thing
+    wrong = known._replace(output=torch.tensor([0.0] * len(known.hidden) + [9.0]))
     assert not any(wrong.is_strange(7 * code) for code in first[20:]), (
         "it is too near to a category for that"
     )

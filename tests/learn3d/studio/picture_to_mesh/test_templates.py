@@ -44,9 +44,8 @@ def picture(category: str, number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bodies(surface: Surface) -> int:
-    mesh = trimesh.Trimesh(
-        surface.vertices.numpy(), surface.faces.numpy()
-    )  # it merges equal vertices
+    # it merges equal vertices
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())
     return mesh.body_count if mesh.volume > 0 else 0  # below 0: it is inside out
 
 

@@ -78,9 +78,8 @@ def test_ranges_of_elevations_and_unknown_cameras() -> None:
     table = estimate_views(
         [dataclasses.replace(dataset, poses=known)], CameraOptions(), quick
     ).table
-    assert all(
-        len(set(azimuths)) == 24 for azimuths in table.azimuth_deg
-    )  # each azimuth once, at the known elevation
+    # each azimuth once, at the known elevation
+    assert all(len(set(azimuths)) == 24 for azimuths in table.azimuth_deg)
     assert np.array_equal(table.elevation_deg[:, 0], known.elevation_deg)
     views = estimate_views(
         [dataclasses.replace(darts(5), poses=None)], CameraOptions("0:30", 2.5, 31.0), quick
@@ -105,9 +104,8 @@ def test_peaks_of_upper_outlines_tell_front_from_back(turns: int) -> None:
     prototype, azimuth = torch.tensor([0, 0, 1, 1]), torch.tensor([1, 3, 1, 3])
     seen = torch.where(prototype == 1, (azimuth - turns) % 4, azimuth)
     data = Masks(masks.flatten(1), torch.ones(4, 1, dtype=torch.bool), torch.arange(4))
-    votes = _peak_votes(data, prototype, seen, 2, 4)[
-        0, :, 0, 1
-    ]  # the first prototype stays as it is
+    # the first prototype stays as it is
+    votes = _peak_votes(data, prototype, seen, 2, 4)[0, :, 0, 1]
     assert votes.argmax() == turns and votes[2 - turns] < 0
 
 

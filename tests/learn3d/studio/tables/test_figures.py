@@ -168,9 +168,8 @@ def test_the_view_is_told_from_entangled_codes_alone() -> None:
     accuracy, chance = tsne.view_accuracy(entangled(0.95), VIEWS, OBJECTS)
     assert accuracy > 0.95 and chance == pytest.approx(1 / 12, abs=0.03)
     accuracy, _ = tsne.view_accuracy(entangled(0.0), VIEWS, OBJECTS)
-    assert (
-        0.02 < accuracy < 0.17
-    )  # as often as by chance, not never: views of the same object do not count
+    # as often as by chance, not never: views of the same object do not count
+    assert 0.02 < accuracy < 0.17
     assert tsne.view_accuracy(entangled(0.5)[:12], VIEWS[:12], OBJECTS[:12]) is None
     assert tsne.view_accuracy(entangled(0.5), 0 * VIEWS, OBJECTS) is None
 
@@ -252,9 +251,8 @@ def test_a_figure_from_a_run_to_a_file(call, finished_run, tmp_path) -> None:
     assert code == 0, err
     assert out.split() == [str(tmp_path / "out" / f"a.{kind}") for kind in ("png", "svg")]
     with Image.open(tmp_path / "out" / "a.png") as image:
-        assert (
-            0.005 < (np.asarray(image.convert("L")) < 200).mean() < 0.7
-        )  # something is drawn on white
+        # something is drawn on white
+        assert 0.005 < (np.asarray(image.convert("L")) < 200).mean() < 0.7
 
 
 def test_the_images_of_an_interpolation_can_be_chosen(call, finished_run, tmp_path) -> None:

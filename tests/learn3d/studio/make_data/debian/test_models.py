@@ -125,9 +125,8 @@ def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> 
 def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path) -> None:
     fetch(tmp_path / "out", debs)
     mesh = trimesh.load(tmp_path / "out/airplane/plane.ply", process=False)
-    assert (
-        mesh.vertices[mesh.vertices[:, 1].argmax(), 2] < -0.3
-    )  # the fin is at the tail: the nose is towards +z
+    # the fin is at the tail: the nose is towards +z
+    assert mesh.vertices[mesh.vertices[:, 1].argmax(), 2] < -0.3
     assert mesh.vertices[mesh.vertices[:, 1].argmin(), 0] > 0.3  # the left wing is at +x
     np.testing.assert_allclose(mesh.extents, [0.8, 0.4, 1.0], atol=1e-6)  # with the disc 0.801 in z
 
@@ -270,9 +269,8 @@ def test_ac3d_tree_names_and_transforms() -> None:
     )
     parts = read_ac3d(ac_text(turned, blank, line, blur), skip=lambda name: "Blur" in name)
     assert [one.vertices.max() for one in parts] == [11, 2]
-    np.testing.assert_allclose(
-        parts[0].vertices.min(axis=0), [-1, 10, 5]
-    )  # row vectors: (x, y) -> (-y, x)
+    # row vectors: (x, y) -> (-y, x)
+    np.testing.assert_allclose(parts[0].vertices.min(axis=0), [-1, 10, 5])
     assert len(parts[0].faces) == 12
 
 
