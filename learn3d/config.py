@@ -45,8 +45,8 @@ class TrainConfig:
     """Size of the view classes, azimuth x elevation in degrees. None: 15x20 for kar; one class for each fixed
     camera."""
     views_per_object: Count | None = None
-    """Training views per object: the first ones for kar, else random ones, the same in every run. None: one for kar,
-    else all."""
+    """Training views per object: the first ones for kar, else random ones, the same in every run.
+    If not given: one for kar, else all."""
     poses: MayDiffer[FilePath | None] = None
     """Table of poses from learn3d estimate-poses, instead of the poses of the data set."""
     pose_updates: Annotated[int, Field(ge=0, le=16)] = 3
@@ -70,7 +70,8 @@ class TrainConfig:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Arithmetic of the networks. auto: bf16 if it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
     threads: MayDiffer[Annotated[int, Field(ge=1, le=4096)] | None] = None
-    """Number of CPU threads. None: one or all, whichever is faster; measured at the start and when steps slow down."""
+    """Number of CPU threads. If not given: one or all, whichever is faster;
+    measured at the start and when steps slow down."""
     log: MayDiffer[Literal["tensorboard", "wandb"]] = "tensorboard"
     """Second log besides metrics.jsonl; wandb sends the metrics to your account there (pip install wandb)."""
     val_split: MayDiffer[Literal["val", "test"]] = "val"

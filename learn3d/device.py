@@ -14,7 +14,8 @@ def resolve_precision(
 ) -> Literal["bf16", "fp32"]:
     """Turn 'auto' into the faster precision: bf16 on CUDA and on x86 CPUs with bf16 instructions, else fp32.
 
-    bf16 instructions halve the time of the networks; without them bf16 is emulated and slower than fp32.
+    bf16 instructions halve the time of the networks; without them bf16 is emulated and slower
+    than fp32.
     """
     if precision != "auto":
         return precision
@@ -30,8 +31,8 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>
 def keep_freed_memory() -> bool:
     """Let this process reuse freed memory instead of returning it; True if that worked (Linux with glibc).
 
-    By default each step maps and unmaps the pages of every large tensor, a quarter of its CPU time at batch 128.
-    Resident memory stays at its peak.
+    By default each step maps and unmaps the pages of every large tensor, a quarter of its CPU
+    time at batch 128. Resident memory stays at its peak.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -76,15 +76,16 @@ def evaluate(
 ) -> Evaluation:
     """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
 
-    Shapes are voxelized in the data set's convention and compared with the object's voxels. If poses are known, the
-    silhouette of a mesh at the camera of another image of the object is compared with that image's mask. An
-    object's only image is compared with its own mask. If voxels are known and no object has a second image, silhouettes
-    are left out. A method in training is measured with its EMA weights.
+    Shapes are voxelized in the data set's convention and compared with the object's voxels. If
+    poses are known, the silhouette of a mesh at the camera of another image of the object is
+    compared with that image's mask. An object's only image is compared with its own mask. If
+    voxels are known and no object has a second image, silhouettes are left out. A method in
+    training is measured with its EMA weights.
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
-    detailed: add the voxel IoU with kato19, the MMD as the paper prints it, and Chamfer-L1 and F-score between 2,000
-    points on each surface. If the data set has no points, the truth is the surface of its voxels, which limits
-    distances to about 1/32.
+    detailed: add the voxel IoU with kato19, the MMD as the paper prints it, and Chamfer-L1 and
+    F-score between 2,000 points on each surface. If the data set has no points, the truth is the
+    surface of its voxels, which limits distances to about 1/32.
     align: turns or moves the predicted shapes of a batch before they are compared.
     """
     samples = spread_samples(
@@ -212,7 +213,8 @@ def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
 def _other_images(object_ids: np.ndarray) -> Tensor:
     """For each sample another one of its object, int64 [M]: a quarter of the object's images further on.
 
-    If views go around the object, that is a quarter turn. Half a turn would show the same outline, mirrored.
+    If views go around the object, that is a quarter turn. Half a turn would show the same
+    outline, mirrored.
     """
     order = np.argsort(object_ids, kind="stable")
     others = np.empty_like(order)
@@ -224,7 +226,8 @@ def _other_images(object_ids: np.ndarray) -> Tensor:
 def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:
     """`count` different samples, int64 [count], ascending, spread evenly over views and objects; always the same ones.
 
-    Samples are taken one by one in a shuffled order, each time from the views and objects that were taken least.
+    Samples are taken one by one in a shuffled order, each time from the views and objects that
+    were taken least.
     """
     total = len(object_ids)
     if count >= total:
@@ -244,9 +247,9 @@ def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> 
 def mean_mmd(codes: Tensor, view_ids: Tensor, forms: Sequence[str] = ("mmd",)) -> dict[str, float]:
     """Mean MMD between the codes [N,C] of two views, over all pairs of views, for each of `forms`.
 
-    The MMD of n codes has a bias of 1 / n, so every view has the same number of codes: that of the view with the
-    fewest, at most 512. Views with one code are left out, as the MMD between two single codes is a constant. The result
-    is {} if fewer than two views are left.
+    The MMD of n codes has a bias of 1 / n, so every view has the same number of codes: that of
+    the view with the fewest, at most 512. Views with one code are left out, as the MMD between
+    two single codes is a constant. The result is {} if fewer than two views are left.
     """
     groups = [codes[view_ids == view].double() for view in view_ids.unique()]
     groups = [group for group in groups if len(group) > 1]
@@ -274,8 +277,8 @@ def mean_mmd(codes: Tensor, view_ids: Tensor, forms: Sequence[str] = ("mmd",)) -
 def picture_grid(method: Method, dataset: ViewDataset, indices: Tensor) -> np.ndarray:
     """Inputs and results of a method in training: uint8 [H,W,3].
 
-    A row per image: the input, the target silhouette, the rendered silhouette and the shaded shape at the input's view,
-    and the shape from five more views around it.
+    A row per image: the input, the target silhouette, the rendered silhouette and the shaded
+    shape at the input's view, and the shape from five more views around it.
     """
     batch = dataset.batch(indices)
     with method.in_use():

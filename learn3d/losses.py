@@ -21,8 +21,9 @@ def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:
 def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -> Tensor:
     """L_adv: batch mean of the distance between predicted and uniform probabilities of K views (eq. 4).
 
-    "probability", as printed: sum_k (p_k - 1/K)^2. "log", as in the published code: sum_k (log(1/K) - log p_k)^2, which
-    is unbounded and much stronger for a confident discriminator. logits [B,K]; differentiable.
+    "probability", as printed: sum_k (p_k - 1/K)^2. "log", as in the published code: sum_k
+    (log(1/K) - log p_k)^2, which is unbounded and much stronger for a confident discriminator.
+    logits [B,K]; differentiable.
     """
     views = logits.shape[1]
     if form == "log":
@@ -35,9 +36,9 @@ def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -
 def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Mean absolute differences of depth maps [B, S, S], and of their slopes.
 
-    A slope is the difference of the depths of pixels two apart in a row or a column (gradient matching, Li and Snavely
-    2018). Only pixels in which both maps show a surface count; others are 100 (nmr's `far`) in `depth` and 0 in
-    `target`. Differentiable in depth.
+    A slope is the difference of the depths of pixels two apart in a row or a column (gradient
+    matching, Li and Snavely 2018). Only pixels in which both maps show a surface count; others
+    are 100 (nmr's `far`) in `depth` and 0 in `target`. Differentiable in depth.
     """
     both = (target > 0) & (depth.detach() < 2 * target)
     error = (depth - target) * both
@@ -65,9 +66,9 @@ def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tens
 def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
     """Distance between silhouettes at five resolutions (published code of Kato and Harada 2019).
 
-    The sum over levels l of the batch mean of |p_l / |p_l| - t_l / |t_l||^2. p_0 is the prediction, and p_(l+1) has the
-    means of 2x2 pixels of p_l. An empty silhouette has p / |p| = 0. prediction, target: float [B,S,S], S >= 16;
-    differentiable in both.
+    The sum over levels l of the batch mean of |p_l / |p_l| - t_l / |t_l||^2. p_0 is the
+    prediction, and p_(l+1) has the means of 2x2 pixels of p_l. An empty silhouette has p / |p| =
+    0. prediction, target: float [B,S,S], S >= 16; differentiable in both.
     """
     pair = torch.stack([prediction.float(), target.float()])
     total = pair.new_zeros(())
@@ -82,9 +83,10 @@ def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
 def silhouette_energy_distance(silhouettes: Tensor, masks: Tensor) -> Tensor:
     """Energy distance between the distributions of silhouettes p and masks t (Szekely and Rizzo 2013).
 
-    2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k); the third term is constant and left out. The distance
-    d(a, b) = 1 - a.b / (a.a + b.b - a.b) is 1 - IoU for silhouettes of 0 and 1 (Tanimoto's similarity, a positive
-    definite kernel: Ralaivola et al. 2005), and 0 for two empty ones.
+    2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k); the third term is constant and left out.
+    The distance d(a, b) = 1 - a.b / (a.a + b.b - a.b) is 1 - IoU for silhouettes of 0 and 1
+    (Tanimoto's similarity, a positive definite kernel: Ralaivola et al. 2005), and 0 for two
+    empty ones.
 
     silhouettes: float [N,D], N >= 2, differentiable; masks: float [M,D], M >= 1.
     """
@@ -108,10 +110,11 @@ def mmd(
 ) -> Tensor:
     """Maximum mean discrepancy between two sets of N codes, x and y; 0 for equal sets.
 
-    xx, yy, xy: float [N,N], squared distances d^2 within x, within y and from x to y; differentiable. b is the mean of
-    d^2 over all pairs of different rows of x and y together, a constant for the gradient. "released", as in the
-    published code and the paper's table: mean(XX + YY - XY - YX) of the sum of five kernels exp(-d^2 / (b * 2^i)),
-    i = -2..2. "paper", as printed: the square root of that mean for one kernel. The paper gives no bandwidth for it;
+    xx, yy, xy: float [N,N], squared distances d^2 within x, within y and from x to y;
+    differentiable. b is the mean of d^2 over all pairs of different rows of x and y together, a
+    constant for the gradient. "released", as in the published code and the paper's table: mean(XX
+    + YY - XY - YX) of the sum of five kernels exp(-d^2 / (b * 2^i)), i = -2..2. "paper", as
+    printed: the square root of that mean for one kernel. The paper gives no bandwidth for it;
     here i = 0.
     """
     rows = 2 * xx.shape[0]

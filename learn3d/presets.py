@@ -225,8 +225,9 @@ def full_name(name: str) -> str:
 def configure(preset: str = DEFAULT_PRESET, **options: Any) -> TrainConfig:
     """The run of a preset with these options in place of its own; data, category and output must be among them.
 
-    preset: its name, or the short name of a method. Settings of the method are options, too; they may also be given
-    together, as `settings`: an instance, or a dictionary. Raises ValueError for an unknown name or a wrong value.
+    preset: its name, or the short name of a method. Settings of the method are options, too; they
+    may also be given together, as `settings`: an instance, or a dictionary. Raises ValueError for
+    an unknown name or a wrong value.
     """
     base = PRESETS[full_name(preset)]
     if missing := [name for name in PLACES if name not in options]:

@@ -1,7 +1,8 @@
 """Runs tasks, each in a process of its own: a few at a time on this machine, or on the workers of a Dask cluster.
 
-A task is a function call that writes files and continues from them when it is called again. So an interrupted
-`run_tasks` is resumed by the same call, and a task whose process or worker died is started again.
+A task is a function call that writes files and continues from them when it is called again. So an
+interrupted `run_tasks` is resumed by the same call, and a task whose process or worker died is
+started again.
 """
 
 import collections
@@ -69,9 +70,10 @@ class Task:
 def run_tasks(tasks: Sequence[Task], workers: Workers) -> list[str]:
     """Run `tasks` on `workers`; return the names of those that failed.
 
-    A failing task does not stop the others; the end of its log is shown. A task whose process or worker died is started
-    again, up to `RESTARTS` times. After SIGINT, SIGTERM or SIGHUP no task is started, and each running one saves its
-    state and ends. Raises OSError if no scheduler answers at `workers.cluster`.
+    A failing task does not stop the others; the end of its log is shown. A task whose process or
+    worker died is started again, up to `RESTARTS` times. After SIGINT, SIGTERM or SIGHUP no task
+    is started, and each running one saves its state and ends. Raises OSError if no scheduler
+    answers at `workers.cluster`.
     """
     failed, starts = [], collections.Counter()
     with stop_on_signal() as asked, _executor(workers) as (executor, stop):

@@ -21,8 +21,9 @@ _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\u
 def without_traceback(main: Callable[P, int]) -> Callable[P, int]:
     """Decorator of the main function of a command, which returns an exit status: errors become one line on stderr.
 
-    ValueError, OSError, MemoryError and FloatingPointError end it with status 1 and the line "error: " and the message.
-    Ctrl-C ends it with status 130. Any other error is a bug and keeps its traceback.
+    ValueError, OSError, MemoryError and FloatingPointError end it with status 1 and the line
+    "error: " and the message. Ctrl-C ends it with status 130. Any other error is a bug and keeps
+    its traceback.
     """
 
     @functools.wraps(main)
@@ -47,7 +48,8 @@ def plain(text: str) -> str:
 def say(text: str) -> None:
     """Print a line of the results through `plain`. A closed pipe (`| head`) is no error.
 
-    Raises OSError if the line cannot be written for another reason (a full disk), because the result is lost.
+    Raises OSError if the line cannot be written for another reason (a full disk), because the
+    result is lost.
     """
     with contextlib.suppress(BrokenPipeError):
         _print(text, sys.stdout)
@@ -112,8 +114,9 @@ def align(rows: Sequence[Sequence[str]]) -> str:
 def stop_on_signal() -> Iterator[SimpleNamespace]:
     """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop: the attribute `name` of the context, "" before.
 
-    A second SIGINT interrupts at once. SIGHUP comes when the terminal is closed; if it is ignored (nohup), it stays
-    ignored. Does nothing outside the main thread, because only this one can handle signals.
+    A second SIGINT interrupts at once. SIGHUP comes when the terminal is closed; if it is ignored
+    (nohup), it stays ignored. Does nothing outside the main thread, because only this one can
+    handle signals.
     """
     stop, previous = SimpleNamespace(name=""), {}
 

@@ -29,13 +29,15 @@ PICTURE_ROWS = 8  # of the picture grids
 def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False) -> Summary:
     """Train one model and save it in `config.output`; `runs.folder` lists the files there.
 
-    SIGINT, SIGTERM and SIGHUP end the run after the current step, with a checkpoint. resume: continue from the last
-    checkpoint (bit-identical on the same CPU with the same number of threads), or from the start if there is no
-    checkpoint yet. A finished run is left unchanged. overwrite: replace an older run in the folder.
+    SIGINT, SIGTERM and SIGHUP end the run after the current step, with a checkpoint. resume:
+    continue from the last checkpoint (bit-identical on the same CPU with the same number of
+    threads), or from the start if there is no checkpoint yet. A finished run is left unchanged.
+    overwrite: replace an older run in the folder.
 
-    Raises ValueError if the folder is not empty, if the data do not fit, or if options or data differ from those of
-    the resumed run; FloatingPointError if a loss is not finite (the last checkpoint predates it); OSError if a
-    checkpoint cannot be written or another process works in the folder.
+    Raises ValueError if the folder is not empty, if the data do not fit, or if options or data
+    differ from those of the resumed run; FloatingPointError if a loss is not finite (the last
+    checkpoint predates it); OSError if a checkpoint cannot be written or another process works in
+    the folder.
     """
     started, folder = time.monotonic(), config.output
     config = dataclasses.replace(
@@ -157,7 +159,8 @@ def loss_values(losses: Losses, step: int) -> dict[str, float]:
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:
     """Measure IoU and MMD on the validation images; save the networks if their IoU is the best so far.
 
-    `Evaluation.selection_metric` says which IoU. Returns the progress with the best IoU and its step.
+    `Evaluation.selection_metric` says which IoU. Returns the progress with the best IoU and its
+    step.
     """
     config, step = run.config, progress.step
     result = evaluate(run.method, val_set, max_images=config.max_val_images)

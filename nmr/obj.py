@@ -15,6 +15,8 @@ _MOST_BYTES = 2**30  # limit of an .obj or .mtl file
 _MOST_EARS = 4096  # corners of a polygon that is no fan; the time grows with their square
 _LARGEST = float(np.finfo(np.float32).max)
 _OPTIONS = r"(?:-(?:[sot](?:\s+[-+.\d][-+.\deE]*){1,3}|mm\s+\S+\s+\S+|[a-zA-Z]+\s+\S+)\s+)*"  # of a line `map_Kd`
+# A line of a vertex that has words behind its numbers.
+_WORDS = re.compile(rb"(?mi)^(\s*v(?:[^\S\n]+[-+.\de]+(?=\s)){3,})[^\S\n]+[^-+.\d\s][^\n]*")
 
 
 class Obj(NamedTuple):
@@ -113,10 +115,13 @@ class _Lines:
         }  # index of a corner, and its line
 
     def take(self, text: bytes, number: int) -> None:
-        """Add complete lines, the first of which has this number. The first wrong one is found by bisection."""
+        """Add complete lines, which count from `number`. The first wrong one is found by bisection."""
         try:
             self._parse(text, number)
         except (ValueError, OverflowError) as error:
+            plain = _WORDS.sub(rb"\1", text)
+            if plain != text:
+                return self.take(plain, number)
             half = len(text) // 2
             end = text.find(b"\n", half, len(text) - 1) + 1 or text.rfind(b"\n", 0, half) + 1
             if end == 0:

@@ -214,7 +214,8 @@ def iou(found: np.ndarray, mask: np.ndarray) -> float:
 def main(images: int = 40, seed: int = 2, sheet: Path | None = None) -> None:
     """Print the share of outlines with an IoU above 0.85, found without a hand and with a box.
 
-    The objects are generated, before drawn rooms and photographs out of scikit-image and scikit-learn.
+    The objects are generated, before drawn rooms and photographs out of scikit-image and
+    scikit-learn.
     sheet: a PNG of the pictures with the outlines that were found without a hand and with a box.
     """
     torch.set_num_threads(1)

@@ -26,10 +26,11 @@ COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,
 def main(models: Path, category: str, run: Path | None = None, images: int = 48) -> None:
     """Print a line for each category: means over `images` pictures of the meshes in the folder models/CATEGORY.
 
-    The meshes have y up and the front towards +z. Pictures have 256x256 pixels, everyday colours, and random ones of
-    Kato's 24 cameras. Columns: IoU of mask and silhouette of the predicted shape, the fitted one and the template,
-    their voxel IoUs (kato18), the share of pictures whose azimuth is right within 20 degrees, whose template has the
-    right category, and with a warning. The model (default: the package's) must have templates.
+    The meshes have y up and the front towards +z. Pictures have 256x256 pixels, everyday colours,
+    and random ones of Kato's 24 cameras. Columns: IoU of mask and silhouette of the predicted
+    shape, the fitted one and the template, their voxel IoUs (kato18), the share of pictures whose
+    azimuth is right within 20 degrees, whose template has the right category, and with a warning.
+    The model (default: the package's) must have templates.
     """
     model = load_model(run)
     print(f"{'':12}", *(f"{column:>20}" for column in COLUMNS))

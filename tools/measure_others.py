@@ -63,8 +63,10 @@ def main(
 ) -> None:
     """Print the share of pictures with a warning: it should be large for other things, small for known kinds.
 
-    others, known: folders of PNG files with transparency, or of meshes, that the model was not trained on.
-    run: the model (default: the package's). images: most pictures of each folder, and of each generated category.
+    others, known: folders of PNG files with transparency, or of meshes, that the model was not
+    trained on.
+    run: the model (default: the package's). images: most pictures of each folder, and of each
+    generated category.
     """
     torch.set_num_threads(1)
     model = load_model(run)

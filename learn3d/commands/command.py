@@ -1,6 +1,7 @@
 """Commands as dataclasses: the docstring describes the command, its fields are options, the texts below them the help.
 
-tyro parses the command line and writes the help. If a field holds a dataclass, its fields are options, too.
+tyro parses the command line and writes the help. If a field holds a dataclass, its fields are
+options, too.
 """
 
 import dataclasses

@@ -20,7 +20,8 @@ class CheckDataset(Command):
     Example:
       learn3d check-dataset DATA --layout kar --category airplane,chair --split train
 
-    The exit status is 1 if there are errors, with which training or evaluation would fail, and 0 otherwise.
+    The exit status is 1 if there are errors, with which training or evaluation would fail, and 0
+    otherwise.
     """
 
     folder: DataFolder
@@ -70,8 +71,8 @@ class ConvertDataset(Command):
     Example:
       learn3d convert-dataset --data KAR --layout kar --output SHARDS --category chair,airplane
 
-    Then give the other commands SHARDS in place of DATA, with the same layout (docs/scale.md). Splits that are complete
-    are skipped.
+    Then give the other commands SHARDS in place of DATA, with the same layout (docs/scale.md).
+    Splits that are complete are skipped.
     """
 
     data: Path

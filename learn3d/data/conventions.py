@@ -1,9 +1,9 @@
 """Conventions: the object frame, Kato's 24 views, and the axes of each data set's voxels.
 
-The object frame is that of the renderer: LEFT-handed, x right, y up, z away from the camera of view 0. Mesh files are
-right-handed; `mesh_to_object` converts their coordinates. A prediction is voxelized in the object frame, and the grid
-is then converted to the axes of the stored ground truth. Sources: the published evaluation code, see
-docs/methods/README.md.
+The object frame is that of the renderer: LEFT-handed, x right, y up, z away from the camera of
+view 0. Mesh files are right-handed; `mesh_to_object` converts their coordinates. A prediction is
+voxelized in the object frame, and the grid is then converted to the axes of the stored ground
+truth. Sources: the published evaluation code, see docs/methods/README.md.
 """
 
 from dataclasses import dataclass
@@ -52,9 +52,10 @@ class VoxelConvention:
     ) -> Tensor:
         """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the stored voxels.
 
-        vertices: float [B, V, 3] or [V, 3]. faces: integer [F, 3] or [B, F, 3]. definition: "kato18" for the voxelizer
-        of Kato et al. 2018 and of the paper, "kato19" for the conservative one of Kato and Harada 2019 (VPL), which
-        fills every cell that a face touches. Their IoUs must not be compared with each other.
+        vertices: float [B, V, 3] or [V, 3]. faces: integer [F, 3] or [B, F, 3]. definition:
+        "kato18" for the voxelizer of Kato et al. 2018 and of the paper, "kato19" for the
+        conservative one of Kato and Harada 2019 (VPL), which fills every cell that a face
+        touches. Their IoUs must not be compared with each other.
         """
         grid = nmr.voxelize(
             self._to_unit(vertices, definition), faces, size=VOXEL_SIZE, definition=definition
@@ -134,10 +135,10 @@ LAYOUTS = {
 def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
     """Matrix float64 [3, 3] from right-handed mesh coordinates to the object frame: object = matrix @ mesh.
 
-    `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x", "-x", "y" ...). A viewer
-    in front of the mesh has up x front on the right. So the rows are [up x front, up, -front], and the determinant is
-    -1. The default, (x, y, z) -> (-z, y, -x), is that of Kato's renderings of ShapeNet. Raises ValueError for other or
-    parallel axes.
+    `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x",
+    "-x", "y" ...). A viewer in front of the mesh has up x front on the right. So the rows are [up
+    x front, up, -front], and the determinant is -1. The default, (x, y, z) -> (-z, y, -x), is
+    that of Kato's renderings of ShapeNet. Raises ValueError for other or parallel axes.
     """
     axes = {
         s + a: np.float64(-1 if s else 1) * row

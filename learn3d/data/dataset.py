@@ -73,8 +73,9 @@ class Batch:
 class ViewDataset:
     """One split of one category or of several: M views (samples) of N objects.
 
-    Images, masks, depth, voxels and points are in memory, or on disk if they were read from shards (`data.shards`).
-    Raises ValueError if fields have different numbers of views or objects, or wrong shapes.
+    Images, masks, depth, voxels and points are in memory, or on disk if they were read from
+    shards (`data.shards`). Raises ValueError if fields have different numbers of views or
+    objects, or wrong shapes.
     """
 
     category: str  # name from the user; several names are joined by commas

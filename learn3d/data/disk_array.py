@@ -25,8 +25,8 @@ ROW = np.dtype([("file", np.int32), ("row", np.int32), ("crc", np.uint32)])
 class DiskArray:
     """An array [M, ...] on disk, whose rows are in some files. `array[samples]` reads rows, int64 [B].
 
-    Files are not mapped into memory: if a mapped file is truncated later, a signal ends the process. Here a DamagedFile
-    with its name is raised.
+    Files are not mapped into memory: if a mapped file is truncated later, a signal ends the
+    process. Here a DamagedFile with its name is raised.
     """
 
     files: tuple[tuple[Path, int], ...]  # (file, position of its first row in bytes)

@@ -1,7 +1,7 @@
 """Turns photographs into the square images of a network: padded with a mask, or cropped by a box.
 
-A photograph is padded to a square around its centre, because a square elsewhere would need an off-axis projection. So
-the camera must have been aimed at the middle of the object.
+A photograph is padded to a square around its centre, because a square elsewhere would need an
+off-axis projection. So the camera must have been aimed at the middle of the object.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ def read_photo(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Read colours uint8 [H, W, 3] and mask uint8 [H, W] of an image with a mask file or with transparency.
 
-    Both are turned upright (EXIF). The mask is the transparency of the mask file if it has any, else its grey values:
-    white is the object. optional: the mask is None if there is neither. Raises FileNotFoundError, and ValueError for
-    unreadable files, a missing mask and different sizes.
+    Both are turned upright (EXIF). The mask is the transparency of the mask file if it has any,
+    else its grey values: white is the object. optional: the mask is None if there is neither.
+    Raises FileNotFoundError, and ValueError for unreadable files, a missing mask and different
+    sizes.
     """
     return sandbox.read(_read, Path(path), mask_path, optional, wanted="a photograph")
 
@@ -95,8 +96,8 @@ def _read(
 def frame(colors: np.ndarray, mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """The network's image uint8 [4, size, size] and the mask uint8 [64, 64] of a photograph, padded to a square.
 
-    colors: uint8 [H, W, 3]. mask: uint8 [H, W]. The image has Kato's form: 255 - colour over white, so that the
-    background is 0, and the mask. Each pixel is the mean over its area.
+    colors: uint8 [H, W, 3]. mask: uint8 [H, W]. The image has Kato's form: 255 - colour over
+    white, so that the background is 0, and the mask. Each pixel is the mean over its area.
     """
     alpha = mask[..., None].astype(np.float32) / 255
     return shrink(
@@ -163,8 +164,8 @@ class Crops:
     def cut(self, shifts: np.ndarray | None = None) -> np.ndarray:
         """Input images uint8 [M, 3, size, size]: the box padded by 15 % a side, clipped to the image, and stretched.
 
-        shifts: float [M, 4] in -1 .. 1: outward shifts of the left, top, right and bottom side, in units of 15 % of the
-        box; None for no shifts (evaluation).
+        shifts: float [M, 4] in -1 .. 1: outward shifts of the left, top, right and bottom side,
+        in units of 15 % of the box; None for no shifts (evaluation).
         """
         shifts = np.zeros((len(self), 4)) if shifts is None else shifts
         images = np.empty((len(self), 3, self.size, self.size), np.uint8)

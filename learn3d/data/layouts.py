@@ -22,10 +22,11 @@ Layout = Literal[tuple(LAYOUTS)]
 def reader(layout: str) -> ModuleType:
     """The module that reads a layout of `LAYOUTS`; it is imported when it is needed.
 
-    `load(folder, category, split, *, findings, ...)` reads a split of a category (name or synset id), with the
-    layout's `options` as keywords. It raises MissingFile or DamagedFile for the first fault; if the findings are not
-    strict, it records all faults and returns None. `contents(folder)` returns the categories of a folder and the
-    splits of each. Raises KeyError for another name.
+    `load(folder, category, split, *, findings, ...)` reads a split of a category (name or synset
+    id), with the layout's `options` as keywords. It raises MissingFile or DamagedFile for the
+    first fault; if the findings are not strict, it records all faults and returns None.
+    `contents(folder)` returns the categories of a folder and the splits of each. Raises KeyError
+    for another name.
     """
     LAYOUTS[layout]
     return importlib.import_module(f"learn3d.data.readers.{layout}")
@@ -72,16 +73,19 @@ def load_dataset(
 ) -> ViewDataset:
     """Read one split ("train", "val" or "test") of one category, or of several joined by commas.
 
-    Categories that the folder has as shards (`data.shards`) are read from these, and their images stay on disk.
+    Categories that the folder has as shards (`data.shards`) are read from these, and their images
+    stay on disk.
 
-    image_size: side of the network's images in pixels; only layouts with larger files have other sizes than 64.
-    view_bins: cells of azimuth and elevation as view classes, see `AngleBins.parse`; None: the layout's own classes.
-    views_per_object: number of views of each object (kar: the first ones; else random, the same ones in every run);
-    None: as in the layout's published protocol.
+    image_size: side of the network's images in pixels; only layouts with larger files have other
+    sizes than 64.
+    view_bins: cells of azimuth and elevation as view classes, see `AngleBins.parse`; None: the
+    layout's own classes.
+    views_per_object: number of views of each object (kar: the first ones; else random, the same
+    ones in every run); None: as in the layout's published protocol.
     poses: file of a `PoseTable`, which replaces the poses of the data set.
 
-    Raises ValueError for an unknown layout, an unsupported option or a damaged file, FileNotFoundError for a missing
-    one. Messages name the file.
+    Raises ValueError for an unknown layout, an unsupported option or a damaged file,
+    FileNotFoundError for a missing one. Messages name the file.
     """
     check_options(layout, image_size=image_size, view_bins=view_bins)
     require_folder(folder)
@@ -160,8 +164,8 @@ def check_folder(
 ) -> list[SplitReport]:
     """Examine all files of the categories and splits of a folder (default: all that it has).
 
-    A missing category or split is an error of the report. Raises ValueError for an unknown layout, FileNotFoundError if
-    the folder does not exist or has nothing of the layout.
+    A missing category or split is an error of the report. Raises ValueError for an unknown
+    layout, FileNotFoundError if the folder does not exist or has nothing of the layout.
     """
     check_options(layout)
     require_folder(folder)

@@ -15,8 +15,9 @@ _SAID = 0.01  # area that is left out, over that of the object, from which it is
 def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
     """The object of a mask uint8 [H, W], without specks and other things; what was left out, None if next to nothing.
 
-    Pixels above 127 that touch, also diagonally, form a region. The object is the largest region with its other parts:
-    regions near it, and a larger one may be farther away. Fainter pixels belong to the nearest region.
+    Pixels above 127 that touch, also diagonally, form a region. The object is the largest region
+    with its other parts: regions near it, and a larger one may be farther away. Fainter pixels
+    belong to the nearest region.
     """
     inside = mask > 127
     step = max(1, -(-max(mask.shape) // _CELLS))

@@ -1,8 +1,9 @@
 """Finds the vertical mirror plane of the objects of a data set from masks and poses.
 
-Let p be the azimuth of a camera that looks along the plane. The view from azimuth 2 p - a mirrors that from azimuth a,
-at the same elevation. So the mean mask of the views around 2 p - a, flipped left-right, equals that of the views around
-a. This needs no symmetry of a single object and no two views of one.
+Let p be the azimuth of a camera that looks along the plane. The view from azimuth 2 p - a mirrors
+that from azimuth a, at the same elevation. So the mean mask of the views around 2 p - a, flipped
+left-right, equals that of the views around a. This needs no symmetry of a single object and no
+two views of one.
 """
 
 import numpy as np
@@ -23,10 +24,11 @@ _MAX_RATIO = 0.1
 def find_mirror_plane(dataset: ViewDataset) -> float | None:
     """Azimuth in degrees, 0 .. 172.5, of a camera that looks along the mirror plane; None if no plane is found.
 
-    The difference at a plane p is the mean squared difference of the mean masks of the sectors v and 2 p - v, less its
-    expected value from noise. A plane is found if the smallest of the 24 differences is below a tenth of their median.
-    A sector counts if it and its mirror image have four images each; for random azimuths some 150 images suffice.
-    Cameras at n < 24 equally spaced azimuths give n candidate planes; at least 6 are needed.
+    The difference at a plane p is the mean squared difference of the mean masks of the sectors v
+    and 2 p - v, less its expected value from noise. A plane is found if the smallest of the 24
+    differences is below a tenth of their median. A sector counts if it and its mirror image have
+    four images each; for random azimuths some 150 images suffice. Cameras at n < 24 equally
+    spaced azimuths give n candidate planes; at least 6 are needed.
 
     Raises ValueError if poses are unknown, or not given by azimuth and elevation.
     """

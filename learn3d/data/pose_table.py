@@ -1,7 +1,7 @@
 """Tables of estimated poses: npz files that replace the poses of a data set.
 
-Each row belongs to one image. Its fingerprint is a hash of the object's name and of the mask. So a table fits any part
-of its data, in any order, and no other data.
+Each row belongs to one image. Its fingerprint is a hash of the object's name and of the mask. So
+a table fits any part of its data, in any order, and no other data.
 """
 
 from __future__ import annotations

@@ -58,7 +58,8 @@ class _PoseSet:
 class LookAtPoses(_PoseSet):
     """M perspective cameras that look at the origin from (distance, elevation, azimuth) in the object frame.
 
-    Conventions of `nmr.cameras.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e cos a).
+    Conventions of `nmr.cameras.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e
+    cos a).
     """
 
     azimuth_deg: Tensor  # float32 [M]
@@ -109,7 +110,8 @@ class LookAtPoses(_PoseSet):
 class RotationPoses(_PoseSet):
     """M orthographic cameras, each given by a rotation (Pascal3D+): v' = R v, and x', y' in [-1, 1] span the image.
 
-    Objects are moved in front of the camera (z' + `depth_offset`), which changes no pixel of a silhouette.
+    Objects are moved in front of the camera (z' + `depth_offset`), which changes no pixel of a
+    silhouette.
     """
 
     rotation: Tensor  # float32 [M, 3, 3]
@@ -142,8 +144,8 @@ class RotationPoses(_PoseSet):
     def mirrored(self, chosen: Tensor) -> RotationPoses:
         """The poses of the images, those with `chosen` (bool [M]) flipped left-right (x' -> -x').
 
-        For an object that is symmetric about z = 0, the pose of the flipped image is D R D' with D = diag(-1, 1, 1) and
-        D' = diag(1, 1, -1).
+        For an object that is symmetric about z = 0, the pose of the flipped image is D R D' with
+        D = diag(-1, 1, 1) and D' = diag(1, 1, -1).
         """
         image, body = torch.tensor([-1.0, 1.0, 1.0]), torch.tensor([1.0, 1.0, -1.0])
         mirrored = image[:, None] * self.rotation * body
@@ -168,8 +170,8 @@ class PoseCandidates:
     def draw(self, indices: Tensor, seed: int, step: int) -> tuple[LookAtPoses, Tensor]:
         """Poses and view classes int64 [B] of the images `indices`: a candidate each, drawn by weights, seed and step.
 
-        So the gradient is an unbiased estimate of that of the expected loss over the candidates, at the cost of one
-        pose.
+        So the gradient is an unbiased estimate of that of the expected loss over the candidates,
+        at the cost of one pose.
         """
         drawn = np.random.default_rng([seed, step, 2]).random(len(indices))
         ends = self.weights[indices].cumsum(axis=1)[:, :-1]

@@ -1,7 +1,7 @@
 """Samples and augments the batches of a training.
 
-They depend on the data set, the seed, the step and the weights of the candidate poses. Checkpoints save only these
-weights.
+They depend on the data set, the seed, the step and the weights of the candidate poses.
+Checkpoints save only these weights.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ def batches(
     """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
 
     options: `sampling`, `batch_size`, `augment`, `seed` and `iterations`, as in `TrainConfig`.
-    rows: int64 [b], the rows that this rank takes of each batch (default: all). Random numbers are drawn for all rows.
-    A thread reads the next batch during a step.
+    rows: int64 [b], the rows that this rank takes of each batch (default: all). Random numbers
+    are drawn for all rows. A thread reads the next batch during a step.
     """
 
     def read(step: int) -> tuple[Tensor, Batch]:
@@ -57,10 +57,11 @@ def sample_indices(
 ) -> Tensor:
     """Samples of step `step` (from 1): int64 [batch_size], or the largest multiple of the group size below it.
 
-    "views": epochs of shuffled views. "pairs": two different views of each of batch_size / 2 random objects,
-    [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "groups": GROUP_SIZE views of each of batch_size / GROUP_SIZE random
-    objects; views repeat if the object has fewer. "classes": a random view of each of batch_size random categories
-    (Kato and Harada 2019). Raises ValueError if "pairs" or "groups" finds no object with two views.
+    "views": epochs of shuffled views. "pairs": two different views of each of batch_size / 2
+    random objects, [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "groups": GROUP_SIZE views of
+    each of batch_size / GROUP_SIZE random objects; views repeat if the object has fewer.
+    "classes": a random view of each of batch_size random categories (Kato and Harada 2019).
+    Raises ValueError if "pairs" or "groups" finds no object with two views.
     """
     if sampling == "views":
         return shuffled_epochs(len(dataset), batch_size, seed, step)
@@ -136,16 +137,17 @@ def augment(
 ) -> Batch:
     """The batch with the named augmentations, in this order, each drawn independently for every sample.
 
-    "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato and Harada 2019).
-    "flip-image": only the colours mirrored (published code of both papers on Pascal3D+, whose meshes are symmetric).
-    "channels": a random permutation of the three colour channels.
-    "colors": a random permutation, each channel times a random factor in 0.7 .. 1.3, and in 30 % of the images times 0.
-    It acts on 255 - colour, so that white stays white; `inverted`: images are stored as 255 - colour. It is not meant
-    for encoders that ignore the mask.
-    "crop": the colours cropped anew from the original image, each side of the padded box moved by up to 15 % of the
-    box (Pascal3D+, both papers). It must come first.
+    "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato
+    and Harada 2019). "flip-image": only the colours mirrored (published code of both papers on
+    Pascal3D+, whose meshes are symmetric). "channels": a random permutation of the three colour
+    channels. "colors": a random permutation, each channel times a random factor in 0.7 .. 1.3,
+    and in 30 % of the images times 0. It acts on 255 - colour, so that white stays white;
+    `inverted`: images are stored as 255 - colour. It is not meant for encoders that ignore the
+    mask. "crop": the colours cropped anew from the original image, each side of the padded box
+    moved by up to 15 % of the box (Pascal3D+, both papers). It must come first.
 
-    count, rows: the batch has these rows of a batch of `count`, for which all random numbers are drawn.
+    count, rows: the batch has these rows of a batch of `count`, for which all random numbers are
+    drawn.
 
     Raises ValueError for "crop" if it is not first or there are no original images.
     """

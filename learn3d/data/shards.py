@@ -13,8 +13,8 @@ A shard of n objects and m views has the tensors
     object_ids, view_ids, sides     int32 [m] in 0 .. n-1, int32 [m], float32 [m]: tables of the views; object sizes
     azimuth_deg ... or rotation     float32 [m, ...]: the poses; fields with one value for all views are in set.json
 
-Its metadata are the names of the objects, and a CRC-32 of names and tables. The bytes of a shard depend on its content
-alone. Axes and colours are those of the layout (`kato`, `kar` ...).
+Its metadata are the names of the objects, and a CRC-32 of names and tables. The bytes of a shard
+depend on its content alone. Axes and colours are those of the layout (`kato`, `kar` ...).
 """
 
 import dataclasses
@@ -164,8 +164,8 @@ def load(
 ) -> ViewDataset | None:
     """Read names and tables of a split, about 60 bytes for each view; the arrays stay on disk.
 
-    Raises MissingFile and DamagedFile if shards are missing, damaged, or of another layout or image size. If the
-    findings are not strict, it checks all arrays, too, and returns None.
+    Raises MissingFile and DamagedFile if shards are missing, damaged, or of another layout or
+    image size. If the findings are not strict, it checks all arrays, too, and returns None.
     """
     where = split_folder(folder, category, split)
     content = read_json(where / SET_FILE, limits.JSON_BYTES, "the description of shards")

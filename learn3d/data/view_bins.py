@@ -25,8 +25,8 @@ IMAGES_PER_CLASS = 8  # smallest mean number of images per view class
 class AngleBins:
     """Cells of equal width in azimuth and elevation, K = azimuth cells x elevation cells (paper, table of bins).
 
-    Cell = floor((azimuth + 180) / w) * n_el + floor((elevation - low) / h), as in the published code. Angles beyond the
-    range are clamped to the first or last cell.
+    Cell = floor((azimuth + 180) / w) * n_el + floor((elevation - low) / h), as in the published
+    code. Angles beyond the range are clamped to the first or last cell.
     """
 
     azimuth_width_deg: Annotated[float, Field(gt=0, le=360)]
@@ -94,8 +94,9 @@ def training_classes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Class int64 [M] in 0 .. K-1 of each view, and the cells int64 [K] of the classes: those with training views.
 
-    views: their cells int64 [M] and directions float [M, D]. training: those of the training views. A view in another
-    cell gets the class of the training view with the nearest direction, that is the largest dot product.
+    views: their cells int64 [M] and directions float [M, D]. training: those of the training
+    views. A view in another cell gets the class of the training view with the nearest direction,
+    that is the largest dot product.
     """
     cells, unseen = views[0].copy(), ~np.isin(views[0], training[0])
     cells[unseen] = training[0][(views[1][unseen] @ training[1].T).argmax(axis=1)]
@@ -106,8 +107,8 @@ def training_classes(
 def choose_bins(poses: LookAtPoses) -> AngleBins:
     """Cells of azimuth and elevation for images with these poses.
 
-    The elevation width is about 20 degrees. The azimuth width is the smallest of AZIMUTH_WIDTHS_DEG for which occupied
-    cells have IMAGES_PER_CLASS images or more on average.
+    The elevation width is about 20 degrees. The azimuth width is the smallest of
+    AZIMUTH_WIDTHS_DEG for which occupied cells have IMAGES_PER_CLASS images or more on average.
     """
     elevations = torch.as_tensor(poses.elevation_deg)
     low = math.floor(float(elevations.min()))
@@ -123,8 +124,8 @@ def choose_bins(poses: LookAtPoses) -> AngleBins:
 def view_classes(poses: LookAtPoses, training: LookAtPoses) -> tuple[np.ndarray, tuple[str, ...]]:
     """Class int64 [M] in 0 .. K-1 of each of M poses, and the K names.
 
-    Classes are the cells (`choose_bins`) with training poses. Another pose gets the class of the training pose with the
-    nearest direction.
+    Classes are the cells (`choose_bins`) with training poses. Another pose gets the class of the
+    training pose with the nearest direction.
     """
     bins = choose_bins(training)
     names = bins.names()

@@ -34,9 +34,9 @@ class RawMesh:
 def read_mesh(path: Path) -> RawMesh:
     """Read all triangles of a mesh file; the meshes of a scene are transformed and concatenated.
 
-    Polygons are cut into triangles, concave ones, too. Other files that it refers to must be in its folder or below.
-    Raises MissingFile, and DamagedFile if it cannot be read as a whole, has no triangle or over 256 MiB, or if a corner
-    is not finite, or if all are at one place.
+    Polygons are cut into triangles, concave ones, too. Other files that it refers to must be in
+    its folder or below. Raises MissingFile, and DamagedFile if it cannot be read as a whole, has
+    no triangle or over 256 MiB, or if a corner is not finite, or if all are at one place.
     """
     mesh = sandbox.read(_read, path, wanted="a mesh file")
     return RawMesh(mesh.vertices, mesh.faces.astype(np.int64))

@@ -23,8 +23,8 @@ _REFUSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_g
 def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices float64 [V, 3] and faces int64 [F, 3] of all meshes of a scene.
 
-    Points and lines are skipped. read_other: content of a file by its name. Raises EOFError if the file is cut short,
-    and ValueError if it needs an extension that is not supported.
+    Points and lines are skipped. read_other: content of a file by its name. Raises EOFError if
+    the file is cut short, and ValueError if it needs an extension that is not supported.
     """
     text, binary = _chunks(content) if content[:4] == b"glTF" else (content, None)
     if not text.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
@@ -32,8 +32,9 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
     if not text.rstrip().endswith(b"}"):
         raise EOFError("its JSON does not end")
     tree = parse_json(text)
-    if not str(tree["asset"]["version"]).startswith("2"):
-        raise ValueError(f"it is glTF {tree['asset']['version']}; version 2 is read")
+    version = tree.get("asset", {}).get("version", "without a version")
+    if not str(version).startswith("2"):
+        raise ValueError(f"it is glTF {version}; version 2 is read")
     for name in tree.get("extensionsRequired", []):
         if not _HARMLESS.fullmatch(name):
             raise ValueError(
@@ -200,7 +201,7 @@ def _skinned(
     accessors: _Accessors,
     places: dict[int, np.ndarray],
 ) -> np.ndarray:
-    """Points [N, 3] where the joints of their skin put them; the place of the mesh itself has no effect."""
+    """Points [N, 3] moved by the joints of their skin. The place of the mesh itself has no effect."""
     joints = np.stack([places[number] for number in skin["joints"]])
     if "inverseBindMatrices" in skin:
         joints = joints @ accessors.read(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(

@@ -1,7 +1,7 @@
 """Reads OFF, PLY and STL files: the corners and triangles of their content.
 
-Each reader takes the bytes of a file and returns vertices float64 [V, 3] and faces [F, 3]. It raises EOFError if the
-file is cut short, and ValueError or another error if it is wrong.
+Each reader takes the bytes of a file and returns vertices float64 [V, 3] and faces [F, 3]. It
+raises EOFError if the file is cut short, and ValueError or another error if it is wrong.
 """
 
 import re
@@ -66,7 +66,7 @@ def read_off(content: bytes) -> Triangles:
     lines = [line for line in re.sub(rb"#[^\r\n]*", b"", content).splitlines() if line.strip()]
     head, *counts = lines[0].split() if lines else [b""]
     head = head.removeprefix(b"\xef\xbb\xbf")
-    if not re.fullmatch(rb"(ST)?C?N?OFF", head) or b"BINARY" in counts:
+    if not re.fullmatch(rb"(ST)?C?N?OFF", head := head.upper()) or b"BINARY" in counts:
         raise ValueError("it does not begin with OFF (or COFF, NOFF, STOFF), as a text file does")
     first = 1
     if not counts:
@@ -104,6 +104,7 @@ def _off_rows(words: list[bytes], num_vertices: int, num_faces: int) -> list[byt
 
 def read_ply(content: bytes) -> Triangles:
     """Read a PLY file: the elements `vertex` and `face`; others are skipped."""
+    content = content.removeprefix(b"\xef\xbb\xbf")
     if not content.startswith(b"ply"):
         raise ValueError("it does not begin with the line `ply`")
     header = re.match(rb".*?[\r\n]end_header[ \t]*(?:\r\n|\n|\r)", content, re.DOTALL)
@@ -239,7 +240,10 @@ def read_dae(file: BinaryIO) -> Triangles:
     import collada
 
     vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
-    for geometry in collada.Collada(file).scene.objects("geometry"):
+    scene = collada.Collada(file).scene
+    if scene is None:
+        raise ValueError("it has no scene")
+    for geometry in scene.objects("geometry"):
         for part in geometry.primitives():
             if isinstance(part, collada.lineset.BoundLineSet):
                 continue

@@ -1,7 +1,8 @@
 """Reads arrays of untrusted npz files.
 
-NumPy stores object arrays, for example images of different sizes, as pickles. They are read in the sandbox, and can
-only call the functions that make NumPy arrays, so they cannot run other code.
+NumPy stores object arrays, for example images of different sizes, as pickles. They are read in
+the sandbox, and can only call the functions that make NumPy arrays, so they cannot run other
+code.
 """
 
 import contextlib
@@ -28,7 +29,8 @@ def names(path: Path, wanted: str) -> list[str]:
 def read(path: Path, key: str, wanted: str, max_bytes: int | None = None) -> np.ndarray:
     """The array `key`, of numbers or bools. Raises DamagedFile for other arrays and larger ones, and MissingFile.
 
-    max_bytes: largest size; None if unknown, then large arrays with a suspicious compression ratio are refused.
+    max_bytes: largest size; None if unknown, then large arrays with a suspicious compression
+    ratio are refused.
     """
     return read_several(path, [key], wanted, max_bytes)[0]
 

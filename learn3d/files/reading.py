@@ -1,6 +1,7 @@
 """Opens and reads untrusted files, and collects their faults.
 
-A fault is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError), whose message names the file.
+A fault is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError), whose message
+names the file.
 """
 
 import contextlib
@@ -86,7 +87,8 @@ STRICT = Findings(strict=True)
 def faults_of(path: Path | str, wanted: str, advice: str = FETCH_AGAIN) -> Iterator[None]:
     """Turn errors into a DamagedFile or MissingFile: libraries raise various ones for damaged files.
 
-    wanted: description of the file, for messages. advice: what to do; after an EOFError always to fetch it again.
+    wanted: description of the file, for messages. advice: what to do; after an EOFError always to
+    fetch it again.
     """
     try:
         yield
@@ -111,7 +113,8 @@ def faults_of(path: Path | str, wanted: str, advice: str = FETCH_AGAIN) -> Itera
 def open_file(path: Path | str, max_bytes: int, wanted: str) -> BinaryIO:
     """Open an untrusted file for reading. wanted: description of the file, for messages.
 
-    Raises MissingFile, and DamagedFile for files above `max_bytes` bytes and, at once, for pipes and devices.
+    Raises MissingFile, and DamagedFile for files above `max_bytes` bytes and, at once, for pipes
+    and devices.
     """
     path = Path(path)
     with faults_of(path, wanted):

@@ -19,8 +19,8 @@ PHOTOGRAPHS = ("PNG", "JPEG", "WEBP", "BMP")
 def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image:
     """Decode an image, in the sandbox. formats: Pillow's names of the allowed formats.
 
-    Raises MissingFile, and DamagedFile for another format, a file above 256 MiB, a side above `max_side` pixels, and
-    more than 64 million pixels.
+    Raises MissingFile, and DamagedFile for another format, a file above 256 MiB, a side above
+    `max_side` pixels, and more than 64 million pixels.
     """
     wanted = f"an image in the format {', '.join(formats)}"
     with faults_of(path, wanted), open_file(path, limits.IMAGE_FILE_BYTES, wanted) as file:
@@ -112,7 +112,8 @@ def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
 def shrink(planes: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """An image uint8 [4, size, size] and its mask uint8 [64, 64] of colours and mask float32 [4, H, W], 0 .. 255.
 
-    The planes are padded with 0 to a square. Each pixel is the mean over its area, fractions of pixels included.
+    The planes are padded with 0 to a square. Each pixel is the mean over its area, fractions of
+    pixels included.
     """
     image = _shrink(planes, size)
     return image, image[3] if size == limits.MASK_SIZE else _shrink(planes[3:], limits.MASK_SIZE)[0]

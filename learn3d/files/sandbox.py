@@ -1,9 +1,10 @@
 """A sandbox for untrusted files: worker processes that may crash, hang or run out of memory.
 
-`read` and `read_all` run functions in workers, with limits of memory (on Linux) and processor time. Two more than there
-are cores start on demand, and read many files each. A failure becomes a `DamagedFile` or `MissingFile` with the name of
-the file, and a dead worker is replaced. This module imports neither torch nor NumPy, so that a worker starts in a tenth
-of a second. It needs a POSIX system.
+`read` and `read_all` run functions in workers, with limits of memory (on Linux) and processor
+time. Two more than there are cores start on demand, and read many files each. A failure becomes a
+`DamagedFile` or `MissingFile` with the name of the file, and a dead worker is replaced. This
+module imports neither torch nor NumPy, so that a worker starts in a tenth of a second. It needs a
+POSIX system.
 """
 
 import atexit
@@ -46,8 +47,8 @@ class Call:
 def read(function: Callable[..., Any], path: Path | str, *arguments: Any, **options: Any) -> Any:
     """function(path, *arguments), computed in a worker. options: other fields of `Call`.
 
-    The function returns arrays and plain values. It can raise its limits with `allow`. Raises DamagedFile and
-    MissingFile.
+    The function returns arrays and plain values. It can raise its limits with `allow`. Raises
+    DamagedFile and MissingFile.
     """
     ((result,),) = read_all([[Call(function, Path(path), arguments, **options)]])
     if isinstance(result, Exception):
@@ -58,8 +59,8 @@ def read(function: Callable[..., Any], path: Path | str, *arguments: Any, **opti
 def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
     """The results of each group of calls, in order, computed on all cores.
 
-    A worker takes a whole group, for example the files of one object. The result for a bad file is a DamagedFile or
-    MissingFile. Two groups more than there are cores are read ahead, at most.
+    A worker takes a whole group, for example the files of one object. The result for a bad file
+    is a DamagedFile or MissingFile. Two groups more than there are cores are read ahead, at most.
     """
     groups, running, most = iter(groups), deque(), cores() + 2
     try:

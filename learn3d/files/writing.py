@@ -16,9 +16,9 @@ from learn3d.terminal import stop_on_signal
 def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; at the end the file there is renamed to `path`.
 
-    After an exception the temporary file is removed; a killed process leaves it. sync: the file is complete even after
-    a power failure. writer: part of the temporary name, if several processes may write the same file. Raises OSError
-    if `path` is a folder, a pipe or a device.
+    After an exception the temporary file is removed; a killed process leaves it. sync: the file
+    is complete even after a power failure. writer: part of the temporary name, if several
+    processes may write the same file. Raises OSError if `path` is a folder, a pipe or a device.
     """
     path = Path(path)
     _require_regular(path)
@@ -65,7 +65,8 @@ def _sync(path: Path) -> None:
 def check_target(path: Path, option: str, *, folder: bool = False) -> None:
     """Raise OSError if `path` cannot be written. To be called before long computations; it leaves no files.
 
-    folder: `path` is a folder, which need not exist. option: the command's option for the path, for the message.
+    folder: `path` is a folder, which need not exist. option: the command's option for the path,
+    for the message.
     """
     path = Path(path)
     existing = next(p for p in (path, *path.parents) if p.exists()) if folder else path.parent
@@ -104,8 +105,9 @@ def write_json(path: Path, value: Any, *, sync: bool = False) -> None:
 def publishing(folder: Path, paths: Sequence[str]) -> Iterator[Path]:
     """Yield a temporary folder in `folder`; at the end its files and folders `paths` replace those of `folder`.
 
-    If one of `paths` is missing in it, it is removed from `folder`; all other files stay. After an exception nothing
-    changes. Signals wait until all files are moved, so that files of two data sets are never mixed.
+    If one of `paths` is missing in it, it is removed from `folder`; all other files stay. After
+    an exception nothing changes. Signals wait until all files are moved, so that files of two
+    data sets are never mixed.
     """
     with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=folder) as temporary:
         new, old = Path(temporary) / "new", Path(temporary) / "old"

@@ -34,7 +34,8 @@ def create_method(
 ) -> Method:
     """The method of `settings`, with networks initialised from `seed`.
 
-    Raises ValueError if the device is missing, or if the method needs poses and the data set has none.
+    Raises ValueError if the device is missing, or if the method needs poses and the data set has
+    none.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise ValueError(

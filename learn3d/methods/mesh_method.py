@@ -38,14 +38,14 @@ class MeshSettings(MethodSettings):
 
     encoder: EncoderName = "conv"
     """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask. conv-light: half the channels,
-    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights. conv-centred: a tenth of the
-    weights, for objects that are all scaled to one size (cameras at unknown distances). resnet18: on 224-pixel
-    RGB."""
+    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights.
+    conv-centred: a tenth of the weights, for objects that are all scaled to one size (cameras at
+    unknown distances). resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
     """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same; neighbours learn to move
-    together first. auto: sphere-smooth if the training masks are compact, else sphere. sphere-small: sphere with half
-    the weights. cube-conv, cube-fc: 1352 vertices of a cube's surface, from convolutions or from linear layers (Kato
-    and Harada 2019)."""
+    together first. auto: sphere-smooth if the training masks are compact, else sphere.
+    sphere-small: sphere with half the weights. cube-conv, cube-fc: 1352 vertices of a cube's
+    surface, from convolutions or from linear layers (Kato and Harada 2019)."""
     symmetry: SymmetryOption = None
     """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
     it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
@@ -99,7 +99,8 @@ def is_compact(info: DatasetInfo) -> bool:
 class MeshMethod(Method):
     """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes.
 
-    A subclass may add a network that classifies the azimuth of an image (`create_view_classifier`, `view_loss`).
+    A subclass may add a network that classifies the azimuth of an image
+    (`create_view_classifier`, `view_loss`).
     """
 
     # whether a code is the mean over an image and its mirror image
@@ -224,8 +225,9 @@ SMOOTHNESS = 0.001  # weight of the smoothness loss, as in the proposed method
 def refine(method: Method, images: Tensor, masks: Tensor, poses: Poses) -> Meshes:
     """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] at the B cameras of `poses`.
 
-    Adam minimises soft IoU loss + 0.001 smoothness over the codes, which keeps shapes plausible, and then over the
-    vertices. Symmetric shapes stay symmetric. Raises ValueError if the method predicts voxels.
+    Adam minimises soft IoU loss + 0.001 smoothness over the codes, which keeps shapes plausible,
+    and then over the vertices. Symmetric shapes stay symmetric. Raises ValueError if the method
+    predicts voxels.
     """
     if not isinstance(method, MeshMethod):
         raise ValueError(

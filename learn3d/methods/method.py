@@ -92,8 +92,9 @@ class Method(abc.ABC):
     """One method in training or in use. A subclass creates networks and optimizers and computes losses;
     `training.take_step` takes the steps.
 
-    Losses depend only on the batch, the step, the parameters and buffers of `networks`, and torch's global random
-    state. A run that is resumed from these, `optimizers` and `ema` is bit-identical.
+    Losses depend only on the batch, the step, the parameters and buffers of `networks`, and
+    torch's global random state. A run that is resumed from these, `optimizers` and `ema` is
+    bit-identical.
     """
 
     networks: nn.ModuleDict  # networks["encoder"] is self.encoder, and so on
@@ -141,8 +142,8 @@ class Method(abc.ABC):
     def phases(self, batch: Batch, step: int) -> Iterator[tuple[Losses, tuple[str, ...]]]:
         """The phases of training step `step`: the losses of each, and the names of the optimizers that minimise them.
 
-        A step has one phase, `losses` with all optimizers, unless a subclass yields others. The optimizers of a phase
-        have stepped when the next one is computed.
+        A step has one phase, `losses` with all optimizers, unless a subclass yields others. The
+        optimizers of a phase have stepped when the next one is computed.
         """
         yield self.losses(batch, step), tuple(self.optimizers)
 

@@ -1,7 +1,8 @@
 """Methods that know which views show the same object, from batches [a_1 .. a_n, b_1 .. b_n, ...].
 
-Multi-view is Vanilla-AE with the supervision of Kato et al. 2018: the shape of each of two views must explain both.
-Many views: the shape of one image must explain other views of its object, whose depth is used if it is known.
+Multi-view is Vanilla-AE with the supervision of Kato et al. 2018: the shape of each of two views
+must explain both. Many views: the shape of one image must explain other views of its object,
+whose depth is used if it is known.
 """
 
 import torch
@@ -75,8 +76,8 @@ class ManyViews(MeshMethod):
 
     def losses(self, batch: Batch, step: int) -> Losses:
         """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
-        depth + lambda_slope slope + lambda_smooth smoothness + lambda_prior prior + lambda_view view. Every second
-        image of symmetric objects is flipped first, but not for the loss view.
+        depth + lambda_slope slope + lambda_smooth smoothness + lambda_prior prior + lambda_view
+        view. Every second image of symmetric objects is flipped first, but not for the loss view.
         """
         settings, count = self.settings, len(batch) // GROUP_SIZE
         images = batch.images[:count]

@@ -31,8 +31,8 @@ class TrainingSchedule:
     def lr_factor(self, step: int) -> float:
         """The learning rate of step `step` (from 1), as a share of the full one.
 
-        It is 1/w, 2/w .. 1 in a warm-up of w steps. After it, constant: 1. linear, cosine: from 1 towards 0. step: 1,
-        and 0.1 in the last 5 % of all iterations (Kato et al. 2018).
+        It is 1/w, 2/w .. 1 in a warm-up of w steps. After it, constant: 1. linear, cosine: from 1
+        towards 0. step: 1, and 0.1 in the last 5 % of all iterations (Kato et al. 2018).
         """
         if step <= self.warmup_steps:
             return step / self.warmup_steps
@@ -54,8 +54,8 @@ class TrainingSchedule:
 class EMA:
     """Exponential moving average of all parameters and floating-point buffers of networks.
 
-    After step t: average = d * average + (1 - d) * weights with d = min(decay, (1 + t) / (10 + t)), so that the initial
-    weights are soon forgotten.
+    After step t: average = d * average + (1 - d) * weights with d = min(decay, (1 + t) / (10 +
+    t)), so that the initial weights are soon forgotten.
     """
 
     def __init__(self, networks: nn.Module, decay: float) -> None:
@@ -101,8 +101,8 @@ def adam(
 def _drop_vanished(optimizer: torch.optim.Optimizer, *_: object) -> None:
     """Every 20 steps, set moments that are far too small to change a weight to 0.
 
-    The gradient of a dead unit is 0, so its moments decay until they are denormal. Some CPUs are many times slower with
-    denormal numbers: Adam took 111 ms a step of Plus instead of 15.
+    The gradient of a dead unit is 0, so its moments decay until they are denormal. Some CPUs are
+    many times slower with denormal numbers: Adam took 111 ms a step of Plus instead of 15.
     """
     for parameter, state in optimizer.state.items():
         if parameter.device.type == "cpu" and state["step"] % 20 == 0:

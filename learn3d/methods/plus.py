@@ -104,8 +104,8 @@ class Plus(PoseInvariant):
 
     def losses(self, batch: Batch, step: int) -> Losses:
         """The losses of `PoseInvariant`, lambda_view times that of the azimuths, and lambda_novel_view times that at a
-        novel view once the mask bank is full. Every second image of symmetric objects is flipped. For the discriminator
-        it has another view class then: K + k instead of k.
+        novel view once the mask bank is full. Every second image of symmetric objects is flipped.
+        For the discriminator it has another view class then: K + k instead of k.
         """
         images, flipped = self.flip_every_second(batch.images)
         codes, vertices = self.predict(images)

@@ -1,8 +1,8 @@
 """Reweights the candidate poses of the training images by the shapes of the model in training.
 
-The shape that the model predicts from an image is rendered at all candidate poses of the image. As all images share the
-networks, the shape of an image with a wrong pose is still predicted in the frame of the others, so its IoU with the
-mask is best at the right pose.
+The shape that the model predicts from an image is rendered at all candidate poses of the image.
+As all images share the networks, the shape of an image with a wrong pose is still predicted in
+the frame of the others, so its IoU with the mask is best at the right pose.
 """
 
 import torch
@@ -30,9 +30,10 @@ def update_steps(iterations: int, count: int) -> tuple[int, ...]:
 def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
     """Reweight the candidates of all images of `dataset`; returns the share of images whose best pose changed.
 
-    The weights are softmax(IoU / TEMPERATURE + log p + b) over the candidates, with masks and renderings of SIZE
-    pixels. p is the candidate's probability in the table, at least _LEAST_PRIOR. b is a number for each 15 degrees of
-    azimuth, chosen so that each such cell keeps its frequency in the table.
+    The weights are softmax(IoU / TEMPERATURE + log p + b) over the candidates, with masks and
+    renderings of SIZE pixels. p is the candidate's probability in the table, at least
+    _LEAST_PRIOR. b is a number for each 15 degrees of azimuth, chosen so that each such cell
+    keeps its frequency in the table.
     """
     candidates, logits = dataset.candidates, []
     count = candidates.weights.shape[1]

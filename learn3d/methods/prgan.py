@@ -81,8 +81,8 @@ class PrGANSettings(MethodSettings):
 class PrGAN(Method):
     """Generator of voxels from z ~ U(-1, 1)^201, discriminator of silhouettes, inverse encoder.
 
-    The first 200 entries of z decide the shape; the last one, v, decides the view: floor((v + 1) K / 2). Views of
-    training images are not used, but all K views must be equally frequent.
+    The first 200 entries of z decide the shape; the last one, v, decides the view: floor((v + 1)
+    K / 2). Views of training images are not used, but all K views must be equally frequent.
     """
 
     settings: PrGANSettings
@@ -141,9 +141,9 @@ class PrGAN(Method):
     def phases(self, batch: Batch, step: int) -> Iterator[tuple[Losses, tuple[str, ...]]]:
         """One phase for the encoder from step `encoder_from_step` on, before it those of the GAN.
 
-        The discriminator learns if its accuracy is at most `accuracy_margin`; then the generator learns from the
-        discriminator's logits, and then from statistics of the discriminator's first layer. All three use the same z,
-        as in the published code.
+        The discriminator learns if its accuracy is at most `accuracy_margin`; then the generator
+        learns from the discriminator's logits, and then from statistics of the discriminator's
+        first layer. All three use the same z, as in the published code.
         """
         z = self.sample_z(size() * len(batch)).chunk(size())[rank()]
         if step >= self.settings.encoder_from_step:
@@ -214,7 +214,8 @@ def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
     """Raise a ValueError unless every camera is that of its view class, as PrGAN has a fixed table of views.
 
-    Tolerances: half a degree for angles, half a percent for the distance, 0.1 degrees for half the field of view.
+    Tolerances: half a degree for angles, half a percent for the distance, 0.1 degrees for half
+    the field of view.
     """
     wanted = (
         f"PrGAN needs images from {views.count} fixed views, view k at azimuth {-360 / views.count:g} k and elevation "

@@ -1,7 +1,8 @@
 """View prior learning (VPL; Kato and Harada 2019), as re-implemented by Peng et al. 2020 and as published.
 
-A discriminator learns to separate silhouettes of predicted shapes at the view of the input image ("real") from those
-at other views ("fake"); encoder and generator learn to fool it. docs/methods/vpl.md has the equations.
+A discriminator learns to separate silhouettes of predicted shapes at the view of the input image
+("real") from those at other views ("fake"); encoder and generator learn to fool it.
+docs/methods/vpl.md has the equations.
 """
 
 import functools
@@ -63,8 +64,8 @@ class VPLSettings(MeshSettings):
     through a gradient reversal layer (as published)."""
     other_views: Literal["random", "reversed", "next"] = "random"
     """Sample of the batch that gives each sample its other view. random: one of another view class. reversed: the one
-    at the same place from the batch's end (published, ShapeNet). next: the next one of its category (published,
-    Pascal3D+)."""
+    at the same place from the batch's end (published, ShapeNet). next: the next one of its
+    category (published, Pascal3D+)."""
     silhouette_size: Pixels = 64
     """Side of rendered silhouettes: 64 (compared with the data's masks) or image_size (with the input's own mask)."""
     anti_aliasing: bool = True
@@ -160,10 +161,11 @@ class VPL(MeshMethod):
     def losses(self, batch: Batch, step: int) -> Losses:
         """Encoder and generator learn from projection + smoothness + inflation in every step.
 
-        With a discriminator D each shape is also rendered at another view. Alternating: odd steps train D on
-        softplus(-D(input view)) + softplus(D(other view)) of detached silhouettes. Even steps train encoder and
-        generator on lambda_D softplus(-D(other view)); D and its running means do not change. Reversal: every step
-        trains D on its loss, and encoder and generator on -lambda_D times its gradient.
+        With a discriminator D each shape is also rendered at another view. Alternating: odd steps
+        train D on softplus(-D(input view)) + softplus(D(other view)) of detached silhouettes.
+        Even steps train encoder and generator on lambda_D softplus(-D(other view)); D and its
+        running means do not change. Reversal: every step trains D on its loss, and encoder and
+        generator on -lambda_D times its gradient.
         """
         settings, (whole, own) = self.settings, whole_batch(batch)
         is_baseline = settings.lambda_discriminator == 0
@@ -250,9 +252,9 @@ class VPL(MeshMethod):
 def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> Tensor:
     """For each sample the index of the sample whose view is its other view, int64 [B]; see VPLSettings.other_views.
 
-    "random" uses torch's global generator, and takes any sample if the batch has one view class. As published,
-    "reversed" gives the middle sample of an odd batch its own view, and "next" does so for the only sample of a
-    category.
+    "random" uses torch's global generator, and takes any sample if the batch has one view class.
+    As published, "reversed" gives the middle sample of an odd batch its own view, and "next" does
+    so for the only sample of a category.
     """
     count = len(batch.view_ids)
     if choice == "reversed":

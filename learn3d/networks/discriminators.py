@@ -1,7 +1,7 @@
 """Discriminators of shape codes (pose-invariant method) and of silhouettes (view prior learning).
 
-Those of silhouettes take silhouettes float [B,S,S] and their views, and return logits: positive for "rendered at the
-view of the input image".
+Those of silhouettes take silhouettes float [B,S,S] and their views, and return logits: positive
+for "rendered at the view of the input image".
 """
 
 import itertools
@@ -25,8 +25,8 @@ def pose_discriminator(num_views: int) -> nn.Sequential:
 class OneHotViewDiscriminator(nn.Module):
     """DCGAN's discriminator on a silhouette and a one-hot plane for each of K views -> logits [B].
 
-    Four 4x4 convolutions of stride 2 with c, 2c, 4c, 8c channels, batch norm on the last three, leaky ReLUs, and a
-    linear layer; c = 128 in the published code of Peng et al. 2020 for S = 64.
+    Four 4x4 convolutions of stride 2 with c, 2c, 4c, 8c channels, batch norm on the last three,
+    leaky ReLUs, and a linear layer; c = 128 in the published code of Peng et al. 2020 for S = 64.
     """
 
     def __init__(self, num_views: int, channels: int = 128, silhouette_size: int = 64) -> None:
@@ -51,10 +51,11 @@ class OneHotViewDiscriminator(nn.Module):
 class SpectralPatchDiscriminator(nn.Module):
     """ "shapenet_patch" of Kato and Harada 2019: one logit per patch, [B,S/64,S/64] rounded up (4x4 for S = 224).
 
-    5x5 convolutions of stride 2 with c, 2c, 4c, 8c, 8c channels (c = 32), each with spectral normalisation, batch norm
-    without gain and leaky ReLU. After the first one, c channels of view features are appended (a linear layer with the
-    same normalisations). A last 5x5 convolution gives the logits. `num_classes` conditions them on the class by
-    projection (Miyato and Koyama 2018): the product of a learned vector of the class with the last features.
+    5x5 convolutions of stride 2 with c, 2c, 4c, 8c, 8c channels (c = 32), each with spectral
+    normalisation, batch norm without gain and leaky ReLU. After the first one, c channels of view
+    features are appended (a linear layer with the same normalisations). A last 5x5 convolution
+    gives the logits. `num_classes` conditions them on the class by projection (Miyato and Koyama
+    2018): the product of a learned vector of the class with the last features.
     """
 
     def __init__(
@@ -96,8 +97,9 @@ class SpectralPatchDiscriminator(nn.Module):
 class PatchDiscriminator(nn.Module):
     """ "pascal_patch" of Kato and Harada 2019: one logit per patch, [B,h,w]; no normalisation of any kind.
 
-    4x4 convolutions with c (stride 2), 2c (2), 4c (2), 8c (1) and 1 (1) channels (c = 64), leaky ReLUs. After the first
-    one, c channels of view features are appended (linear layer, leaky ReLU). He's initial weights.
+    4x4 convolutions with c (stride 2), 2c (2), 4c (2), 8c (1) and 1 (1) channels (c = 64), leaky
+    ReLUs. After the first one, c channels of view features are appended (linear layer, leaky
+    ReLU). He's initial weights.
     """
 
     def __init__(self, view_features: int, channels: int = 64) -> None:

@@ -17,8 +17,8 @@ CENTRED_SIZE = 0.8  # object size (`ViewDataset.object_sizes`) after `centre`
 class ConvEncoder(nn.Module):
     """Image [B,4,64,64] (RGB and mask, float in [0,1]) -> shape code [B,512] (no ReLU at the end).
 
-    inverted: whether the data set stores colours as 1 - colour. Encoders take colours as they are stored, but for those
-    that say otherwise.
+    inverted: whether the data set stores colours as 1 - colour. Encoders take colours as they are
+    stored, but for those that say otherwise.
     """
 
     image_size = 64
@@ -47,9 +47,10 @@ class SmallConvEncoder(ConvEncoder):
 class LightConvEncoder(ConvEncoder):
     """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers. Unpublished.
 
-    3.9 million weights, not 19. With torch's initial weights the codes of the first hundred steps hardly depend on the
-    image: mode collapse may follow, so the convolutions get He's. A white background has the same effect, so colours
-    that are not `inverted` (stored as 1 - colour over black) are inverted first.
+    3.9 million weights, not 19. With torch's initial weights the codes of the first hundred steps
+    hardly depend on the image: mode collapse may follow, so the convolutions get He's. A white
+    background has the same effect, so colours that are not `inverted` (stored as 1 - colour over
+    black) are inverted first.
     """
 
     def __init__(self, inverted: bool = True) -> None:
@@ -70,8 +71,9 @@ class LightConvEncoder(ConvEncoder):
 class CentredConvEncoder(LightConvEncoder):
     """LightConvEncoder with two more convolutions, one hidden layer and scaled input: all objects have one size.
 
-    A cut-out picture does not show the camera's distance. With this encoder training images do not show it either, so
-    the size of an object is learnt from its appearance. 2.0 million weights. Unpublished.
+    A cut-out picture does not show the camera's distance. With this encoder training images do
+    not show it either, so the size of an object is learnt from its appearance. 2.0 million
+    weights. Unpublished.
     """
 
     hidden_sizes = (576,)
@@ -109,8 +111,8 @@ class ViewClassifier(nn.Module):
 
 def centre(images: Tensor, object_size: float = CENTRED_SIZE) -> Tensor:
     """Scale and shift images float [B,C,S,S], the mask last, so that the mask's bounding box is centred and its longer
-    side takes `object_size` of the image. Beyond the border, colours are repeated and the mask is 0. Images with an
-    empty mask do not change.
+    side takes `object_size` of the image. Beyond the border, colours are repeated and the mask is
+    0. Images with an empty mask do not change.
     """
     size = images.shape[-1]
     inside = images[:, -1] > 0.5
@@ -177,10 +179,10 @@ def network_input(
 class PreactResNet18(nn.Module):
     """Images [B,4,S,S] in [0,1] -> shape code [B,512], unbounded; S is a multiple of 32 (published: 224).
 
-    As published by Kato and Harada 2019: colours in [-1,1], 0 (grey) if the mask is 0; 7x7 convolution of stride 2,
-    batch norm, ReLU, 3x3 maximum of stride 2; four stages of two blocks with 64, 128, 256, 512 channels, with batch
-    norm and ReLU before each convolution; batch norm, ReLU; a linear layer from all 512 * (S/32)^2 features. He's
-    initial weights.
+    As published by Kato and Harada 2019: colours in [-1,1], 0 (grey) if the mask is 0; 7x7
+    convolution of stride 2, batch norm, ReLU, 3x3 maximum of stride 2; four stages of two blocks
+    with 64, 128, 256, 512 channels, with batch norm and ReLU before each convolution; batch norm,
+    ReLU; a linear layer from all 512 * (S/32)^2 features. He's initial weights.
     """
 
     def __init__(self, image_size: int = 224, channels: int = 64) -> None:
@@ -204,7 +206,8 @@ class PreactResNet18(nn.Module):
 
 class _Block(nn.Module):
     """x + f(x): f is two 3x3 convolutions, with batch norm and ReLU before each (except at the input of the first
-    block). If the number of channels changes, x passes a 1x1 convolution, and it and the first one have stride 2.
+    block). If the number of channels changes, x passes a 1x1 convolution, and it and the first
+    one have stride 2.
     """
 
     def __init__(self, before: int, after: int, first: bool = False) -> None:

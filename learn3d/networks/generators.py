@@ -22,8 +22,8 @@ SymmetryOption = Symmetry | Literal["auto"] | None
 class MeshGenerator(nn.Module):
     """Shape code [B,512] -> vertices float32 [B,V,3] in the object frame (y up), on faces of a fixed topology.
 
-    If `symmetry` is not None, a subclass computes vertices that are symmetric about z = 0, and `place` turns them about
-    the vertical axis to the plane `symmetry`.
+    If `symmetry` is not None, a subclass computes vertices that are symmetric about z = 0, and
+    `place` turns them about the vertical axis to the plane `symmetry`.
     """
 
     faces: Tensor  # int64 [F,3]
@@ -80,8 +80,9 @@ class MeshGenerator(nn.Module):
 def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
     """Vertices 0.5 * (sphere + displacement): [V,3] and [B,V,3] -> [B,V,3].
 
-    The paper's text adds the displacement to the unit sphere itself. At the data set's camera a unit sphere covers the
-    whole image, so no silhouette edge would be seen and nothing would be learnt; the published code has the factor 0.5.
+    The paper's text adds the displacement to the unit sphere itself. At the data set's camera a
+    unit sphere covers the whole image, so no silhouette edge would be seen and nothing would be
+    learnt; the published code has the factor 0.5.
     """
     return 0.5 * (sphere + displacement)
 
@@ -89,9 +90,9 @@ def deform_sphere(sphere: Tensor, displacement: Tensor) -> Tensor:
 class SphereGenerator(MeshGenerator):
     """Vertices float32 [B,642,3]: a displacement for each vertex of the sphere.
 
-    With `symmetry` 979 numbers are predicted instead of 1926 (published code of Peng et al. 2020 for Pascal3D+): x and
-    y of the 32 vertices on the plane z = 0, which stay on it, and x, y, z of the 305 with z > 0; the other 305 are
-    their mirror images.
+    With `symmetry` 979 numbers are predicted instead of 1926 (published code of Peng et al. 2020
+    for Pascal3D+): x and y of the 32 vertices on the plane z = 0, which stay on it, and x, y, z
+    of the 305 with z > 0; the other 305 are their mirror images.
     """
 
     sphere: Tensor  # float32 [642,3]
@@ -134,9 +135,10 @@ class SphereGenerator(MeshGenerator):
 class SmoothSphereGenerator(SphereGenerator):
     """SphereGenerator with the displacements D = M U of its outputs U, M = a I + (1 - a) (I + b L)^-1.
 
-    L [642,642] is the graph Laplacian of the sphere, b = 3, a = 0.2. M keeps low frequencies over the sphere and
-    reduces high ones to a fifth, so they are learnt more slowly: whole parts move before single vertices do, and the
-    sphere hardly folds early in training (preconditioning after Nicolet et al. 2021, who have a = 0).
+    L [642,642] is the graph Laplacian of the sphere, b = 3, a = 0.2. M keeps low frequencies over
+    the sphere and reduces high ones to a fifth, so they are learnt more slowly: whole parts move
+    before single vertices do, and the sphere hardly folds early in training (preconditioning
+    after Nicolet et al. 2021, who have a = 0).
     """
 
     mixing: Tensor  # float32 [642,642]: M
@@ -182,8 +184,9 @@ BOUND = 1.2  # coordinates lie between -BOUND and BOUND
 def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
     """The surface of a grid of size^3 points: (points int64 [V,3], patches int64 [6,size,size], faces int64 [F,3]).
 
-    patches[f, i, j] is the vertex at (i, j) of side f of the cube; sides share the vertices at edges and corners.
-    Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and F = 2700.
+    patches[f, i, j] is the vertex at (i, j) of side f of the cube; sides share the vertices at
+    edges and corners. Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and
+    F = 2700.
     """
     grid = torch.cartesian_prod(*[torch.arange(size)] * 3)
     outside = ((grid == 0) | (grid == size - 1)).any(1)
@@ -205,10 +208,11 @@ def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
 class CubeGenerator(MeshGenerator):
     """Base class: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
 
-    `base` is a parameter that starts as the sphere of radius 0.5 (times object_scale); a subclass computes `bias`, the
-    offsets [B,1352,3], from the codes. With `symmetry`, as published: z becomes |z|, each vertex becomes the mean of
-    itself and its mirror image, and z gets the sign that the vertex has on the cube. The vertices are then exactly
-    symmetric, but the faces' diagonals are not.
+    `base` is a parameter that starts as the sphere of radius 0.5 (times object_scale); a subclass
+    computes `bias`, the offsets [B,1352,3], from the codes. With `symmetry`, as published: z
+    becomes |z|, each vertex becomes the mean of itself and its mirror image, and z gets the sign
+    that the vertex has on the cube. The vertices are then exactly symmetric, but the faces'
+    diagonals are not.
     """
 
     signs: Tensor  # float32 [V,3]: (1, 1, -1) if z < 0 on the cube, else 1
@@ -236,8 +240,8 @@ class CubeGenerator(MeshGenerator):
 class ConvCubeGenerator(CubeGenerator):
     """A stack of transposed convolutions for each side of the cube; shared vertices get the mean (ShapeNet).
 
-    Each stack: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64 channels, batch norm
-    and ReLU after each of the four; 3x3 convolution to 3@16x16.
+    Each stack: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64
+    channels, batch norm and ReLU after each of the four; 3x3 convolution to 3@16x16.
     """
 
     positions: Tensor  # int64 [V,3]: places of a vertex among the 6 * 16 * 16 outputs, padded with the first

@@ -32,7 +32,8 @@ def initialize_he(network: nn.Module) -> None:
 def reverse_gradient(values: Tensor, factor: float) -> Tensor:
     """The identity, with the gradient times -factor (Ganin and Lempitsky 2015).
 
-    Networks after it minimise a loss; networks before it maximise the same loss, `factor` times as fast.
+    Networks after it minimise a loss; networks before it maximise the same loss, `factor` times
+    as fast.
     """
     same = values.view_as(values)
     same.register_hook(lambda grad: -factor * grad)

@@ -40,12 +40,15 @@ class _Block(nn.Module):
 class ResNet18Encoder(nn.Module):
     """Images [B, 4, S, S] in [0, 1] -> shape codes [B, 512].
 
-    R, G, B are normalised by ImageNet's mean and deviation; the mask is not read. inverted: images hold 1 - colour
-    (Kato's files); natural colours are restored first. The code is the average of the last features, which is not
-    negative, as in the published code of Peng et al. 2020 on Pascal3D+ (S = 224).
+    R, G, B are normalised by ImageNet's mean and deviation; the mask is not read. inverted:
+    images hold 1 - colour (Kato's files); natural colours are restored first. The code is the
+    average of the last features, which is not negative, as in the published code of Peng et al.
+    2020 on Pascal3D+ (S = 224).
 
-    flat_size: S of the encoder of Kato and Harada 2019, whose code is a linear layer on all 512 * (S/32)^2 features.
-    frozen_norms: statistics, gain and offset of the batch norms do not change, as they published for ImageNet weights.
+    flat_size: S of the encoder of Kato and Harada 2019, whose code is a linear layer on all 512 *
+    (S/32)^2 features.
+    frozen_norms: statistics, gain and offset of the batch norms do not change, as they published
+    for ImageNet weights.
     """
 
     image_size = 224
@@ -89,9 +92,11 @@ class ResNet18Encoder(nn.Module):
 def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
     """Copy weights of torchvision's resnet18 (.pth, .pt or .safetensors) into an encoder, in place.
 
-    The layers "fc" of the file and "code" of the encoder are left out. Nothing in the file is executed (weights_only).
+    The layers "fc" of the file and "code" of the encoder are left out. Nothing in the file is
+    executed (weights_only).
 
-    Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has weights of another network.
+    Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has
+    weights of another network.
     """
     # here, as a training without pretrained weights reads no such file
     from learn3d.files import (

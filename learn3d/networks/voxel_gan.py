@@ -1,11 +1,13 @@
 """PrGAN's networks (Gadelha et al. 2017): voxel generator, projection, silhouette discriminator, inverse encoder.
 
-Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully connected layers from
-N(0, 0.1), of convolutions from N(0, 0.02), biases 0. TensorFlow's momentum of 0.9 in batch norms is torch's 0.1.
+Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully
+connected layers from N(0, 0.1), of convolutions from N(0, 0.02), biases 0. TensorFlow's momentum
+of 0.9 in batch norms is torch's 0.1.
 
-The published code rotates the 64^3 volume to the view by trilinear resampling and sums along the depth. For a fixed
-view that is a linear map from voxels to pixels. Here it is a sparse matrix, five times as fast as `grid_sample` forward
-and backward on one core (40 ms for a batch of 16 instead of 200).
+The published code rotates the 64^3 volume to the view by trilinear resampling and sums along the
+depth. For a fixed view that is a linear map from voxels to pixels. Here it is a sparse matrix,
+five times as fast as `grid_sample` forward and backward on one core (40 ms for a batch of 16
+instead of 200).
 """
 
 import functools
@@ -80,9 +82,10 @@ class _Double(torch.autograd.Function):
 class VoxelGenerator(nn.Module):
     """Shape code [B, 200] -> density float32 [B, 64, 64, 64] in [0, 1 / TAU], axes (x, y, z) of the object frame.
 
-    A linear layer to `channels[0]` features on 4^3 cells, then doubling convolutions to the other channels and to one
-    at 64^3; batch norm and ReLU after all but the last, which has a sigmoid. The published code has one channel already
-    at 32^3, perhaps by mistake: its batch norm there is declared for 16.
+    A linear layer to `channels[0]` features on 4^3 cells, then doubling convolutions to the other
+    channels and to one at 64^3; batch norm and ReLU after all but the last, which has a sigmoid.
+    The published code has one channel already at 32^3, perhaps by mistake: its batch norm there
+    is declared for 16.
     """
 
     def __init__(self, channels: Sequence[int] = GENERATOR_CHANNELS) -> None:
@@ -106,7 +109,8 @@ class VoxelGenerator(nn.Module):
 class SilhouetteDiscriminator(nn.Module):
     """Silhouettes [B, 64, 64] in [0, 1] -> logits [B]: positive for silhouettes of the data set.
 
-    5x5 convolutions of stride 2 to four `channels`, batch norm and LeakyReLU(0.2) after each, then a linear layer.
+    5x5 convolutions of stride 2 to four `channels`, batch norm and LeakyReLU(0.2) after each,
+    then a linear layer.
     """
 
     def __init__(self, channels: Sequence[int] = DISCRIMINATOR_CHANNELS) -> None:
@@ -131,7 +135,8 @@ class SilhouetteDiscriminator(nn.Module):
 class InverseEncoder(nn.Module):
     """Silhouettes [B, 64, 64] in [0, 1] -> z [B, 201]: the shape code, then the view's entry.
 
-    4096-512-512-201, with LeakyReLU(0.2) after the first layer only and the output divided by 201, as published.
+    4096-512-512-201, with LeakyReLU(0.2) after the first layer only and the output divided by
+    201, as published.
     """
 
     def __init__(self) -> None:
@@ -164,8 +169,8 @@ def _initialise(module: nn.Module) -> None:
 class ViewCircle:
     """K views at equal steps of azimuth, as in Kato's protocol: view k has azimuth -360 k / K degrees.
 
-    Rays are parallel, as PrGAN's. The image covers `half_width` to each side of the origin, so that objects have the
-    same size as in the data set's perspective images.
+    Rays are parallel, as PrGAN's. The image covers `half_width` to each side of the origin, so
+    that objects have the same size as in the data set's perspective images.
     """
 
     count: int = 24
@@ -208,9 +213,10 @@ class ViewCircle:
 def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) -> Tensor:
     """Soft silhouettes P = 1 - exp(-tau * integral of the density along the ray), float32 [B, S, S], row 0 = top.
 
-    density: float32 [B, S, S, S] at the voxel centres of the box [-0.5, 0.5]^3, axes (x, y, z) of the object frame,
-    trilinear in between, zero outside. view_ids: int64 [B] in 0 .. K-1, on the CPU to avoid a copy. The integral is in
-    voxels: a solid of density 1 and a thickness of n voxels gives 1 - exp(-tau n). Differentiable in the density.
+    density: float32 [B, S, S, S] at the voxel centres of the box [-0.5, 0.5]^3, axes (x, y, z) of
+    the object frame, trilinear in between, zero outside. view_ids: int64 [B] in 0 .. K-1, on the
+    CPU to avoid a copy. The integral is in voxels: a solid of density 1 and a thickness of n
+    voxels gives 1 - exp(-tau n). Differentiable in the density.
     """
     size = density.shape[-1]
     # A quarter turn permutes the voxels, so a quarter of the views needs a matrix.

@@ -24,7 +24,8 @@ def studio_lights(
 ) -> nmr.Lights:
     """A key light from the direction `light` (of any length but 0), a weaker one from behind, and ambient light.
 
-    ambient: its share in 0 .. 1; a surface that faces the key light has the brightness 1. smooth: interpolate normals.
+    ambient: its share in 0 .. 1; a surface that faces the key light has the brightness 1. smooth:
+    interpolate normals.
     """
     key, direction = 1.0 - ambient, torch.as_tensor(light, dtype=torch.float64)
     direction = direction / direction.norm()
@@ -46,10 +47,12 @@ def photograph(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One mesh in B views on white. Both sides of its faces are lit in the same way. Not differentiable.
 
-    vertices float [V, 3] in the object frame, faces integer [F, 3], a camera of nmr with B poses. colors: a texture, or
-    colours of the faces, float [F, 3] or [3] in [0, 1]. supersample: subpixels per pixel and axis, an even number; 2
-    covers exactly the pixels that `nmr.render_silhouette` covers. Returns rgb uint8 [B, S, S, 3], row 0 = top, and
-    alpha uint8 [B, S, S], 255 * the covered share of each pixel. Raises TypeError and ValueError as `nmr.render` does.
+    vertices float [V, 3] in the object frame, faces integer [F, 3], a camera of nmr with B poses.
+    colors: a texture, or colours of the faces, float [F, 3] or [3] in [0, 1]. supersample:
+    subpixels per pixel and axis, an even number; 2 covers exactly the pixels that
+    `nmr.render_silhouette` covers. Returns rgb uint8 [B, S, S, 3], row 0 = top, and alpha uint8
+    [B, S, S], 255 * the covered share of each pixel. Raises TypeError and ValueError as
+    `nmr.render` does.
     """
     faces = torch.as_tensor(faces).cpu()
     if not isinstance(colors, nmr.UVTexture):
@@ -93,7 +96,8 @@ def natural_look(
 ) -> tuple[np.ndarray, nmr.Lights]:
     """Random colours [F, 3] and lights for a mesh [V, 3], [F, 3].
 
-    Connected parts with the same number of faces get the same colour out of three. The light comes from any side.
+    Connected parts with the same number of faces get the same colour out of three. The light
+    comes from any side.
     palette: the three colours; None for random ones.
     """
     part = connected_component_labels(np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices))[

@@ -27,8 +27,8 @@ def tile(
 ) -> np.ndarray:
     """Arrange pictures uint8 [h,w,3] on a white sheet, each scaled to the same square; uint8 [H,W,3].
 
-    None leaves a place free. Titles are above the columns and to the left of the rows. rules: numbers of the rows that
-    have a thin line above them.
+    None leaves a place free. Titles are above the columns and to the left of the rows. rules:
+    numbers of the rows that have a thin line above them.
     """
     font = ImageFont.load_default(12)
     top = HEADER + MARGIN if titles else MARGIN
@@ -105,7 +105,8 @@ LEGEND = (
 def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.ndarray]:
     """An object's row of the contact sheet: up to 8 views, the mask of view 0, the voxels, each uint8 [64, 64, 3].
 
-    rgb uint8 [n, S, S, 3] over white, alpha uint8 [n, S, S], voxels bool [32, 32, 32] with axes (x, y, z), z = away.
+    rgb uint8 [n, S, S, 3] over white, alpha uint8 [n, S, S], voxels bool [32, 32, 32] with axes
+    (x, y, z), z = away.
     """
     thickness = voxels.sum(axis=2).T[::-1]
     # the grid's own square is grey

@@ -45,8 +45,8 @@ class Surface(NamedTuple):
 def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surface:
     """Marching cubes: the surface of a grid [s, s, s] with axes (x, y, z) over the cube [-box/2, box/2]^3.
 
-    The surface is empty if no cell is above `level`, and closed at the border of the grid. Normals point outwards by
-    the right-hand rule in these axes, as `nmr.icosphere`'s do.
+    The surface is empty if no cell is above `level`, and closed at the border of the grid.
+    Normals point outwards by the right-hand rule in these axes, as `nmr.icosphere`'s do.
     """
     size = grid.shape[-1]
     padded = np.pad(grid.detach().cpu().float().numpy(), 1)
@@ -63,7 +63,8 @@ def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surfa
 def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> Cameras:
     """The camera of a single pose, turned about the object's vertical axis by each of these angles.
 
-    A turn adds to the azimuth; elevation, distance, field of view and roll stay. `zoom` magnifies about the centre.
+    A turn adds to the azimuth; elevation, distance, field of view and roll stay. `zoom` magnifies
+    about the centre.
     """
     if isinstance(poses, LookAtPoses):
         elevation, distance, half_fov = (
@@ -104,7 +105,8 @@ def azimuths_deg(poses: Poses | None) -> Tensor:
 def common_zoom(shapes: Iterable[tuple[Surface, Cameras]], masks: Tensor) -> float:
     """The largest magnification, at least 1, at which shapes and masks stay inside their pictures.
 
-    masks: float [B, S, S] of the input images. A mask that touches the border allows no magnification.
+    masks: float [B, S, S] of the input images. A mask that touches the border allows no
+    magnification.
     """
     inside = torch.nonzero(masks > 0.5)[:, 1:]
     # 1 is the border

@@ -1,7 +1,7 @@
 """Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its header. No pickle.
 
-The header has two entries: "learn3d", the JSON of `Metadata`, and "crc32", the CRC-32 of that JSON and of the names,
-dtypes, shapes and bytes of all tensors.
+The header has two entries: "learn3d", the JSON of `Metadata`, and "crc32", the CRC-32 of that
+JSON and of the names, dtypes, shapes and bytes of all tensors.
 """
 
 import dataclasses
@@ -134,9 +134,10 @@ def load(
 ) -> tuple[dict[str, Tensor], Metadata]:
     """Read the tensors, on the CPU, and the metadata of a checkpoint, and verify their checksum.
 
-    path: a file, or a run folder with the checkpoint `which`. with_tensors: if False, neither tensors nor checksum are
-    read. Raises DamagedFile if the file is truncated, changed or of another kind; ValueError if it is missing or from
-    another version of learn3d; OSError if it cannot be read.
+    path: a file, or a run folder with the checkpoint `which`. with_tensors: if False, neither
+    tensors nor checksum are read. Raises DamagedFile if the file is truncated, changed or of
+    another kind; ValueError if it is missing or from another version of learn3d; OSError if it
+    cannot be read.
     """
     path = find(path, which)
     if not path.is_file():
@@ -179,7 +180,8 @@ def load_method(
 ) -> tuple[Method, TrainConfig, Metadata]:
     """Open a checkpoint for evaluation or reconstruction, see `load`.
 
-    Returns the method in evaluation mode, with its EMA weights if it has any; its configuration; the metadata.
+    Returns the method in evaluation mode, with its EMA weights if it has any; its configuration;
+    the metadata.
     """
     tensors, metadata = load(path, which)
     how = {"device": device, "precision": resolve_precision(precision, device), "seed": 0}
@@ -201,7 +203,8 @@ def load_data(
     """A split of a run's data, or of another folder, category or layout, in the form that its networks take.
 
     The run's own data get its options `poses` and, in the training split, `views_per_object`.
-    Raises ValueError if the layout inverts colours and the training layout does not, or the other way round.
+    Raises ValueError if the layout inverts colours and the training layout does not, or the other
+    way round.
     """
     layout = layout or config.layout
     if layout in LAYOUTS and LAYOUTS[layout].inverted != LAYOUTS[config.layout].inverted:
@@ -268,8 +271,8 @@ def restore_optimizer(
 ) -> None:
     """Restore the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the parameters.
 
-    Fused kernels index parameter, gradient and state by position in memory, so each tensor must have its parameter's
-    shape, and is copied to its parameter's memory layout.
+    Fused kernels index parameter, gradient and state by position in memory, so each tensor must
+    have its parameter's shape, and is copied to its parameter's memory layout.
     """
     parameters = [
         (p, group.get("fused")) for group in optimizer.param_groups for p in group["params"]

@@ -1,8 +1,9 @@
 """One training in several ranks, the processes that torchrun starts: what a rank needs beside torch.distributed.
 
-Every rank holds the same networks and takes the same steps. It draws all random numbers of a step for the whole batch
-and computes the losses of its own rows. Its share of a loss is 1 / W of its mean, with W ranks, so the sums of the
-ranks' gradients are the gradients of the whole batch. Without torchrun there is one rank.
+Every rank holds the same networks and takes the same steps. It draws all random numbers of a step
+for the whole batch and computes the losses of its own rows. Its share of a loss is 1 / W of its
+mean, with W ranks, so the sums of the ranks' gradients are the gradients of the whole batch.
+Without torchrun there is one rank.
 """
 
 import contextlib
@@ -44,8 +45,8 @@ def describe() -> str:
 def join_ranks(device: str) -> Iterator[None]:
     """Context in which this process is one of the ranks that torchrun started, if it did.
 
-    Ranks use gloo for tensors on the CPU, and NCCL on GPUs, of which each needs its own. Raises OSError if the ranks
-    do not find each other, ValueError if this machine has too few GPUs.
+    Ranks use gloo for tensors on the CPU, and NCCL on GPUs, of which each needs its own. Raises
+    OSError if the ranks do not find each other, ValueError if this machine has too few GPUs.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield
@@ -83,9 +84,9 @@ def _lost_ranks() -> Iterator[None]:
 def own_rows(batch_size: int, views: int) -> Tensor:
     """The rows of a batch [a_1 .. a_n, b_1 .. b_n, ...] that this rank takes, int64 [b].
 
-    They are all `views` of consecutive objects.
-    All ranks take equally many objects, and an even number, because methods may flip every second image. Raises
-    ValueError if the batch cannot be divided so.
+    They are all `views` of consecutive objects. All ranks take equally many objects, and an even
+    number, because methods may flip every second image. Raises ValueError if the batch cannot be
+    divided so.
     """
     objects = batch_size // views
     if size() > 1 and objects % (2 * size()):
@@ -171,7 +172,8 @@ def all_gather(rows: Tensor) -> Tensor:
 def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
     """Let optimizers step on the sums of all ranks' gradients, and batch norms take the statistics of all rows.
 
-    `nn.SyncBatchNorm` works on GPUs only, and DistributedDataParallel with one backward pass a step.
+    `nn.SyncBatchNorm` works on GPUs only, and DistributedDataParallel with one backward pass a
+    step.
     """
     if size() == 1:
         return
@@ -199,8 +201,9 @@ def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]
 class _BatchNorm(torch.autograd.Function):
     """Normalizes the channels of x [B, C, ...] with mean and variance [C] over the rows of all ranks.
 
-    With y = w x' + b, x' = (x - mean) / s and N numbers of a channel in all ranks, the gradient of the sum of the
-    ranks' losses is dx = w / s (dy - sum(dy) / N - x' sum(dy x') / N), with sums over the rows of all ranks.
+    With y = w x' + b, x' = (x - mean) / s and N numbers of a channel in all ranks, the gradient
+    of the sum of the ranks' losses is dx = w / s (dy - sum(dy) / N - x' sum(dy x') / N), with
+    sums over the rows of all ranks.
     """
 
     @staticmethod

@@ -41,8 +41,8 @@ WRITTEN += (WANDB_ID, CONFIG)
 def lock_folder(folder: Path) -> Iterator[None]:
     """Context that makes the folder and locks it; a folder that is empty at the end is removed.
 
-    The operating system releases the lock when the process ends, even if it is killed. Raises OSError if another
-    process holds the lock, or if the folder cannot be written to.
+    The operating system releases the lock when the process ends, even if it is killed. Raises
+    OSError if another process holds the lock, or if the folder cannot be written to.
     """
     if rank() > 0:  # rank 0 has locked it
         yield
@@ -74,7 +74,8 @@ def is_run(folder: Path) -> bool:
 def check_can_start(folder: Path, overwrite: bool) -> None:
     """Raise a ValueError unless a new run may begin in a folder: an empty one, or with `overwrite` any folder.
 
-    Even then no file may have the name of a run's file, unless it belongs to a run. Only rank 0 checks.
+    Even then no file may have the name of a run's file, unless it belongs to a run. Only rank 0
+    checks.
     """
     if rank() > 0:
         return

@@ -133,9 +133,9 @@ def evaluate_runs(
 ) -> list[Result]:
     """Measure run folders (their checkpoint `which`) or checkpoint files, on each of their categories by itself.
 
-    `data` and `category` default to those of the training. A model that learnt from estimated poses is measured with
-    them only on its own data (`data` is None). Raises ValueError or OSError before anything is measured if a checkpoint
-    or a data folder is missing.
+    `data` and `category` default to those of the training. A model that learnt from estimated
+    poses is measured with them only on its own data (`data` is None). Raises ValueError or
+    OSError before anything is measured if a checkpoint or a data folder is missing.
     """
     if not paths:
         raise ValueError("give at least one run folder or checkpoint to evaluate")

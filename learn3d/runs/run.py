@@ -188,8 +188,9 @@ def load_last(
 ) -> tuple[tuple[dict[str, Tensor], Metadata] | None, tuple[str, ...]]:
     """The newest undamaged checkpoint of a run, or None if it has none yet; and warnings.
 
-    If last.safetensors is damaged or missing, previous.safetensors replaces it. Raises ValueError if the folder has no
-    run or one with other options; DamagedFile if all checkpoints are damaged; OSError if one cannot be read.
+    If last.safetensors is damaged or missing, previous.safetensors replaces it. Raises ValueError
+    if the folder has no run or one with other options; DamagedFile if all checkpoints are
+    damaged; OSError if one cannot be read.
     """
     folder, notes = config.output, []
     paths = run_folder.checkpoints(folder)

@@ -1,7 +1,8 @@
 """The number of CPU threads of a training: one or all, whichever makes its steps faster.
 
-Threads synchronise hundreds of times a step. If cores are oversubscribed, a step with all threads takes up to 14 times
-as long as with one; on an idle machine it takes a fraction. So both are measured.
+Threads synchronise hundreds of times a step. If cores are oversubscribed, a step with all threads
+takes up to 14 times as long as with one; on an idle machine it takes a fraction. So both are
+measured.
 """
 
 import os
@@ -20,8 +21,8 @@ SLOWER = 3.0  # ratio of the two medians at which both numbers of threads are me
 class ThreadTuner:
     """Chooses between one thread and all by the duration of training steps.
 
-    The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, if there is only one core, or if
-    several ranks train together.
+    The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, if there is
+    only one core, or if several ranks train together.
     """
 
     def __init__(self, threads: int | None) -> None:

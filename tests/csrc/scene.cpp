@@ -577,8 +577,8 @@ bool same(const Number* a, const Number* b, size_t size) {
   return false;
 }
 
-// The name of the first result of which the first numbers, as many as `share(name, size in a, size
-// in b)`, differ; or "".
+// The name of the first result that differs, or "". share(name, size in a, size in b) is how many
+// of its numbers count, from the first.
 template <class T, class Share>
 const char* compare(const Results<T>& a, const Results<T>& b, const Share& share) {
   const char* different = "";

@@ -35,6 +35,7 @@ SAME_SQUARES = {
     "normals that are missing": SQUARE.replace("f 1 2 3", "f 1//1 2//1 3//1"),
     "texture coordinates that are missing": SQUARE.replace("f 1 2 3", "f 1/1 2/2/7 3/"),
     "forms mixed in a line": "vt 0 0\nvt 1\n" + SQUARE.replace("f 1 2 3", "f 1 2/2 3/-1/-5"),
+    "words behind numbers": SQUARE.replace("v 1 0 0", "v 1 0 0 // a corner"),
     "exponents and signs": SQUARE.replace("v 1 0", "v +1e0 -0.0").replace("v 0 1", "v .0 1."),
     "no line end": SQUARE[:-1],
     "zeros at the end": SQUARE[:-1] + "\0\0",

@@ -1,7 +1,7 @@
 """Measure nmr beside deodr, PyTorch3D, Open3D and Mesa (through pyrender), each if it is installed, one thread each.
 
-Prints a table in Markdown: medians in milliseconds, with the backward pass for the two renderers that have one. Stops
-if the images differ. PYOPENGL_PLATFORM=egl takes EGL instead of OSMesa.
+Prints a table in Markdown: medians in milliseconds, with the backward pass for the two renderers
+that have one. Stops if the images differ. PYOPENGL_PLATFORM=egl takes EGL instead of OSMesa.
 """
 
 import math

@@ -1,8 +1,8 @@
 """Generated objects seen from all sides: our own layout, as shards only (`learn3d.data.shards`).
 
-Images are 64x64, with colours stored as 255 - colour. Cameras have any azimuth, elevations in -10 .. 60 degrees, fields
-of view in 14 .. 40 degrees, and see the whole object. Every view has a depth map. Voxel axes are Kato's; the view
-classes are 24 cells of azimuth.
+Images are 64x64, with colours stored as 255 - colour. Cameras have any azimuth, elevations in -10
+.. 60 degrees, fields of view in 14 .. 40 degrees, and see the whole object. Every view has a
+depth map. Voxel axes are Kato's; the view classes are 24 cells of azimuth.
 """
 
 from pathlib import Path

@@ -6,12 +6,13 @@
 - `{synset}/{id}/pointcloud.npz`: `points` [P, 3] on the surface in the world of the cameras.
 - `{synset}/softras_{train,val,test}.lst`: one id per line.
 
-The data set has the content of Kato's npz files, and exactly Kato's cameras. A fit of the 24 camera positions finds the
-rotation (and reflection) from the file's world to the object frame, which is also applied to the points. A file with
-another order, direction or distance of its views is refused.
+The data set has the content of Kato's npz files, and exactly Kato's cameras. A fit of the 24
+camera positions finds the rotation (and reflection) from the file's world to the object frame,
+which is also applied to the points. A file with another order, direction or distance of its views
+is refused.
 
-There are no voxels: measure with the points (Chamfer distance, F-score). Kato's voxels are not used, because their
-objects may have another order than the lists.
+There are no voxels: measure with the points (Chamfer distance, F-score). Kato's voxels are not
+used, because their objects may have another order than the lists.
 """
 
 import dataclasses

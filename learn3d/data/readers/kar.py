@@ -58,8 +58,9 @@ def load(
 ) -> ViewDataset | None:
     """Read a split. View classes are cells of azimuth and elevation, see `VIEW_BINS`.
 
-    image_size: side of the images in pixels, up to 224; masks always have 64. views_per_object: use the first 1 .. 20
-    renders of each object; None: 1 for training, all for the other splits and if the findings are not strict.
+    image_size: side of the images in pixels, up to 224; masks always have 64. views_per_object:
+    use the first 1 .. 20 renders of each object; None: 1 for training, all for the other splits
+    and if the findings are not strict.
     """
     if views_per_object is not None and not 1 <= views_per_object <= NUM_RENDERS:
         raise ValueError(f"views_per_object must lie in 1 .. {NUM_RENDERS}, got {views_per_object}")

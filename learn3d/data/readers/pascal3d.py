@@ -3,12 +3,13 @@
 - Files are `{aeroplane,car,chair}_{train,val,imagenet}.npz`; training uses train and imagenet. There is no test split:
   both papers report on val, so "test" is val here.
 - `images` is an object array of uint8 [H, W, 3], pickled by Python 2, see `files.npz`. The input of the network is the
-  object's box, padded by 15 % a side, clipped to the image and stretched to a square. In training each side moves by up
-  to 15 % more or less (the augmentation "crop").
+  object's box, padded by 15 % a side, clipped to the image and stretched to a square. In training
+  each side moves by up to 15 % more or less (the augmentation "crop").
 - The fourth channel of `images_ref` uint8 [N, 224, 224, 4] is the ground truth silhouette of the crop without that
   augmentation. The published code of Peng et al. 2020 takes every 3.5th pixel of it to get 64x64.
 - Cameras are orthographic: v' = R v. VPL's rasterizer turns images upside down AND left-right in the end, so x' points
-  LEFT in the image. Here, as everywhere, x' points right: the stored rotation is mirrored once, in `poses`.
+  LEFT in the image. Here, as everywhere, x' points right: the stored rotation is mirrored once,
+  in `poses`.
 - VPL adds 1 + 1e-5 to depths and draws from depth 0.1 on, which cuts off z' < -0.9. `RotationPoses` cuts nothing off.
 - Objects lie in [-1, 1], upright and mirror-symmetric about z = 0. Voxels are 32^3 over the same box.
 """
@@ -57,9 +58,10 @@ def load(
 ) -> ViewDataset | None:
     """Read a split ("test" is val); each photograph is an object of its own.
 
-    image_size: side of the network's images in pixels, 224 in both papers. View classes are the 45-degree cells of the
-    rotation (`rotation_cells`) with training photographs. Another photograph gets the class of the training photograph
-    with the nearest rotation; only the MMD depends on it.
+    image_size: side of the network's images in pixels, 224 in both papers. View classes are the
+    45-degree cells of the rotation (`rotation_cells`) with training photographs. Another
+    photograph gets the class of the training photograph with the nearest rotation; only the MMD
+    depends on it.
     """
     paths = _paths(folder, category, split)
     found = read_all([Call(npz.read_ragged, path, ("images", _WANTED), _WANTED)] for path in paths)
@@ -106,8 +108,8 @@ def poses(rotations: np.ndarray) -> RotationPoses:
 def rotation_cells(rotations: np.ndarray) -> np.ndarray:
     """45-degree cells of the Euler angles about y, then z, then x (scipy's 'yzx'): int64 [M] in 0 .. 511.
 
-    Angles are first rounded to a thousandth of a degree. Many are 0, the border of two cells, and in the published code
-    rounding errors of float32 choose the cell.
+    Angles are first rounded to a thousandth of a degree. Many are 0, the border of two cells, and
+    in the published code rounding errors of float32 choose the cell.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Gimbal lock")

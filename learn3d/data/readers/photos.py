@@ -70,8 +70,9 @@ def load(
 ) -> ViewDataset | None:
     """Read a split of the photographs in `folder/category`.
 
-    image_size: side of the images in pixels. They have Kato's form (`framing.frame`), for which methods and presets are
-    made. View classes are those of `view_bins.view_classes`, from the training photographs.
+    image_size: side of the images in pixels. They have Kato's form (`framing.frame`), for which
+    methods and presets are made. View classes are those of `view_bins.view_classes`, from the
+    training photographs.
     """
     synset_of(category)  # raises ValueError for a path, which would lead to other folders
     table = Path(folder) / category / TABLE
@@ -240,7 +241,8 @@ def _unlisted(table: Path, photos: list[Photo]) -> str | None:
 def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
     """The split of each object. Without splits in the table, a hash of the names selects 20 % test and 10 % val.
 
-    Raises DamagedFile if an object is in two splits or in none, or if there are too few objects to split.
+    Raises DamagedFile if an object is in two splits or in none, or if there are too few objects
+    to split.
     """
     given: dict[str, set[str | None]] = {}
     for photo in photos:

@@ -30,12 +30,13 @@ def read_objects(
 ) -> tuple[np.ndarray, np.ndarray | None, list[Any], list[np.ndarray]] | None:
     """Read N objects of V views each: images uint8 [N * V, 4, S, S], masks uint8 [N * V, 64, 64], poses, shapes.
 
-    The masks are None if they are the images' fourth channel. Returns None if the findings are not strict.
+    The masks are None if they are the images' fourth channel. Returns None if the findings are
+    not strict.
 
-    files: the calls for an object, in this order: its cameras, whose folder must exist; its shape (voxels or points);
-    then one for each view, which returns an image, a mask and the mask's largest value. build: the poses and the shape
-    of an object, from the paths and the content of the first two files; it may raise DamagedFile. title: of the
-    progress bar.
+    files: the calls for an object, in this order: its cameras, whose folder must exist; its shape
+    (voxels or points); then one for each view, which returns an image, a mask and the mask's
+    largest value. build: the poses and the shape of an object, from the paths and the content of
+    the first two files; it may raise DamagedFile. title: of the progress bar.
     """
     findings.objects = len(names)
     whole = (
@@ -90,7 +91,8 @@ def join_objects(
 ) -> ViewDataset | None:
     """The data set of the result of `read_objects`, with poses as of `check_poses`; None if that is None.
 
-    view_bins: cells of the view classes, see `AngleBins.parse`. about: the result of `LayoutProperties.about`.
+    view_bins: cells of the view classes, see `AngleBins.parse`. about: the result of
+    `LayoutProperties.about`.
     """
     if objects is None:
         return None

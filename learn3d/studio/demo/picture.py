@@ -64,7 +64,8 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
 def find_object(picture: Picture, judge: Judge | None = None) -> tuple[Outline, str | None]:
     """The object's outline, and what was left out, see `keep_object`.
 
-    The mask is the given one, or is found in the box or picture. If it was corrected, nothing is left out.
+    The mask is the given one, or is found in the box or picture. If it was corrected, nothing is
+    left out.
     """
     if picture.box is None and picture.strokes is not None:
         return Outline(correct(picture.colors, picture.mask, picture.strokes), "by hand"), None
@@ -100,13 +101,15 @@ def make_meshes(
 ) -> None:
     """Send the masks, the progress, and in the end the meshes of all models, or an error as a sentence.
 
-    Several pictures show one object, of which the first model makes a mesh. category: the object's, None if unknown.
+    Several pictures show one object; the first model makes one mesh of it. category: the
+    object's, None if unknown.
     """
     try:
         judge, masks = next(iter(models.values())).judge, []
         for number, picture in enumerate(pictures):
             outline, left_out = find_object(picture, judge)
             of = {"of": number} if len(pictures) > 1 else {}
+            which = f" in picture {number + 1}" if of else ""
             found = {
                 "mask": _base64(np.packbits(outline.mask > 127).tobytes()),
                 "left_out": left_out,
@@ -115,14 +118,12 @@ def make_meshes(
             try:
                 check_mask(outline.mask, cropped=True)
             except ValueError:
-                which = f" in picture {number + 1}" if of else ""
                 raise ValueError(
                     f"No object was found{which}. Draw a box around it, or paint it with Add."
                 ) from None
-            if outline.doubt and not of:
-                raise ValueError(
-                    f"Is this the object? {outline.doubt.capitalize()}. Draw a box around it (Box)."
-                )
+            if outline.doubt:
+                doubt = f"{outline.doubt.capitalize()}. Draw a box around it (Box)."
+                raise ValueError(f"Is this the object{which}? {doubt}")
             masks.append(outline.mask)
 
         def progress(text: str, part: float) -> None:

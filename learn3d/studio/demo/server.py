@@ -238,8 +238,8 @@ def _number(text: str) -> int:
 class Gate:
     """ASGI middleware that refuses requests of other web pages, those to another host name, and too many pictures.
 
-    An attacker's host name can point to this server (DNS rebinding). So the Host header must be an IP address, `host`
-    or a name of this machine.
+    An attacker's host name can point to this server (DNS rebinding). So the Host header must be
+    an IP address, `host` or a name of this machine.
     """
 
     def __init__(self, app: ASGIApp, host: str) -> None:

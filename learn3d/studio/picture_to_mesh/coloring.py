@@ -1,6 +1,7 @@
 """Colours for a mesh from the picture to which it was fitted, at its vertices and in a texture image.
 
-Hidden parts get blurred colours of their neighbours. Each face has a triangle of its own in the texture image.
+Hidden parts get blurred colours of their neighbours. Each face has a triangle of its own in the
+texture image.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,10 +46,11 @@ def color_mesh(
     """A surface with the colours of pictures, mostly of those that see a part best. Hidden vertices get the colours of
     their mirror images or, if these are hidden, too, blurred colours of their neighbours.
 
-    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the cameras of N pictures.
-    pictures: N of R, G, B and mask, uint8 [4, S, S], framed as in `fitting.fit`. mirror: float32 [3, 3], the reflection
-    that maps the shape to itself, None without symmetry. textured: double the vertices along sharp edges, and add a
-    texture image.
+    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the cameras
+    of N pictures.
+    pictures: N of R, G, B and mask, uint8 [4, S, S], framed as in `fitting.fit`. mirror: float32
+    [3, 3], the reflection that maps the shape to itself, None without symmetry. textured: double
+    the vertices along sharp edges, and add a texture image.
     """
     of_pictures = [
         _seen(*mesh, view.select(torch.tensor([n])), picture) for n, picture in enumerate(pictures)
@@ -108,10 +110,11 @@ def _seen(vertices: Tensor, faces: Tensor, view: View, picture: np.ndarray) -> L
 def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
     """Spread colours [V, 3] from vertices [V, 3] with a high weight [V] to the others as smoothly as possible.
 
-    The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2 + 1e-5 sum_v |c_v - near_v|^2.
-    So seen vertices (w_v near 1) keep their colours, and neighbours become alike. The last term decides on parts that
-    no edge joins to a seen vertex: near_v is the colour of the nearest vertex that is clearly seen, or of the
-    corresponding one of an equal part.
+    The result minimises sum_v w_v^2 |c_v - given_v|^2 + 0.01 sum_edges |c_a - c_b|^2 + 1e-5 sum_v
+    |c_v - near_v|^2. So seen vertices (w_v near 1) keep their colours, and neighbours become
+    alike. The last term decides on parts that no edge joins to a seen vertex: near_v is the
+    colour of the nearest vertex that is clearly seen, or of the corresponding one of an equal
+    part.
     """
     clear = (weight >= min(0.5, float(weight.max()))).numpy()
     neighbours = joined(faces.numpy(), len(colors))
@@ -164,10 +167,11 @@ def paint(surface: Surface, look_up: LookUp) -> Surface:
 def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor]:
     """Lay triangles [F, 3, 3] out in an image.
 
-    Each rectangular cell of the image holds two triangles of the same size. Around a triangle one more texel continues
-    its colours, so that interpolation at its sides does not read another triangle. Returns the image's height; places
-    of all corners in texels, x right and y down, float32 [F, 3, 2]; and for each of N used texels its index, int64 [N],
-    three of the 3 F corners, int64 [N, 3], and their barycentric shares, float32 [N, 3].
+    Each rectangular cell of the image holds two triangles of the same size. Around a triangle one
+    more texel continues its colours, so that interpolation at its sides does not read another
+    triangle. Returns the image's height; places of all corners in texels, x right and y down,
+    float32 [F, 3, 2]; and for each of N used texels its index, int64 [N], three of the 3 F
+    corners, int64 [N, 3], and their barycentric shares, float32 [N, 3].
     """
     edges = np.linalg.norm(triangles - np.roll(triangles, 1, 1), axis=2)
     order = (

@@ -81,9 +81,9 @@ class Outline(NamedTuple):
 def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None = None) -> Outline:
     """Find the object in a photograph uint8 [H, W, 3], and other things beside it.
 
-    With a box: see `cut_out`. If there is no box and the background is plain, the object is everything that differs
-    from the border's colour. Otherwise rembg finds it if it is installed, and if not, see `cut_out`. Raises ValueError
-    as `cut_out` does, or if rembg fails.
+    With a box: see `cut_out`. If there is no box and the background is plain, the object is
+    everything that differs from the border's colour. Otherwise rembg finds it if it is installed,
+    and if not, see `cut_out`. Raises ValueError as `cut_out` does, or if rembg fails.
     """
     if box is not None:
         return Outline(cut_out(colors, box), "by GrabCut in the box")
@@ -152,9 +152,9 @@ def _differences(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
     """Mask an object on a plain background: uint8 [H, W], 0 or 255.
 
-    colors: uint8 [H, W, 3]. The background colour is the median of the border. A pixel belongs to the object if a
-    channel differs from it by more than `tolerance` (0 .. 1). Holes are filled, but for some with the colour of the
-    background, such as the gaps between the rungs of a chair.
+    colors: uint8 [H, W, 3]. The background colour is the median of the border. A pixel belongs to
+    the object if a channel differs from it by more than `tolerance` (0 .. 1). Holes are filled,
+    but for some with the colour of the background, such as the gaps between the rungs of a chair.
     """
     difference, noise = _differences(colors)
     found = difference > 255 * tolerance
@@ -173,11 +173,11 @@ def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarr
 def cut_out(colors: np.ndarray, box: Box | None = None, judge: Judge | None = None) -> np.ndarray:
     """The mask uint8 [H, W], 0 or 255, of the object within a box of a photograph.
 
-    colors: uint8 [H, W, 3]. Pixels outside the box are background (default box: all but a narrow border). GrabCut
-    starts with the pixels that are unlike the background at their height (`_separate`). If the result is much smaller
-    than that of a start with the whole box, that one is taken. Without a box the largest parts are tried, each in a
-    box of its own, and the `judge` decides. Raises ValueError without OpenCV, or if the box exceeds or fills the
-    picture.
+    colors: uint8 [H, W, 3]. Pixels outside the box are background (default box: all but a narrow
+    border). GrabCut starts with the pixels that are unlike the background at their height
+    (`_separate`). If the result is much smaller than that of a start with the whole box, that one
+    is taken. Without a box the largest parts are tried, each in a box of its own, and the `judge`
+    decides. Raises ValueError without OpenCV, or if the box exceeds or fills the picture.
     """
     height, width = colors.shape[:2]
     scale = min(1.0, SIDE / max(height, width))
@@ -244,8 +244,8 @@ def _offset(inside: np.ndarray) -> float:
 def _difference(colors: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Difference of each pixel, float [H, W], from the colours of the background, bool [H, W], at its height.
 
-    So wall, skirting board and floor are each compared with themselves. Below, the background may also be darker: a
-    shadow on the floor.
+    So wall, skirting board and floor are each compared with themselves. Below, the background may
+    also be darker: a shadow on the floor.
     """
     height, width = background.shape
     blurred = ndimage.gaussian_filter(colors.astype(np.float32) / 255, (0.8, 0.8, 0))
@@ -345,8 +345,8 @@ def _mark(colors: np.ndarray, inside: np.ndarray, judge: Judge | None) -> float:
 def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.ndarray:
     """A mask uint8 [H, W], 0 or 255, corrected by strokes uint8 [H, W].
 
-    Each pixel of the strokes is KEEP (as in the mask), OBJECT, BACKGROUND or OPEN (GrabCut decides). colors: uint8
-    [H, W, 3]. Raises ValueError without OpenCV.
+    Each pixel of the strokes is KEEP (as in the mask), OBJECT, BACKGROUND or OPEN (GrabCut
+    decides). colors: uint8 [H, W, 3]. Raises ValueError without OpenCV.
     """
     inside, unsure = (
         np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND)),

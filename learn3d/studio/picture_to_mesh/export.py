@@ -25,11 +25,11 @@ _UNUSED = {
 def export(source: Path, target: Path, *, which: str = "last", others: Tensor | None = None) -> int:
     """Write the encoder and generator of a run or checkpoint file in float16; returns the size in bytes.
 
-    The file is a checkpoint for `evaluate` and `reconstruct`, without the paths of the run. If the training data are
-    still there, it also holds known codes (see `familiarity`), with which reconstruction warns of unknown kinds of
-    objects, and `templates` if they have generated shapes. others: stored images uint8 [M, 4, S, S] of other objects,
-    which improve these warnings.
-    Raises ValueError for methods other than proposed, Vanilla-AE, Plus and Many views.
+    The file is a checkpoint for `evaluate` and `reconstruct`, without the paths of the run. If
+    the training data are still there, it also holds known codes (see `familiarity`), with which
+    reconstruction warns of unknown kinds of objects, and `templates` if they have generated
+    shapes. others: stored images uint8 [M, 4, S, S] of other objects, which improve these
+    warnings. Raises ValueError for methods other than proposed, Vanilla-AE, Plus and Many views.
     """
     method, config, metadata = checkpoint.load_method(source, which)
     config = dataclasses.replace(config, poses=None)

@@ -98,7 +98,8 @@ def known_codes(
 def learn_others(known: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     """`KnownCodes.hidden` and `.output` that tell normalised codes of training images [N, C] from others [M, C].
 
-    They are small networks with dropout, trained on all codes at once; both classes have the same total weight.
+    They are small networks with dropout, trained on all codes at once; both classes have the same
+    total weight.
     """
     codes = _SCALE * torch.cat([known, others])
     wanted = torch.cat([torch.zeros(len(known)), torch.ones(len(others))])

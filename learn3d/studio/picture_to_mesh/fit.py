@@ -1,7 +1,8 @@
 """Fits a predicted shape to the mask of a framed picture: the camera, the code, then the vertices.
 
-A picture is framed if the bounding box of its mask is centred and its object size is `CENTRED_SIZE`. Its camera is the
-view from which the silhouette of the predicted shape is most like the mask.
+A picture is framed if the bounding box of its mask is centred and its object size is
+`CENTRED_SIZE`. Its camera is the view from which the silhouette of the predicted shape is most
+like the mask.
 """
 
 from __future__ import annotations
@@ -114,9 +115,9 @@ def find_view(
 ) -> tuple[View, float]:
     """Find the view in which the silhouette of a shape [V, 3], [F, 3] is most like a framed mask [64, 64].
 
-    The best of a grid of views, with azimuths more than 20 degrees apart, are optimised. probabilities: float32
-    [AZIMUTHS], the probability of each azimuth cell from -180 degrees on; None if unknown. Returns the view and the
-    soft IoU of silhouette and mask.
+    The best of a grid of views, with azimuths more than 20 degrees apart, are optimised.
+    probabilities: float32 [AZIMUTHS], the probability of each azimuth cell from -180 degrees on;
+    None if unknown. Returns the view and the soft IoU of silhouette and mask.
     """
     azimuths = -180 + (torch.arange(AZIMUTHS) + 0.5) * (360 / AZIMUTHS)
     grid = torch.cartesian_prod(azimuths, torch.tensor(ELEVATIONS_DEG))

@@ -22,8 +22,9 @@ _SOLID = 0.2  # share of inner cells, up to which all cells that the object touc
 def inflate(picture: np.ndarray) -> tuple[Surface, View]:
     """A shape with the outline of a picture, mirror-symmetric about the picture's plane, and its view.
 
-    picture: R, G, B and mask, uint8 [4, S, S], framed as in `fit`. With u = 0 on the outline and Laplace(u) = -4
-    within, the surface is where z^2 = DEPTH^2 u, so that a disc becomes an ellipsoid. Both sides show the picture.
+    picture: R, G, B and mask, uint8 [4, S, S], framed as in `fit`. With u = 0 on the outline and
+    Laplace(u) = -4 within, the surface is where z^2 = DEPTH^2 u, so that a disc becomes an
+    ellipsoid. Both sides show the picture.
     """
     mask = torch.from_numpy(picture[3])[None, None].float()
     inside = torch.nn.functional.interpolate(mask, (CELLS, CELLS), mode="area")[0, 0].numpy() > 127

@@ -122,10 +122,11 @@ def reconstruct_files(
 ) -> list[Path]:
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
-    masks: a file for each image. Without them the object is searched in images without transparency, and in all of them
-    with a `box` (see `cutting`). refined, category, guesses: see `reconstruct_guesses`. Returns the files, named after
-    the images, with "-2" and so on for further guesses (see `save`). Raises ValueError if a mask is empty, or if a
-    result would replace an input file. A file that cannot be used is an error after all others are done.
+    masks: a file for each image. Without them the object is searched in images without
+    transparency, and in all of them with a `box` (see `cutting`). refined, category, guesses: see
+    `reconstruct_guesses`. Returns the files, named after the images, with "-2" and so on for
+    further guesses (see `save`). Raises ValueError if a mask is empty, or if a result would
+    replace an input file. A file that cannot be used is an error after all others are done.
     """
     names = check_files(folder, images, images, masks)
     model = load_model(run, which)
@@ -171,8 +172,8 @@ def reconstruct_object_files(
 ) -> list[Path]:
     """Reconstruct one object from several image files, and save the result in `folder` under the first one's name.
 
-    See `reconstruct_files` for the arguments, and `reconstruct_several` for the errors. A file that cannot be used is
-    left out with a line, as is a picture that does not fit the others.
+    See `reconstruct_files` for the arguments, and `reconstruct_several` for the errors. A file
+    that cannot be used is left out with a line, as is a picture that does not fit the others.
     """
     name = check_files(folder, images[:1], images, masks)[0]
     model = load_model(run, which)
@@ -228,8 +229,8 @@ def reconstruct_dataset(
 ) -> list[Path]:
     """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`.
 
-    refined: fit the shapes to the masks at the data set's poses; ValueError if it has none. Returns the files, named
-    after category, split and index (see `save`).
+    refined: fit the shapes to the masks at the data set's poses; ValueError if it has none.
+    Returns the files, named after category, split and index (see `save`).
     """
     require_folder(data)
     model = load_model(run, which)
@@ -265,7 +266,8 @@ def reconstruct(
 ) -> list[Surface]:
     """Shapes, in the object frame, of stored images uint8 [B,4,S,S], for example from `prepare_image`.
 
-    With masks float32 [B,64,64] and poses, the shapes are fitted to them; ValueError if the method predicts voxels.
+    With masks float32 [B,64,64] and poses, the shapes are fitted to them; ValueError if the
+    method predicts voxels.
     """
     images = torch.as_tensor(images)
     if poses is not None:
@@ -314,10 +316,11 @@ def prepare_image(
 ) -> np.ndarray:
     """Turn colours uint8 [H,W,3] and a mask uint8 [H,W] into a stored image uint8 [4,size,size] of a layout.
 
-    The background becomes white. crop: centre the object in a square, so that its larger side takes `object_size` of
-    it; without, the picture must be framed like that already and is only padded to a square and scaled. Colours are
-    inverted if the layout inverts them. Layouts with stretched images (Pascal3D+) keep the background, and `crop` cuts
-    out the mask's box as their reader does (`learn3d.data.framing`).
+    The background becomes white. crop: centre the object in a square, so that its larger side
+    takes `object_size` of it; without, the picture must be framed like that already and is only
+    padded to a square and scaled. Colours are inverted if the layout inverts them. Layouts with
+    stretched images (Pascal3D+) keep the background, and `crop` cuts out the mask's box as their
+    reader does (`learn3d.data.framing`).
 
     Raises ValueError if the mask has no pixel above half.
     """
@@ -402,7 +405,8 @@ def reconstruct_guesses(
 
     refined: fit camera, shape and colours to the picture; methods with voxels only predict.
     category: the object's, None if unknown. With a known one there is no warning.
-    guesses: largest number of different shapes, the best first; a model without templates makes one.
+    guesses: largest number of different shapes, the best first; a model without templates makes
+    one.
     progress: called with the name of each stage and the share that is done.
 
     Raises ValueError if the model was not trained on the category.
@@ -467,9 +471,10 @@ def reconstruct_several(
 ) -> SeveralPictures:
     """Reconstruct an object from 2 to 8 pictures uint8 [H, W, 3] with masks uint8 [H, W]; their cameras are unknown.
 
-    Of three pictures or more, those that show something else, or have a wrong outline, are left out.
-    category, progress: see `reconstruct_guesses`. Raises ValueError for another number of pictures, for an unknown
-    category, or if the model has no templates.
+    Of three pictures or more, those that show something else, or have a wrong outline, are left
+    out.
+    category, progress: see `reconstruct_guesses`. Raises ValueError for another number of
+    pictures, for an unknown category, or if the model has no templates.
     """
     if not 2 <= len(pictures) <= MOST_PICTURES:
         raise ValueError(
@@ -561,7 +566,8 @@ def input_azimuth_deg(
 ) -> float:
     """Azimuth, in degrees, from which the shape's silhouette fits the mask uint8 [S,S] of its image best.
 
-    A guess, since elevation and distance are unknown; 0 for an empty shape. probabilities: see `find_view`.
+    A guess, since elevation and distance are unknown; 0 for an empty shape. probabilities: see
+    `find_view`.
     """
     if not len(surface.faces):
         return 0.0
@@ -577,9 +583,10 @@ def export_mesh(path: Path, surface: Surface) -> None:
 def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
     """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed, normals outwards.
 
-    The object frame is left-handed, so the mesh is reflected and the order of each face reversed. A GLB has the texture
-    or else the vertex colours, OBJ and PLY only the vertex colours. `name` is the node's in a GLB, whose material is
-    double-sided: learnt surfaces cross themselves, and viewers would hide the faces that are seen from behind.
+    The object frame is left-handed, so the mesh is reflected and the order of each face reversed.
+    A GLB has the texture or else the vertex colours, OBJ and PLY only the vertex colours. `name`
+    is the node's in a GLB, whose material is double-sided: learnt surfaces cross themselves, and
+    viewers would hide the faces that are seen from behind.
     """
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)

@@ -1,7 +1,8 @@
 """One shape from several pictures of an object whose cameras are unknown.
 
-Generated shapes tell where the cameras stood. Then the object is carved out of a grid: a cell is kept if all outlines
-contain it, and likely shapes contain it or an outline needs it.
+The cameras are those from which a generated shape looks most like the pictures. Then the object
+is carved out of a grid: a cell is kept if all outlines contain it, and likely shapes contain it or
+an outline needs it.
 """
 
 from __future__ import annotations
@@ -184,7 +185,8 @@ def _look_around(
 def _choose_views(scores: Tensor) -> tuple[Tensor, Tensor]:
     """The best view of each of N pictures by scores [M, N], int64 [N], and the mean of their scores.
 
-    Who walks around an object holds the camera about equally high, so elevations that differ cost something.
+    Who walks around an object holds the camera about equally high, so elevations that differ cost
+    something.
     """
     levels = len(ELEVATIONS_DEG)
     if len(scores) != AZIMUTHS * levels:  # the views are known
@@ -204,7 +206,7 @@ def _guess(found: Candidates, view: View, mask: Tensor) -> Tensor:
 
 
 def _all_ious(views: View, vertices: Tensor, faces: Tensor, masks: Tensor) -> Tensor:
-    """IoU [M, N] of the silhouettes of a shape in M views and N masks."""
+    """IoU [M, N] of each of M silhouettes of a shape, one a view, and each of N masks."""
     drawn, wanted = views.silhouettes(vertices[None], faces).flatten(1), masks.flatten(1)
     both = drawn @ wanted.T
     return both / (drawn.sum(1, keepdim=True) + wanted.sum(1) - both).clamp(min=1e-6)

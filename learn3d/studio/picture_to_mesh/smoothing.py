@@ -35,8 +35,9 @@ def smooth(vertices: Tensor, faces: Tensor, rounds: int = 4) -> Tensor:
 def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Vertices and faces of the visible surface of a shape [V, 3], [F, 3], without folds and self-intersections.
 
-    It encloses the cells of a grid that cannot be reached from outside (`nmr.voxelize`). To keep thin parts whole, the
-    surface is first drawn too far outside, smoothed, and then moved inwards. Normals point outwards.
+    It encloses the cells of a grid that cannot be reached from outside (`nmr.voxelize`). To keep
+    thin parts whole, the surface is first drawn too far outside, smoothed, and then moved
+    inwards. Normals point outwards.
     """
     low, high = vertices.amin(0), vertices.amax(0)
     centre, side = (low + high) / 2, 1.1 * float((high - low).max())
@@ -52,7 +53,8 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Tensor]:
     """Divide a mesh [V, 3], [F, 3] until no edge is longer than `longest`. Closed meshes stay closed.
 
-    An edge is halved, and with it all its faces, if it is the longest of each of them (Rivara 1984).
+    An edge is halved, and with it all its faces, if it is the longest of each of them (Rivara
+    1984).
     """
     points, triangles = vertices.double().numpy(), faces.numpy()
     while True:

@@ -1,7 +1,7 @@
 """Templates: generated shapes. The one that fits a picture best is stretched and bent until its outline matches.
 
-A template has the thin legs, gaps and straight edges that a deformed sphere cannot have. A model knows the codes of its
-templates; the shapes themselves are made again from their numbers.
+A template has the thin legs, gaps and straight edges that a deformed sphere cannot have. A model
+knows the codes of its templates; the shapes themselves are made again from their numbers.
 """
 
 from __future__ import annotations
@@ -91,8 +91,9 @@ class Templates(NamedTuple):
 def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | None:
     """The templates of a training set; None if one of its categories has none.
 
-    They are the objects that `make-dataset --procedural` generates with the seed `SEED`. They are recognised by their
-    names, and by their voxels, which must be those of the shape with the number in the name.
+    They are the objects that `make-dataset --procedural` generates with the seed `SEED`. They are
+    recognised by their names, and by their voxels, which must be those of the shape with the
+    number in the name.
     """
     found = {
         category: [] for category in dataset.class_names or (dataset.category,)
@@ -186,9 +187,10 @@ def fit_template(
 ) -> Iterator[tuple[Fit, str]]:
     """Fit templates to a framed mask float32 [64, 64]: up to `guesses` different ones, the best first, with categories.
 
-    Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel IoU with the predicted
-    shape, and the cosine of the two codes. The best are stretched along the axes. Of these the best is bent, and those
-    whose voxel IoU with a better one is below `DIFFERENT`. category: see `find_candidates`.
+    Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel
+    IoU with the predicted shape, and the cosine of the two codes. The best are stretched along
+    the axes. Of these the best is bent, and those whose voxel IoU with a better one is below
+    `DIFFERENT`. category: see `find_candidates`.
     """
     progress("shape", 0.3)
     found = find_candidates(templates, categories, [predicted], category)
@@ -220,7 +222,7 @@ def fit_template(
 
 
 def _choose_different(voxels: list[Tensor], count: int) -> list[int]:
-    """Up to `count` of N shapes, of which each differs from all before it."""
+    """Up to `count` of N shapes. Each differs from all before it."""
     chosen = [0]
     for row in range(1, len(voxels)):
         alike = [float(nmr.metrics.voxel_iou(voxels[row], voxels[other])) for other in chosen]
@@ -236,8 +238,8 @@ def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
 def likeness(views: View, shapes: list[Tensor], faces: list[Tensor], masks: Tensor) -> Tensor:
     """How alike the outlines of N shapes and of masks are: their IoU less the distance of their edges, [N].
 
-    By the IoU alone a solid back is better than slats beside the true ones. masks: [64, 64], or [M, 64, 64] for N a
-    multiple of M, which are taken in turn.
+    By the IoU alone a solid back is better than slats beside the true ones. masks: [64, 64], or
+    [M, 64, 64] for N a multiple of M, which are taken in turn.
     """
     masks = masks.view(-1, *masks.shape[-2:])
     wanted = [_edges(mask) for mask in masks]
@@ -269,8 +271,8 @@ def stretch(
 ) -> tuple[View, list[Tensor], Tensor]:
     """Stretch N shapes along the three axes until they have the outlines of masks [64, 64] or [M, 64, 64].
 
-    views: N, or N M with those of the first shape first. held: puts known parts of the views in their place.
-    Returns the fitted views, the shapes, and how unequal the factors are, [N].
+    views: N, or N M with those of the first shape first. held: puts known parts of the views in
+    their place. Returns the fitted views, the shapes, and how unequal the factors are, [N].
     """
     copies = len(views.azimuth_deg) // len(shapes)
     wanted = masks if masks.dim() == 2 else masks.repeat(len(shapes), 1, 1)

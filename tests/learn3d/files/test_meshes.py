@@ -397,6 +397,7 @@ REFUSED = {
         "triangle strips",
     ),
     "web.off": ("<html></html>", "does not begin with OFF"),
+    "empty.gltf": ("{}", "it is glTF without a version"),
     "web.glb": ("<html></html>", "begins with neither glTF nor {"),
     "web.ply": ("<html></html>", "does not begin with the line `ply`"),
     "corner.off": (
@@ -428,7 +429,7 @@ def test_a_missing_package_is_named(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_off_files_need_no_lines(tmp_path: Path) -> None:
-    (tmp_path / "a.off").write_text("OFF 4 2 0 0 0 0 1 0 0 1 1 0\n0 1 0 3 0 1 2\n3 0 2 3")
+    (tmp_path / "a.off").write_text("off 4 2 0 0 0 0 1 0 0 1 1 0\n0 1 0 3 0 1 2\n3 0 2 3")
     mesh = read_mesh(tmp_path / "a.off")
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
     assert mesh.vertices[2].tolist() == [1, 1, 0]

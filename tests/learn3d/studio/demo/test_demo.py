@@ -120,6 +120,9 @@ def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> Non
     assert np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)).sum() == 8 * 120
     asked = "Is this the object? Its outline touches 2 sides of the picture. Draw a box around it (Box)."
     assert error == {"error": asked}
+    picture = pictures.Picture(colors, unknown)
+    pictures.make_meshes(models, [picture, picture], sent.append)
+    assert sent[-1] == {"error": asked.replace("object?", "object in picture 1?")}
 
 
 def test_the_side_of_the_input_is_found() -> None:
