@@ -43,10 +43,8 @@ def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     both = (target > 0) & (depth.detach() < 2 * target)
     error = (depth - target) * both
     rows, columns = both[:, 2:] & both[:, :-2], both[:, :, 2:] & both[:, :, :-2]
-    down, right = (
-        (error[:, 2:] - error[:, :-2]).abs() * rows,
-        (error[:, :, 2:] - error[:, :, :-2]).abs() * columns,
-    )
+    down = (error[:, 2:] - error[:, :-2]).abs() * rows
+    right = (error[:, :, 2:] - error[:, :, :-2]).abs() * columns
     counts = torch.stack([pixels.sum().float() for pixels in (both, rows, columns)])
     all_pixels, in_rows, in_columns = all_reduce_mean(counts).clamp(min=1)
     return error.abs().sum() / all_pixels, down.sum() / in_rows + right.sum() / in_columns
@@ -90,10 +88,8 @@ def silhouette_energy_distance(silhouettes: Tensor, masks: Tensor) -> Tensor:
 
     silhouettes: float [N,D], N >= 2, differentiable; masks: float [M,D], M >= 1.
     """
-    across, within = (
-        _tanimoto_distances(silhouettes, masks),
-        _tanimoto_distances(silhouettes, silhouettes),
-    )
+    across = _tanimoto_distances(silhouettes, masks)
+    within = _tanimoto_distances(silhouettes, silhouettes)
     pairs = len(silhouettes) * (len(silhouettes) - 1)
     return 2 * across.mean() - (within.sum() - within.diagonal().sum()) / pairs
 

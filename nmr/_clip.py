@@ -75,10 +75,8 @@ def clip_near(
         *mesh[:3], plane, new_starts, sum(num_new), sum(num_drawn)
     )
     share, new = _new_vertices(world, mesh, camera, plane, ends[:, :2], new_starts)
-    own, own_counts = (
-        mesh.each_vertices(),
-        mesh.vertex_counts or (mesh.vertices.shape[-2],) * mesh.batch,
-    )
+    own = mesh.each_vertices()
+    own_counts = mesh.vertex_counts or (mesh.vertices.shape[-2],) * mesh.batch
     vertices = torch.cat([x for pair in zip(own, new.split(num_new), strict=True) for x in pair])
     vertex_counts = tuple(v + n for v, n in zip(own_counts, num_new, strict=True))
     drawn = MeshBatch(
@@ -112,9 +110,8 @@ def _new_vertices(
     starts: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The new vertices between two rows of the vertices: how far from the first ``[P, 1]``, and in renderer space."""
-    if (
-        camera is None
-    ):  # the perspective image (x, y, z) of a point is linear in space as (x z, y z, z)
+    # the perspective image (x, y, z) of a point is linear in space as (x z, y z, z)
+    if camera is None:
         ends = F.embedding(rows, mesh.vertices.reshape(-1, 3))
         finite = _moderate(ends).view(-1, 1, 1)
         ends = torch.where(finite, ends, torch.zeros_like(ends))  # no gradient is 0 * inf

@@ -179,10 +179,8 @@ def pack_meshes(vertices: object, faces: object) -> MeshBatch:
         )
     if len(vertices) == 1:
         return MeshBatch(vertices[0].unsqueeze(0), faces[0])
-    vertex_counts, face_counts = (
-        tuple(len(part) for part in vertices),
-        tuple(len(part) for part in faces),
-    )
+    vertex_counts = tuple(len(part) for part in vertices)
+    face_counts = tuple(len(part) for part in faces)
     starts = packed_starts(vertex_counts, face_counts)
     return MeshBatch(
         torch.cat(tuple(vertices)), torch.cat(faces), starts, vertex_counts, face_counts

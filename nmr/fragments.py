@@ -121,11 +121,9 @@ class Fragments:
 
     def _wide(self) -> Fragments:
         """All layers side by side, as one raster ``[B, H, W K]``."""
-        index, weights, depth = (
-            self.sided_face_index.flatten(2),
-            self.weights.flatten(2, 3),
-            self.depth.flatten(2),
-        )
+        index = self.sided_face_index.flatten(2)
+        weights = self.weights.flatten(2, 3)
+        depth = self.depth.flatten(2)
         return replace(self, sided_face_index=index, weights=weights, depth=depth)
 
     def _each_layer(self, raster: Tensor) -> Tensor:
@@ -257,10 +255,8 @@ class Fragments:
             number = torch.arange(count, dtype=torch.int32, device=own.device)
             index = number.view(1, *own.shape[1:3]) + count * self.is_back
             index = torch.where(self.covered, index, -1).int()
-            faces, weights = (
-                number.long().view(-1, 1).expand(-1, 3),
-                own.new_tensor([1.0, 0.0, 0.0]).expand_as(own),
-            )
+            faces = number.long().view(-1, 1).expand(-1, 3)
+            weights = own.new_tensor([1.0, 0.0, 0.0]).expand_as(own)
             at = viewer, points.flatten(1, 2), faces, index, weights, None, True
             return ops.lit(colors, -own.flatten(1, 2), parameters, layout, *at)
         world = self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world

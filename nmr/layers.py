@@ -115,10 +115,8 @@ def render_soft(
     )
     dtype, layers = scene.mesh.vertices.dtype, check_size(faces_per_pixel, "faces_per_pixel", 1024)
     sigma, gamma = as_positive(sigma, "sigma", dtype), as_positive(gamma, "gamma", dtype)
-    reach, least = (
-        math.log(1 / check_dist_eps(dist_eps) - 1),
-        check_number(background_eps, "background_eps"),
-    )
+    reach = math.log(1 / check_dist_eps(dist_eps) - 1)
+    least = check_number(background_eps, "background_eps")
     fragments = scene.soft_fragments(layers, sigma, reach)
     image, behind = shade(fragments, colors, lights, background, True)
     rgb, alpha = _blend(fragments, image, behind, sigma, gamma, least, float(near), float(far))

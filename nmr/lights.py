@@ -170,10 +170,8 @@ class Lights:
                 continue
             counts = {_rows(getattr(self, name), name).shape[1] for name in group} - {1}
             if len(counts) > 1:
-                names, shapes = (
-                    ", ".join(group),
-                    ", ".join(describe(getattr(self, name)) for name in group),
-                )
+                names = ", ".join(group)
+                shapes = ", ".join(describe(getattr(self, name)) for name in group)
                 raise ValueError(
                     f"{names} must have the same number of lights (or one light), got {shapes}"
                 )

@@ -684,10 +684,8 @@ def render_fragments(
     scene = make_scene(
         vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
     )
-    layers, blur_radius = (
-        check_size(faces_per_pixel, "faces_per_pixel", 1024),
-        check_number(blur_radius, "blur_radius"),
-    )
+    layers = check_size(faces_per_pixel, "faces_per_pixel", 1024)
+    blur_radius = check_number(blur_radius, "blur_radius")
     if not 0 <= blur_radius < float("inf"):
         raise ValueError(f"blur_radius must be 0 or more and finite, got {blur_radius}")
     if blur_radius > 0:

@@ -236,9 +236,8 @@ class UVTexture:
 
     def sample(self, fragments: Fragments) -> Tensor:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
-        if (
-            fragments.layers and self.filter == "mipmap"
-        ):  # the level depends on the place of a pixel in the image
+        # the level depends on the place of a pixel in the image
+        if fragments.layers and self.filter == "mipmap":
             return torch.stack(
                 [self.sample(fragments.layer(k)) for k in range(fragments.layers)], dim=3
             )

@@ -137,9 +137,8 @@ def test_from_softras_draws_silhouettes_and_colours():
 def test_pages_run_and_what_they_name_exists(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tested_elsewhere = ("README.md", "contributing.md", "what-for.md")
-    if (
-        page.name not in tested_elsewhere and page not in MIGRATING.values()
-    ):  # above, and in learn3d/methods/test_development.py
+    # above, and in learn3d/methods/test_development.py
+    if page.name not in tested_elsewhere and page not in MIGRATING.values():
         run(page)
     text = page.read_text()
     named = re.findall(

@@ -84,10 +84,8 @@ def test_draw_gradients(tmp_path):
     moved = run("draw_gradients", tmp_path, "--image-size", "64")
     assert moved["nmr"] > 2 * moved["local"] > 100 and moved["none"] == 0
     panels = np.split(imageio.imread(tmp_path / "gradients.png").astype(int), 5, axis=1)
-    orange, blue = (
-        (panels[3][..., 0] - panels[3][..., 2] > 60),
-        (panels[3][..., 2] - panels[3][..., 0] > 60),
-    )
+    orange = panels[3][..., 0] - panels[3][..., 2] > 60
+    blue = panels[3][..., 2] - panels[3][..., 0] > 60
     assert orange.sum() > 10 and blue.sum() < orange.sum()
 
 

@@ -40,14 +40,10 @@ class Scene(NamedTuple):
         height, width = self.mask.shape
         wide, high = right - left, bottom - top
         shares = rng.uniform(0.01, 0.05, 4)
-        left, right = (
-            max(1, round(left - shares[0] * wide)),
-            min(width - 1, round(right + shares[1] * wide)),
-        )
-        top, bottom = (
-            max(1, round(top - shares[2] * high)),
-            min(height - 1, round(bottom + shares[3] * high)),
-        )
+        left = max(1, round(left - shares[0] * wide))
+        right = min(width - 1, round(right + shares[1] * wide))
+        top = max(1, round(top - shares[2] * high))
+        bottom = min(height - 1, round(bottom + shares[3] * high))
         return left, top, right - left, bottom - top
 
 

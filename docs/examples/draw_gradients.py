@@ -27,11 +27,9 @@ def pulls(grad: Tensor) -> Tensor:
     """Colours of vertices: orange if descent moves one to the right, blue if to the left, white if it stays."""
     step = -grad[:, 0] / grad[:, 0].abs().max().clamp_min(1e-12)
     step = step.sign() * step.abs() ** 0.4
-    white, orange, blue = (
-        torch.ones(3),
-        torch.tensor([0.9, 0.35, 0.0]),
-        torch.tensor([0.0, 0.3, 0.85]),
-    )
+    white = torch.ones(3)
+    orange = torch.tensor([0.9, 0.35, 0.0])
+    blue = torch.tensor([0.0, 0.3, 0.85])
     return (
         white
         + step.clamp_min(0)[:, None] * (orange - white)

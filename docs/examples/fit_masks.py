@@ -74,10 +74,8 @@ def main(
         make_folder(folder := output / "masks")
     masks, camera = read_folder(folder)
     mesh = trimesh.load(start, force="mesh") if start else trimesh.creation.torus(0.3, 0.1)
-    shape, faces = (
-        torch.tensor(mesh.vertices, dtype=torch.float32).requires_grad_(),
-        torch.tensor(mesh.faces),
-    )
+    shape = torch.tensor(mesh.vertices, dtype=torch.float32).requires_grad_()
+    faces = torch.tensor(mesh.faces)
     edges, optimizer = nmr.edge_table(faces), torch.optim.Adam([shape], lr=0.01)
     for _ in range(steps + 1):
         images = nmr.render_silhouette(shape, faces, camera, image_size=tuple(masks.shape[1:]))

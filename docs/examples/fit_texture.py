@@ -62,10 +62,8 @@ def main(
             vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=size
         )
 
-    azimuths, elevations = (
-        [360 / views * k for k in range(views)],
-        [(5.0, 40.0)[k % 2] for k in range(views)],
-    )
+    azimuths = [360 / views * k for k in range(views)]
+    elevations = [(5.0, 40.0)[k % 2] for k in range(views)]
     truth = painting(3 * size // 4, 2 * size)
     pictures = photograph(truth, elevations, azimuths)
     unseen = [20.0] * 4, [60.0, 150.0, 240.0, 330.0]

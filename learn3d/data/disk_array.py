@@ -64,10 +64,8 @@ class DiskArray:
 
     def __getitem__(self, samples: np.ndarray) -> np.ndarray:
         file_of, row_of, crc_of = (self.rows[samples][name] for name in ROW.names)
-        result, size = (
-            np.empty((len(row_of), *self.row_shape), self.dtype),
-            math.prod(self.row_shape),
-        )
+        result = np.empty((len(row_of), *self.row_shape), self.dtype)
+        size = math.prod(self.row_shape)
         content = result.reshape(len(row_of), size).view(np.uint8)
         for number, samples_of_file in itertools.groupby(
             np.lexsort((row_of, file_of)), key=file_of.__getitem__
@@ -81,9 +79,8 @@ class DiskArray:
                             raise OSError("it ends early")
                         if zlib.crc32(content[k]) != crc_of[k]:
                             raise ValueError(CHANGED)
-                        if (
-                            self.dtype == np.bool_ and content[k].max() > 1
-                        ):  # such bools compute wrongly
+                        # such bools compute wrongly
+                        if self.dtype == np.bool_ and content[k].max() > 1:
                             raise ValueError("its bools have values other than 0 and 1")
                         if self.dtype.kind == "f" and not np.isfinite(result[k]).all():
                             raise ValueError("it has numbers that are not finite")

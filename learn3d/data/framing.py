@@ -22,11 +22,8 @@ from learn3d.files.renderings import PHOTOGRAPHS, open_image, shrink
 MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 PADDING = 0.15  # padding of a crop on each side, over the side of the box
 JITTER = 0.15  # largest shift of each side of a crop in training, over the side of the box
-# shifts of the smallest crop (the box) and of the largest
-SMALLEST, LARGEST = (
-    np.full(4, -1.0),
-    np.ones(4),
-)
+SMALLEST = np.full(4, -1.0)  # shifts of the smallest crop, the box
+LARGEST = np.ones(4)  # and of the largest
 
 
 def read_photo(

@@ -189,10 +189,8 @@ def check_folder(
             try:
                 _read_split(layout, folder, category, split, findings)
             except (ValueError, OSError) as error:
-                path, message = (
-                    getattr(error, "path", folder),
-                    getattr(error, "message", str(error)),
-                )
+                path = getattr(error, "path", folder)
+                message = getattr(error, "message", str(error))
                 findings.problems.append(Problem(str(path), message))
             reports.append(
                 SplitReport(

@@ -38,9 +38,8 @@ class _PoseSet:
         joined = {}
         for name in vars(parts[0]):
             values = [getattr(part, name) for part in parts]
-            if (
-                any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1
-            ):  # else one number for all
+            # else one number for all
+            if any(isinstance(v, Tensor) for v in values) or len(set(values)) > 1:
                 tensors = [torch.as_tensor(v, dtype=torch.float32) for v in values]
                 values = [
                     torch.cat(

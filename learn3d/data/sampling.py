@@ -111,10 +111,8 @@ def _grouped_views(dataset: ViewDataset, by_class: bool) -> tuple[np.ndarray, np
     """Samples int64 [M] sorted by object or category, after the positions int64 at which each starts, and M."""
     ids, count = dataset.object_ids, dataset.num_objects
     if by_class:
-        ids, count = (
-            np.zeros_like(ids) if dataset.class_ids is None else dataset.class_ids[ids],
-            dataset.num_classes,
-        )
+        ids = np.zeros_like(ids) if dataset.class_ids is None else dataset.class_ids[ids]
+        count = dataset.num_classes
     order = np.argsort(ids, kind="stable")
     return np.searchsorted(ids[order], np.arange(count + 1)), order
 
@@ -138,13 +136,15 @@ def augment(
     """The batch with the named augmentations, in this order, each drawn independently for every sample.
 
     "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato
-    and Harada 2019). "flip-image": only the colours mirrored (published code of both papers on
-    Pascal3D+, whose meshes are symmetric). "channels": a random permutation of the three colour
-    channels. "colors": a random permutation, each channel times a random factor in 0.7 .. 1.3,
-    and in 30 % of the images times 0. It acts on 255 - colour, so that white stays white;
-    `inverted`: images are stored as 255 - colour. It is not meant for encoders that ignore the
-    mask. "crop": the colours cropped anew from the original image, each side of the padded box
-    moved by up to 15 % of the box (Pascal3D+, both papers). It must come first.
+    and Harada 2019).
+    "flip-image": only the colours mirrored (published code of both papers on Pascal3D+, whose
+    meshes are symmetric).
+    "channels": a random permutation of the three colour channels.
+    "colors": a random permutation, each channel times a random factor in 0.7 .. 1.3, and in 30 %
+    of the images times 0. It acts on 255 - colour, so that white stays white; `inverted`: images
+    are stored as 255 - colour. It is not meant for encoders that ignore the mask.
+    "crop": the colours cropped anew from the original image, each side of the padded box moved by
+    up to 15 % of the box (Pascal3D+, both papers). It must come first.
 
     count, rows: the batch has these rows of a batch of `count`, for which all random numbers are
     drawn.

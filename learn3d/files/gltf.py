@@ -112,10 +112,8 @@ class _Accessors:
     def read(self, number: int) -> np.ndarray:
         """Accessor `number` as [count, components]; float64 for floats and normalised integers."""
         accessor = self.tree["accessors"][_index(number)]
-        kind, shape = (
-            _COMPONENTS[accessor["componentType"]],
-            (accessor["count"], _WIDTHS[accessor["type"]]),
-        )
+        kind = _COMPONENTS[accessor["componentType"]]
+        shape = (accessor["count"], _WIDTHS[accessor["type"]])
         sparse = accessor.get("sparse")
         if "bufferView" in accessor:
             values = self._view(accessor["bufferView"], accessor.get("byteOffset", 0), kind, shape)

@@ -51,9 +51,8 @@ def _read(archive: zipfile.ZipFile, key: str, max_bytes: int | None) -> np.ndarr
     while piece := file.read(2**20):  # zipfile stops at the size, and compares the checksum
         content += piece
     array = np.ndarray(shape, dtype, content, order="F" if fortran else "C")
-    if (
-        dtype.kind == "b" and array.view(np.uint8).max(initial=0) > 1
-    ):  # NumPy and torch compute wrong results with them
+    # NumPy and torch compute wrong results with them
+    if dtype.kind == "b" and array.view(np.uint8).max(initial=0) > 1:
         raise ValueError(f"the bools of {key!r} have values other than 0 and 1")
     return array
 
@@ -72,9 +71,8 @@ def read_ragged(path: Path, key: str, wanted: str) -> list[np.ndarray]:
             if type(item) is not np.ndarray or item.dtype != np.uint8
         ]:
             raise ValueError(f"{key}[{wrong[0]}] must be an array of uint8")
-        if (
-            sum(item.nbytes for item in items) > size
-        ):  # the pickle refers to the same array many times
+        # the pickle refers to the same array many times
+        if sum(item.nbytes for item in items) > size:
             raise ValueError(f"the arrays of {key!r} take more bytes than the file has")
         return list(items)
 

@@ -38,9 +38,8 @@ def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[P
         if sync:
             _sync(path.parent)
     except OSError as error:
-        if (
-            error.errno is not None and error.filename is None
-        ):  # the error for a full disk has no file name
+        # the error for a full disk has no file name
+        if error.errno is not None and error.filename is None:
             error.filename = str(path)
         raise
     finally:

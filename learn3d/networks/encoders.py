@@ -120,10 +120,8 @@ def centre(images: Tensor, object_size: float = CENTRED_SIZE) -> Tensor:
     for axis in (1, 2):
         touched = inside.any(axis)
         # `last` is excluded
-        first, last = (
-            touched.int().argmax(1),
-            size - touched.flip(1).int().argmax(1),
-        )
+        first = touched.int().argmax(1)
+        last = size - touched.flip(1).int().argmax(1)
         extents.append(last - first)
         middles.append((first + last) / size - 1)
     scale = torch.maximum(*extents) / (size * object_size)

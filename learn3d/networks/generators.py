@@ -41,10 +41,8 @@ class MeshGenerator(nn.Module):
         if symmetry not in (None, "z"):
             angle = math.radians(0.0 if symmetry == "x" else symmetry)
             # exact for quarter turns
-            sine, cosine = (
-                round(math.sin(angle), 12),
-                round(math.cos(angle), 12),
-            )
+            sine = round(math.sin(angle), 12)
+            cosine = round(math.cos(angle), 12)
             # The x axis is turned towards the eye, in direction (sin a, -cos a) of (x, z).
             tables["rotation"] = torch.tensor(
                 [[sine, 0.0, -cosine], [0.0, 1.0, 0.0], [cosine, 0.0, sine]]

@@ -36,9 +36,8 @@ class DoublingConvolution(nn.ConvTranspose3d):
         super().__init__(before, after, 4, stride=2, padding=1)
 
     def forward(self, features: Tensor) -> Tensor:
-        if (
-            self.out_channels == 1 and features.device.type == "cpu"
-        ):  # torch takes four times as long
+        # torch takes four times as long
+        if self.out_channels == 1 and features.device.type == "cpu":
             return _Double.apply(features, self.weight, self.bias)
         return super().forward(features)
 

@@ -70,8 +70,8 @@ class EstimatePoses(Command):
     """Estimate the pose of each image of a data set from the masks alone, for `learn3d train --poses`.
 
     Examples:
-      learn3d estimate-poses photos --layout photos --category mug --elevation 20 --output
-      mug-poses.npz learn3d estimate-poses DATA --category airplane --output poses.npz --compare
+      learn3d estimate-poses photos --layout photos --category mug --elevation 20 --output mug.npz
+      learn3d estimate-poses DATA --category airplane --output poses.npz --compare
 
     It also writes a sheet (poses.png). Look at it: all images below an azimuth must show the
     object from there. Azimuth 0 is a side that the estimate chooses.
@@ -119,12 +119,12 @@ class Experiment(Request, Command):
     """Make a table of the paper: train its runs, measure them, and report the paper's values beside ours.
 
     Examples:
-      learn3d experiment --list learn3d experiment kato --data DATA --output OUTPUT --category
-      airplane,chair --iterations 5000 --jobs 2 learn3d experiment ablation --data DATA --output
-      OUTPUT --category chair --set precision=fp32 learn3d experiment mmd --data DATA --output
-      OUTPUT --category airplane,chair --iterations 5000 --report-only
+      learn3d experiment --list
+      learn3d experiment kato --data DATA --output OUT --category airplane,chair --jobs 2
+      learn3d experiment ablation --data DATA --output OUT --category chair --set precision=fp32
+      learn3d experiment mmd --data DATA --output OUT --category airplane,chair --report-only
 
-    Tables share their runs in OUTPUT/runs/<category>/<method>-seed<k>, with those that `learn3d
+    Tables share their runs in OUT/runs/<category>/<method>-seed<k>, with those that `learn3d
     train` made there: complete runs are skipped, interrupted ones continue. Ctrl-C stops all of
     them; the same command continues.
     """

@@ -335,10 +335,8 @@ def from_pytorch3d(
     >>> camera.transform(torch.tensor([[[0.5, 0.25, 0.0]]])).tolist()  # +1 is the right border here, the left one there
     [[[-0.5, 0.25, 2.0]]]
     """
-    R, T = (
-        batched(as_parameter(R, "R", 3, 3), torch.float64, 3, 3),
-        batched(as_parameter(T, "T", 3), torch.float64, 3, 1),
-    )
+    R = batched(as_parameter(R, "R", 3, 3), torch.float64, 3, 3)
+    T = batched(as_parameter(T, "T", 3), torch.float64, 3, 1)
     batch = common_batch(R=R, T=T)
     matrix = torch.cat([R.transpose(1, 2).expand(batch, 3, 3), T.expand(batch, 3, 1)], dim=-1)
     focal, centre = _pairs(focal_length, "focal_length"), _pairs(principal_point, "principal_point")

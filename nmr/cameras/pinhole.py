@@ -92,11 +92,9 @@ class Pinhole(ProjectingCamera):
         )
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        K, R, t = (
-            batched(self.K, torch.float64, 3, 3),
-            batched(self.R, dtype, 3, 3),
-            batched(self.t, dtype, 3, 1),
-        )
+        K = batched(self.K, torch.float64, 3, 3)
+        R = batched(self.R, dtype, 3, 3)
+        t = batched(self.t, dtype, 3, 1)
         batch = common_batch(R=R, t=t)
         matrix = torch.cat([R.expand(batch, 3, 3), t.expand(batch, 3, 1)], dim=-1)
         height, width = self.orig_size

@@ -97,10 +97,8 @@ class ProjectingCamera:
         """
         vertices, meshes = _check_batch(vertices, starts)
         rows, distortion, perspective = self._rows(vertices.dtype)
-        rows, distortion = (
-            rows.to(vertices),
-            None if distortion is None else distortion.to(vertices),
-        )
+        rows = rows.to(vertices)
+        distortion = None if distortion is None else distortion.to(vertices)
         batch = len(rows) if distortion is None or len(distortion) == 1 else len(distortion)
         if batch != meshes and batch != 1 and (meshes != 1 or starts is not None):
             raise ValueError(
@@ -213,10 +211,8 @@ class Projection(ProjectingCamera):
         )
         origin = matrix.new_zeros(1, 3) if origin is None else origin
         extent = matrix.new_ones(1) if extent is None else extent
-        parts, batch = (
-            (matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)),
-            self.batch,
-        )
+        parts = (matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1))
+        batch = self.batch
         rows = torch.cat(
             [part if len(part) == batch else part.expand(batch, -1) for part in parts], dim=1
         )

@@ -32,11 +32,9 @@ class _Cubes:
     def sample(self, fragments: Fragments) -> Tensor:
         if self.textures is None:
             raise ValueError("RGB images need textures [B, F, ts, ts, ts, 3], got None")
-        face_index, weights, batch = (
-            fragments.sided_face_index,
-            fragments.weights,
-            fragments.mesh.batch,
-        )
+        face_index = fragments.sided_face_index
+        weights = fragments.weights
+        batch = fragments.mesh.batch
         textures = check_textures(self.textures, batch, fragments.faces.shape[-2]).to(weights)
         colors = ops.texture_cubes(textures, face_index, weights, None, fragments.eps)
         if self.light is None:

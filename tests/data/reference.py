@@ -346,10 +346,8 @@ def _one_pixel_moves(
     """d loss / d (coordinate along the rows) of the point seen in each pixel, ``[H, W]``."""
     per_pixel = image.shape[1] / 2
     step = image[:, 1:] - image[:, :-1]
-    right, left = (
-        (step * grad[:, 1:]).sum(-1) * per_pixel,
-        -(step * grad[:, :-1]).sum(-1) * per_pixel,
-    )
+    right = (step * grad[:, 1:]).sum(-1) * per_pixel
+    left = -(step * grad[:, :-1]).sum(-1) * per_pixel
     none = torch.zeros_like(image[:, :1, 0])
     # sums over both pairs of a pixel
     right, left = (

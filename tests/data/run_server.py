@@ -131,9 +131,8 @@ def _watch(folder: str, kill_at: int | None, half: bool) -> list[int]:
             return
         count[0] += 1
         if count[0] == kill_at:
-            if (
-                half and event == "os.rename" and os.stat(arguments[0]).st_nlink == 1
-            ):  # not a second name of a file
+            # not a second name of a file
+            if half and event == "os.rename" and os.stat(arguments[0]).st_nlink == 1:
                 os.truncate(arguments[0], os.stat(arguments[0]).st_size // 2)
             os.kill(os.getpid(), signal.SIGKILL)
 

@@ -136,11 +136,9 @@ def write_kar(folder: Path, lists: dict[str, list[str]], size: int = 224):
         root = folder / "renders" / CHAIR / name
         rows = []
         for k in range(20):
-            azimuth, elevation, distance = (
-                rng.uniform(-180, 180),
-                rng.uniform(-20, 40),
-                rng.uniform(1.9, 2.3),
-            )
+            azimuth = rng.uniform(-180, 180)
+            elevation = rng.uniform(-20, 40)
+            distance = rng.uniform(1.9, 2.3)
             eye = nmr_eye(azimuth, elevation, distance)
             right = unit(np.cross(UP, -eye))  # a left-handed frame
             shown = draw(swap_frames(eye), swap_frames(right), 16 / 60, size, boxes)

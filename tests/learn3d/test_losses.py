@@ -114,10 +114,8 @@ def test_mmd_vectors() -> None:
     case = {
         k: torch.from_numpy(v) for k, v in load_vector("loss_mmd").items() if v.dtype.kind == "f"
     }
-    source, target = (
-        case["source"].clone().requires_grad_(),
-        case["target"].clone().requires_grad_(),
-    )
+    source = case["source"].clone().requires_grad_()
+    target = case["target"].clone().requires_grad_()
     value = mmd(
         *(
             squared_distances(*pair)

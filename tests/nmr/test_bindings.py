@@ -29,10 +29,8 @@ CALLS = {
 }
 NUMBERS = dict(near=0.1, far=100.0, eps=1e-4, fill_back=True, perspective=True, anti_aliasing=True)
 NUMBERS |= dict(local=False, true=True, touched=True)
-RASTER, SMOOTHNESS = (
-    ("rasterize", "silhouette_backward", "local"),
-    ("smoothness", "smoothness_backward"),
-)
+RASTER = ("rasterize", "silhouette_backward", "local")
+SMOOTHNESS = ("smoothness", "smoothness_backward")
 IOU = ("soft_iou_loss", "soft_iou_loss_backward")
 
 

@@ -196,10 +196,8 @@ def test_packed_is_one_by_one(name, one_camera):
     eye_sum = torch.zeros_like(eye)
     for b, mesh in enumerate(meshes):
         rows = slice(first[b], first[b + 1])
-        alone, own_eye = (
-            mesh.clone().requires_grad_(),
-            eye[0 if one_camera else b].detach().clone().requires_grad_(),
-        )
+        alone = mesh.clone().requires_grad_()
+        own_eye = eye[0 if one_camera else b].detach().clone().requires_grad_()
         out = camera(own_eye).transform(alone)
         out.backward(upstream[None, rows])
         assert torch.equal(out[0], packed[rows]) and torch.equal(alone.grad, vertices.grad[rows])
@@ -404,10 +402,8 @@ EYE, K = [0.0, 0.0, -2.0], torch.eye(3)
 def test_tensors_in_lists_keep_their_gradient():
     """torch.as_tensor([tensor, 0.0]) would cut them off without a word."""
     points = torch.rand(2, 3, 3, dtype=torch.float64)
-    x, z = (
-        torch.tensor(0.3, requires_grad=True),
-        torch.tensor(-2.0, dtype=torch.float64, requires_grad=True),
-    )
+    x = torch.tensor(0.3, requires_grad=True)
+    z = torch.tensor(-2.0, dtype=torch.float64, requires_grad=True)
     eye = torch.tensor(
         [[0.3, 0.0, -2.0], [0.0, 1.0, -2.0]], dtype=torch.float64, requires_grad=True
     )

@@ -103,10 +103,8 @@ def test_a_room_from_inside():
 
 def test_one_face_is_drawn_as_its_part_in_front():
     # Cut by hand, with the same gradient by the chain rule.
-    vertices, faces = (
-        torch.tensor([[-1.0, -1.0, 4.0], [3.0, -0.5, -2.0], [0.5, 1.0, 3.0]]),
-        torch.tensor([[0, 1, 2]]),
-    )
+    vertices = torch.tensor([[-1.0, -1.0, 4.0], [3.0, -0.5, -2.0], [0.5, 1.0, 3.0]])
+    faces = torch.tensor([[0, 1, 2]])
     vertices, near = vertices.double().requires_grad_(), 0.5
     eye = nmr.LookAt([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], half_fov_deg=40.0)
     a, b, c = vertices

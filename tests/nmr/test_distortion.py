@@ -92,10 +92,8 @@ def test_the_reach_is_where_the_formula_turns(dtype) -> None:
 @pytest.mark.parametrize("name", MODELS)
 def test_gradients_are_finite_differences(name) -> None:
     torch.manual_seed(0)
-    inner, outer = (
-        torch.rand(1, 20, 3, dtype=torch.float64) - 0.5,
-        8 * torch.randn(1, 20, 3, dtype=torch.float64),
-    )
+    inner = torch.rand(1, 20, 3, dtype=torch.float64) - 0.5
+    outer = 8 * torch.randn(1, 20, 3, dtype=torch.float64)
     inner[..., 2], outer[..., 2] = 1.0, 1.0
     inner[0, 0, :2] = 0.0
     coefficients = torch.tensor(MODELS[name], dtype=torch.float64, requires_grad=True)
@@ -179,9 +177,8 @@ def test_gradients_of_pictures_are_finite_differences(name) -> None:
         torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(1))
         for x in leaves
     ]
-    if (
-        name != "fisheye"
-    ):  # what lies beyond the reach of the others has no gradient to the coefficients
+    # what lies beyond the reach of the others has no gradient to the coefficients
+    if name != "fisheye":
         directions[1].zero_()
     steps = [
         [x + sign * 1e-8 * d for x, d in zip((wall, lens), directions, strict=True)]

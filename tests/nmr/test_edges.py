@@ -89,10 +89,8 @@ def test_background_is_the_colour_of_pixels_without_a_face(threads, per_image):
     """The same as an image that holds it, in values and gradients; the gradient has the same bits for any threads."""
     vertices, faces = random_soup(0)
     face_index = face_index_of(vertices, faces, 20)
-    image, behind = (
-        random_image(face_index, 3),
-        torch.rand(2 if per_image else 1, 3, dtype=torch.float64),
-    )
+    image = random_image(face_index, 3)
+    behind = torch.rand(2 if per_image else 1, 3, dtype=torch.float64)
     upstream = torch.randn(
         2, 10, 10, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )

@@ -177,10 +177,8 @@ def test_a_list_has_the_bits_of_each_mesh(name, eyes):
 @pytest.mark.parametrize("batch, size", [(4, 24), (2, (150, 90))])
 def test_a_batch_has_the_bits_of_each_mesh_with_any_number_of_threads(name, batch, size):
     """Few large images are cut into blocks. Faces may be shared, or those of each image."""
-    vertices, faces = (
-        torch.stack([s * MESHES[0][0] for s in (1.0, 0.8, 0.5, 0.7)[:batch]]),
-        MESHES[0][1],
-    )
+    vertices = torch.stack([s * MESHES[0][0] for s in (1.0, 0.8, 0.5, 0.7)[:batch]])
+    faces = MESHES[0][1]
     values = [
         torch.stack([x, *(0.5 * x for _ in range(batch - 1))])
         for x in values_of(name, vertices[0], faces)
@@ -431,10 +429,8 @@ def call_everything(dtype, packed):
     (loss + pinhole.transform(vertices).sum() + angles.transform(vertices).sum()).backward()
     nmr.voxelize(vertices, faces, 4)
     # in clip space
-    positions, triangles = (
-        torch.cat([vertices, vertices[..., :1] + 3], dim=-1),
-        faces.int(),
-    )
+    positions = torch.cat([vertices, vertices[..., :1] + 3], dim=-1)
+    triangles = faces.int()
     rast, slopes = dr.rasterize(dr.RasterizeCudaContext(), positions, triangles, (6, 7))
     (dr.antialias(rast, rast, positions, triangles).sum() + slopes.sum()).backward()
 

@@ -27,10 +27,8 @@ def outward_normals(vertices, faces):
 def test_flat_light_is_that_of_the_face():
     vertices, faces = bumpy_sphere()
     direction = torch.tensor([0.5, 0.7, -0.4], dtype=torch.float64)
-    ambient_color, color = (
-        torch.tensor([0.9, 0.5, 0.1]).double(),
-        torch.tensor([0.2, 0.6, 1.0]).double(),
-    )
+    ambient_color = torch.tensor([0.9, 0.5, 0.1]).double()
+    color = torch.tensor([0.2, 0.6, 1.0]).double()
     lights = nmr.Lights(0.3, 0.8, direction, ambient_color, color)
     colors = torch.rand(
         len(faces), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
@@ -244,10 +242,8 @@ def test_own_normals_are_lit_as_those_of_the_mesh(camera):
 def test_normal_maps_tilt_along_u_and_v():
     """A square in the plane z = 0 of a right-handed world; mirrored coordinates mirror the tilt."""
     vertices = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
-    faces, camera = (
-        torch.tensor([[0, 1, 2], [0, 2, 3]]),
-        nmr.Orthographic([0.0, 0.0, 3.0], right_handed=True),
-    )
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    camera = nmr.Orthographic([0.0, 0.0, 3.0], right_handed=True)
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=4)
     texel = torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 1.0], dtype=torch.float64), dim=0)
     for flip in (torch.tensor([1.0, 1.0]), torch.tensor([-1.0, 1.0]), torch.tensor([1.0, -1.0])):
@@ -333,11 +329,9 @@ def test_normals_in_camera_space_are_those_of_the_depth(camera):
     """Where depth is f(x, y), the normal towards the viewer is (df/dx, df/dy, -1), normalised."""
     vertices, faces = bumpy_sphere(1)
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=64)
-    normals, depth, index = (
-        fragments.normals(space="camera")[0],
-        fragments.depth[0],
-        fragments.face_index[0],
-    )
+    normals = fragments.normals(space="camera")[0]
+    depth = fragments.depth[0]
+    index = fragments.face_index[0]
     same = (
         (index[1:-1, 1:-1] >= 0)
         & (index[1:-1, 2:] == index[1:-1, :-2])
@@ -345,10 +339,8 @@ def test_normals_in_camera_space_are_those_of_the_depth(camera):
     )
     same &= index[1:-1, 2:] == index[1:-1, 1:-1]
     same &= index[2:, 1:-1] == index[1:-1, 1:-1]
-    slope_x, slope_y = (
-        16 * (depth[1:-1, 2:] - depth[1:-1, :-2]),
-        16 * (depth[:-2, 1:-1] - depth[2:, 1:-1]),
-    )
+    slope_x = 16 * (depth[1:-1, 2:] - depth[1:-1, :-2])
+    slope_y = 16 * (depth[:-2, 1:-1] - depth[2:, 1:-1])
     wanted = torch.nn.functional.normalize(
         torch.stack([slope_x, slope_y, -torch.ones_like(slope_x)], -1), dim=-1
     )

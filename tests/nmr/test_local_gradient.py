@@ -171,9 +171,8 @@ def test_together_with_other_images():
 def scene_of(name):
     """Vertices in renderer space [B, V, 3] (of a pair of meshes if packed), faces, and whether depth is perspective."""
     vertices, faces = random_soup(3)
-    if (
-        name == "spheres"
-    ):  # one behind the other, without perspective, with faces smaller than a pixel
+    # one behind the other, without perspective, with faces smaller than a pixel
+    if name == "spheres":
         ball, faces = nmr.icosphere(5)
         pair = [
             0.6 * ball.double() + torch.tensor(at) for at in ([-0.2, 0.1, 2.0], [0.3, -0.1, 3.5])
@@ -197,10 +196,8 @@ def colors_gradient(
 def test_colors_equal_the_slow_definition(name, anti_aliasing, own_background):
     vertices, faces, perspective = scene_of(name)
     # in one block of rows, and in several
-    size, batch = (
-        (10, 14) if perspective else (100, 140),
-        len(vertices),
-    )
+    size = (10, 14) if perspective else (100, 140)
+    batch = len(vertices)
     raster = tuple(n * (1 + anti_aliasing) for n in size)
     index = nmr.ops.rasterize(vertices, faces, None, *raster, True, 0.1, 100.0, perspective)
     image, upstream = noise(batch, *raster, 3), noise(batch, *size, 3, seed=1)

@@ -73,10 +73,8 @@ def test_smoothness_equals_the_formula_and_its_derivative():
 def test_same_bits_for_any_number_of_threads():
     vertices, faces = nmr.icosphere(2)
     g = torch.Generator().manual_seed(0)
-    vertices, edges = (
-        vertices + 0.1 * torch.randn(37, len(vertices), 3, generator=g),
-        nmr.edge_table(faces),
-    )
+    vertices = vertices + 0.1 * torch.randn(37, len(vertices), 3, generator=g)
+    edges = nmr.edge_table(faces)
     images = [torch.rand(7, 5001, generator=g) for _ in range(2)]
 
     def gradients():
@@ -197,10 +195,8 @@ def test_soft_iou_derivatives_of_any_kind():
     for dtype in (torch.float32, torch.float64):
         images = [x.to(dtype).detach().requires_grad_() for x in (prediction, target)]
         torch.library.opcheck(nmr.ops.soft_iou_loss.op, images)
-        areas, upstream = (
-            nmr.ops.soft_iou_loss(*images)[1],
-            torch.rand((), dtype=dtype, generator=g),
-        )
+        areas = nmr.ops.soft_iou_loss(*images)[1]
+        upstream = torch.rand((), dtype=dtype, generator=g)
         torch.library.opcheck(
             nmr.ops.soft_iou_loss.backward.op, (*images, areas, upstream, [True, False])
         )
@@ -219,10 +215,8 @@ def octahedron():
 @pytest.mark.parametrize("key", ["laplacian", "edge", "inflation"])
 def test_published_losses(key, dtype):
     v = load_vector("loss_extra")
-    vertices, faces = (
-        torch.from_numpy(v["vertices"]).to(dtype).requires_grad_(),
-        torch.from_numpy(v["faces"]),
-    )
+    vertices = torch.from_numpy(v["vertices"]).to(dtype).requires_grad_()
+    faces = torch.from_numpy(v["faces"])
     if key == "laplacian":
         loss = laplacian_loss(vertices, nmr.unique_edges(faces))
     elif key == "edge":

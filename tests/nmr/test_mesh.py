@@ -160,11 +160,9 @@ def test_lights_per_image(smooth):
 
 def test_values_of_a_batch_may_be_lists():
     vertices = torch.stack([VERTICES[0], 0.7 * VERTICES[0]])
-    image, uv, uv_faces = (
-        uniform(2, 4, 4, 3),
-        uniform(2, 50, 2),
-        torch.stack([FACES[0] % 50, FACES[0] % 49]),
-    )
+    image = uniform(2, 4, 4, 3)
+    uv = uniform(2, 50, 2)
+    uv_faces = torch.stack([FACES[0] % 50, FACES[0] % 49])
     stacked, lists = (
         nmr.render_rgb(
             vertices, FACES[0], nmr.LookAt(EYES[:2]), colors=nmr.UVTexture(*values), **SIZE

@@ -385,12 +385,10 @@ def test_install_as(monkeypatch, tmp_path):
     context.release_context()
 
 
-POS, TRI, UV, TEX = (
-    torch.zeros(1, 3, 4),
-    torch.zeros(1, 3, dtype=torch.int32),
-    torch.zeros(1, 2, 2, 2),
-    torch.zeros(1, 4, 4, 1),
-)
+POS = torch.zeros(1, 3, 4)
+TRI = torch.zeros(1, 3, dtype=torch.int32)
+UV = torch.zeros(1, 2, 2, 2)
+TEX = torch.zeros(1, 4, 4, 1)
 RAST = torch.zeros(1, 2, 2, 4)
 
 

@@ -140,10 +140,8 @@ def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -
 def test_polygons_stay_in_order_and_convex_ones_are_fans() -> None:
     vertices = np.random.default_rng(0).normal(size=(9, 3))
     vertices[:5] = [[0, 0, 0], [2, 0, 0], [3, 1, 0], [2, 2, 0], [0, 2, 0]]
-    corners, sizes = (
-        np.array([5, 6, 7, 0, 1, 2, 3, 4, 8, 7, 0, 8, 0, 1, 2, 3]),
-        np.array([3, 5, 2, 1, 1, 4]),
-    )
+    corners = np.array([5, 6, 7, 0, 1, 2, 3, 4, 8, 7, 0, 8, 0, 1, 2, 3])
+    sizes = np.array([3, 5, 2, 1, 1, 4])
     faces = corners[triangulate(vertices, corners, sizes)]
     assert faces[:4].tolist() == [[5, 6, 7], [0, 1, 2], [0, 2, 3], [0, 3, 4]] and len(faces) == 6
     with pytest.raises(ValueError, match="missing vertex; there are 9"):

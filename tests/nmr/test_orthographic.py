@@ -187,10 +187,8 @@ def test_mipmaps_of_a_tilted_square_have_one_level() -> None:
     vertices = torch.tensor(
         [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 3.0], [-1.0, 1.0, 3.0]]
     )
-    faces, uv = (
-        torch.tensor([[0, 1, 2], [0, 2, 3]]),
-        torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
-    )
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    uv = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     camera = nmr.Orthographic([0.0, 0.0, -2.0])
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=32, anti_aliasing=False)
     texture = nmr.UVTexture(torch.rand(256, 256, 1), uv, filter="mipmap")

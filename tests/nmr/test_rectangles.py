@@ -171,10 +171,8 @@ def sphere(batch=2):
 @pytest.mark.parametrize("perspective", [True, False])
 def test_wide_images_show_more_at_the_sides(size, mode, perspective):
     vertices, faces = sphere()
-    vertices, textures = (
-        vertices * 0.7 + torch.tensor([0.3, -0.2, 0]),
-        torch.rand(2, 80, 2, 2, 2, 3),
-    )
+    vertices = vertices * 0.7 + torch.tensor([0.3, -0.2, 0])
+    textures = torch.rand(2, 80, 2, 2, 2, 3)
     renderer = nr.Renderer(camera_mode=mode, image_size=16, perspective=perspective)
     square = renderer(vertices, faces, textures)
     renderer.image_size = size

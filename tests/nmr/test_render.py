@@ -144,10 +144,8 @@ def test_published_renderer(name):
     for name, leaf in {"vertices": vertices, "textures": textures, **leaves}.items():
         key = f"grad_{name}"
         if key in v and (own or leaf is not textures):
-            expected, contracted = (
-                torch.from_numpy(v[key]),
-                torch.from_numpy(v.get(f"{key}_fma", v[key])),
-            )
+            expected = torch.from_numpy(v[key])
+            contracted = torch.from_numpy(v.get(f"{key}_fma", v[key]))
             assert relative(leaf.grad, expected) < max(5 * relative(contracted, expected), least), (
                 key
             )
@@ -277,11 +275,9 @@ def test_flat_normals_point_at_the_viewer_and_are_those_of_the_faces():
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_normals_point_at_the_viewer_in_a_right_handed_world_too(smooth):
-    K, t, sides = (
-        [[1.5, 0.0, 0.5], [0.0, 1.5, 0.5], [0.0, 0.0, 1.0]],
-        [0.0, 0.0, 3.0],
-        torch.tensor([-1.0, 1.0, 1.0]),
-    )
+    K = [[1.5, 0.0, 0.5], [0.0, 1.5, 0.5], [0.0, 0.0, 1.0]]
+    t = [0.0, 0.0, 3.0]
+    sides = torch.tensor([-1.0, 1.0, 1.0])
     # y of a calibrated camera points down: a rotation by 180 degrees about z sees y up, and x to the left.
     right_handed = nmr.Pinhole(K, torch.diag(torch.tensor([-1.0, -1.0, 1.0])), t, orig_size=1)
     left_handed = nmr.Pinhole(K, torch.diag(torch.tensor([1.0, -1.0, 1.0])), t, orig_size=1)

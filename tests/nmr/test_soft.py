@@ -256,10 +256,8 @@ def test_fragments_of_a_blur_know_the_distance():
 
 def test_transparent_surfaces_are_composited_front_to_back():
     vertices, faces = random_soup(0, 1)
-    colors, opacity = (
-        noise(len(faces), 3).requires_grad_(),
-        noise(len(faces), 1, seed=1).requires_grad_(),
-    )
+    colors = noise(len(faces), 3).requires_grad_()
+    opacity = noise(len(faces), 1, seed=1).requires_grad_()
     background = noise(3, seed=2).requires_grad_()
     values = dict(
         colors=nmr.FaceColors(colors), opacity=nmr.FaceColors(opacity), background=background

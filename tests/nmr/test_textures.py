@@ -109,10 +109,8 @@ def textured_fragments(dtype=torch.float64, image_size=24, per_image=False, grad
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=image_size)
     fragments = replace(fragments, weights=fragments.weights.clone().requires_grad_(grad))
     batch = (2,) if per_image else ()
-    image, noise = (
-        uniform(*batch, 7, 12, 3, seed=2, dtype=dtype),
-        uniform(*batch, 42, 2, seed=3, dtype=dtype),
-    )
+    image = uniform(*batch, 7, 12, 3, seed=2, dtype=dtype)
+    noise = uniform(*batch, 42, 2, seed=3, dtype=dtype)
     uv = 0.8 * vertices[:, :2] + 0.3 * noise
     return fragments, image.requires_grad_(grad), uv.requires_grad_(grad)
 
@@ -241,10 +239,8 @@ def test_vertex_colours_in_perspective():
 
 def test_face_colours_are_exact():
     vertices, faces = nmr.icosphere(1)
-    camera, colors = (
-        nmr.LookAt.from_angles(3.0, 10.0, [0.0, 90.0]),
-        uniform(80, 4, dtype=torch.float32),
-    )
+    camera = nmr.LookAt.from_angles(3.0, 10.0, [0.0, 90.0])
+    colors = uniform(80, 4, dtype=torch.float32)
     for values in (colors, torch.stack([colors, colors.flip(0)])):
         rgb = draw(nmr.FaceColors(values), (vertices, faces), 16, camera=camera)
         index = nmr.render_face_index(vertices, faces, camera, image_size=16).long()

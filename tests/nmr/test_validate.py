@@ -77,10 +77,8 @@ def test_one_set_of_faces_may_have_a_batch_axis():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_parameters_of_cameras_are_copies_of_arrays(dtype):
     eye, matrix = np.array([0.0, 0.0, -3.0], dtype), np.array(INTRINSICS, dtype)
-    camera, pinhole = (
-        nmr.LookAt(eye),
-        nmr.Pinhole(matrix, np.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640)),
-    )
+    camera = nmr.LookAt(eye)
+    pinhole = nmr.Pinhole(matrix, np.eye(3), [0.0, 0.0, 2.0], orig_size=(480, 640))
     before = [x.transform(SPHERE) for x in (camera, pinhole)]
     eye[2], matrix[0, 0] = -9.0, 1.0
     assert torch.equal(camera.transform(SPHERE), before[0]) and torch.equal(

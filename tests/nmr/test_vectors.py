@@ -57,10 +57,8 @@ def test_silhouette_bit_for_bit_and_gradient(name):
 def test_index_map(name):
     v = load_vector(name)
     num_faces, expected = len(v["faces"]), v["face_index_map"][:, ::-1]
-    mesh, size = (
-        (torch.from_numpy(v["vertices"]), torch.from_numpy(v["faces"]).long()),
-        expected.shape[1],
-    )
+    mesh = (torch.from_numpy(v["vertices"]), torch.from_numpy(v["faces"]).long())
+    size = expected.shape[1]
     how = {"fill_back": bool(v["fill_back"]), "near": float(v["near"]), "far": float(v["far"])}
     fragments = nmr.render_fragments(*mesh, image_size=size, clip=False, **how)
     assert np.array_equal(fragments.sided_face_index.numpy(), expected)
@@ -86,10 +84,8 @@ def test_reference_agrees_with_vectors(name):
     )
     faces, size = torch.from_numpy(v["faces"]).long(), v["image_size"].item() * (2 if aa else 1)
     for b in range(len(v["vertices"])):
-        vertices, grad_alpha = (
-            torch.from_numpy(v["vertices"][b]),
-            torch.from_numpy(v["grad_alpha"][b]),
-        )
+        vertices = torch.from_numpy(v["vertices"][b])
+        grad_alpha = torch.from_numpy(v["grad_alpha"][b])
         index = reference.face_index(vertices, faces, size, back, near, far)
         assert np.array_equal(reference.silhouette(index, aa).numpy(), v["alpha"][b])
         grad = reference.silhouette_gradient(vertices, faces, index, grad_alpha, aa, back, eps)

@@ -1,13 +1,14 @@
 """Measure the renderer, its losses and its metrics. Compare only numbers of one run.
 
-  w1: 64 spheres, 64x64 anti-aliased w2: one mesh of 81,920 faces, 512x512 w3: one mesh of 1,280
-  faces, 1024x1024 w4: w1 with depth instead of silhouettes white, vertex, uv, uv-lights: w1 in
-  colour: white, vertex colours, texture images of 128x128, lights voxels: voxel IoU of 1000
-  predictions
+  w1: 64 spheres, 64x64 anti-aliased
+  w2: one mesh of 81,920 faces, 512x512
+  w3: one mesh of 1,280 faces, 1024x1024
+  w4: w1 with depth instead of silhouettes
+  white, vertex, uv, uv-lights: w1 in colour: white, vertex colours, texture images of 128x128, lights
+  voxels: voxel IoU of 1000 predictions
 
-Prints the median and the fastest of the repeats in milliseconds; repeats alternate between the
-programs. Freed memory is kept, as in training (learn3d/device.py). w1 to w4 are measured with
-deodr as well, if it is installed.
+Prints the median and the fastest of the repeats in milliseconds; repeats alternate between the programs. Freed memory
+is kept, as in training (learn3d/device.py). w1 to w4 are measured with deodr as well, if it is installed.
 """
 
 from __future__ import annotations
@@ -289,8 +290,7 @@ def bench_voxels(options: Options) -> None:
 def time_by_turns(programs: dict[str, Program], repeats: int) -> list[list[Timing]]:
     """The times of each program. Repeats alternate between the programs.
 
-    Each turn begins with a call that is not timed, because the caches are full of another
-    program's data.
+    Each turn begins with a call that is not timed, because the caches are full of another program's data.
     """
     times: list[list[Timing]] = [[] for _ in programs]
     for _ in range(repeats):

@@ -160,10 +160,8 @@ def _parse(path: Path, found: Any, findings: Findings) -> tuple[list[np.ndarray]
         if array.shape != (len(images), *shape) or (
             key == "images_ref" and array.dtype != np.uint8
         ):
-            wanted, got = (
-                f"{list(shape)} for each of {len(images)} images",
-                f"{array.dtype} {list(array.shape)}",
-            )
+            wanted = f"{list(shape)} for each of {len(images)} images"
+            got = f"{array.dtype} {list(array.shape)}"
             raise DamagedFile(path, f"{key} must be {wanted} (uint8 if images), got {got}")
         arrays.append(array)
     if not len(images):

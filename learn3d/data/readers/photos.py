@@ -269,9 +269,8 @@ def _photo(
 ) -> Photo:
     """Check one row of the table."""
     try:
-        if (
-            None in row or None in row.values()
-        ):  # csv.DictReader marks too long and too short rows with None
+        # csv.DictReader marks too long and too short rows with None
+        if None in row or None in row.values():
             raise ValueError("it has more or fewer values than there are columns")
         values = {name: value.strip() for name, value in row.items()}
         name = Path(values["file"].removeprefix("images/"))

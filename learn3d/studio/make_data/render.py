@@ -92,10 +92,8 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
     Raises ValueError (no usable mesh), FileExistsError (the folder has files of the category and
     `overwrite` is False).
     """
-    items, writer = (
-        [item for of_split in split_items(config).values() for item in of_split],
-        WRITERS[config.layout],
-    )
+    items = [item for of_split in split_items(config).values() for item in of_split]
+    writer = WRITERS[config.layout]
     paths = [*writer.paths(config.category), *report_files(config.category)]
     there = [path for path in paths if (config.output / path).exists()]
     if there and not config.overwrite:
@@ -173,10 +171,8 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
     lights = studio_lights((writer.turn @ KEY_LIGHT).tolist())
     if writer.natural:
         color, lights = natural_look(placed, mesh.faces, rng)
-    vertices, faces = (
-        torch.as_tensor(placed, dtype=torch.float32).contiguous(),
-        torch.from_numpy(mesh.faces),
-    )
+    vertices = torch.as_tensor(placed, dtype=torch.float32).contiguous()
+    faces = torch.from_numpy(mesh.faces)
     rgb, alpha = photograph(
         vertices, faces, color, poses.cameras(), image_size=writer.image_size, lights=lights
     )

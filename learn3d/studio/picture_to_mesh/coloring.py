@@ -92,10 +92,8 @@ def _seen(vertices: Tensor, faces: Tensor, view: View, picture: np.ndarray) -> L
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         placed = view.place(points[None])
         x, y, z = camera.transform(placed)[0].unbind(1)
-        grid, options = (
-            torch.stack([x, -y], 1)[None, None],
-            {"padding_mode": "border", "align_corners": False},
-        )
+        grid = torch.stack([x, -y], 1)[None, None]
+        options = {"padding_mode": "border", "align_corners": False}
         found, depth, trusted = (
             F.grid_sample(v[None], grid, **options)[0, :, 0] for v in (pixels, depth_map, reliable)
         )
@@ -118,10 +116,8 @@ def _spread(colors: Tensor, weight: Tensor, vertices: Tensor, faces: Tensor) -> 
     """
     clear = (weight >= min(0.5, float(weight.max()))).numpy()
     neighbours = joined(faces.numpy(), len(colors))
-    given, nearest = (
-        weight.double().numpy()[:, None] ** 2,
-        _nearest_clear(vertices.numpy(), clear, neighbours),
-    )
+    given = weight.double().numpy()[:, None] ** 2
+    nearest = _nearest_clear(vertices.numpy(), clear, neighbours)
     laplacian = diags_array(neighbours.sum(1)) - neighbours
     system = (diags_array(given[:, 0] + 1e-5) + 0.01 * laplacian).tocsc()
     colors = colors.double().numpy()

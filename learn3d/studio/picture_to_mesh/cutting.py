@@ -22,13 +22,10 @@ INSET = 0.03  # width of the background border without a box, as a share of the 
 PLAIN = 0.9  # least share of the border with one colour in pictures with a plain background
 TOLERANCE = 0.12  # largest difference from the background's colour, in 0 .. 1
 JPEG_NOISE = 6  # levels by which compression changes the background near an object
-PLAIN_HOLE = 0.5  # a hole of the mask shows the background if more than this share of it has the background's colour,
-# and its size, as a share of the object, lies between these; larger ones are often white table
-# tops
-HOLES = (
-    0.001,
-    0.4,
-)
+# A hole of the mask shows the background if more than this share of it has the background's colour.
+PLAIN_HOLE = 0.5
+# Its least and largest size, as a share of the object; larger holes are often white table tops.
+HOLES = 0.001, 0.4
 KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
 _ROUNDS, _ROUNDS_FROM_GUESS, _ROUNDS_IN_STROKES = 5, 3, 2
 _AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
@@ -46,23 +43,14 @@ _TOUCHED = 0.03  # share of a side of the picture, from which the object touches
 _PREFERRED = 0.05  # by which GrabCut from the whole region must be judged better
 _FILLED = 0.75  # share of its box, below which an object in a given box is not the whole one
 _PROBABLE = -0.6  # mark of an object that is probably the right one
-# share of its box that an upright rectangle fills; by which its mark is worse
-_RECTANGLE, _UNLIKELY = (
-    0.9,
-    0.3,
-)
-# least areas of a picture on the wall, over those of the mask and of its own box
-_FRAME, _FRAME_FILL = (
-    0.05,
-    0.7,
-)
+_RECTANGLE = 0.9  # share of its box that an upright rectangle fills
+_UNLIKELY = 0.3  # by which the mark of such a rectangle is worse
+_FRAME = 0.05  # least area of a picture on the wall, over that of the mask
+_FRAME_FILL = 0.7  # and over that of its own box
 _FRAME_WIDTH = 5  # pixels
 _OFF_CENTRE = 0.6  # weight of the distance from the centre against the judgement
-# parts that may be the object, and their least area over that of the largest
-_PARTS, _PART = (
-    3,
-    0.1,
-)
+_PARTS = 3  # parts that may be the object
+_PART = 0.1  # their least area, over that of the largest
 _RAGGED = 600  # squared length of an outline over its area, in pixels; a thin-legged chair has 200
 
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
@@ -90,15 +78,11 @@ def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None
     if is_plain(colors):
         mask, how = threshold_mask(colors), "as all that differs from the plain background"
     elif importlib.util.find_spec("rembg") is not None:
-        mask, how = (
-            _ask_rembg(colors),
-            "by rembg, which loads its weights from the internet at its first use",
-        )
+        mask = _ask_rembg(colors)
+        how = "by rembg, which loads its weights from the internet at its first use"
     else:
-        mask, how = (
-            cut_out(colors, judge=judge),
-            "by its difference from the background at the border",
-        )
+        mask = cut_out(colors, judge=judge)
+        how = "by its difference from the background at the border"
     return Outline(mask, how, find_doubt(keep_object(mask)[0]))
 
 
@@ -348,10 +332,8 @@ def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.nda
     Each pixel of the strokes is KEEP (as in the mask), OBJECT, BACKGROUND or OPEN (GrabCut
     decides). colors: uint8 [H, W, 3]. Raises ValueError without OpenCV.
     """
-    inside, unsure = (
-        np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND)),
-        strokes == OPEN,
-    )
+    inside = np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND))
+    unsure = strokes == OPEN
     if unsure.any():
         rows, columns = (np.flatnonzero(unsure.any(axis=axis)) for axis in (1, 0))
         part = tuple(

@@ -24,13 +24,10 @@ KNOWN_CODES = (
     "output_layer",
 )
 _NEAREST = 3  # centres whose mean distance is compared
-# sizes of the classifiers, whose logits are averaged
-_HIDDEN, _MEMBERS, _DROPOUT, _STEPS = (
-    64,
-    2,
-    0.3,
-    300,
-)
+_HIDDEN = 64  # width of a classifier
+_MEMBERS = 2  # classifiers, whose logits are averaged
+_DROPOUT = 0.3
+_STEPS = 300
 _SCALE = 10.0  # length of the codes that they see
 
 
@@ -78,10 +75,8 @@ def known_codes(
         np.linspace(0, len(dataset) - 1, min(IMAGES, len(dataset))).astype(np.int64)
     )
     batches = [dataset.batch(part, voxels=False) for part in chosen.split(128)]
-    classes, codes = (
-        torch.cat([b.class_ids for b in batches]),
-        _directions(method, (b.images for b in batches)),
-    )
+    classes = torch.cat([b.class_ids for b in batches])
+    codes = _directions(method, (b.images for b in batches))
     count = min(
         CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min())
     )

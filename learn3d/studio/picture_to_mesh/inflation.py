@@ -28,9 +28,8 @@ def inflate(picture: np.ndarray) -> tuple[Surface, View]:
     """
     mask = torch.from_numpy(picture[3])[None, None].float()
     inside = torch.nn.functional.interpolate(mask, (CELLS, CELLS), mode="area")[0, 0].numpy() > 127
-    if (
-        ndimage.binary_erosion(inside).sum() <= _SOLID * inside.sum()
-    ):  # lines, dots: smoothing would remove them
+    # lines, dots: smoothing would remove them
+    if ndimage.binary_erosion(inside).sum() <= _SOLID * inside.sum():
         inside = torch.nn.functional.adaptive_max_pool2d(mask, CELLS)[0, 0].numpy() > 127
     square = DEPTH**2 * _solve(inside) - 4 * ndimage.distance_transform_edt(~inside)
     z = np.arange(CELLS) - (CELLS - 1) / 2

@@ -340,11 +340,9 @@ def prepare_image(
     alpha = mask.astype(np.float32) / 255
     planes = [(255 - colors[..., channel]) * alpha for channel in range(3)] + [255 * alpha]
     planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduction)) for plane in planes])
-    x, y, half = (
-        (left + right) / 2 / reduction,
-        (top + bottom) / 2 / reduction,
-        side / 2 / reduction,
-    )
+    x = (left + right) / 2 / reduction
+    y = (top + bottom) / 2 / reduction
+    half = side / 2 / reduction
     pad = math.ceil(
         max(0, half - x, half - y, x + half - planes.shape[2], y + half - planes.shape[1])
     )

@@ -30,23 +30,15 @@ AXES = 24  # principal axes of the codes that are kept
 CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
 KEPT = 16  # best of them, which are stretched
 DIFFERENT = 0.5  # voxel IoU below which two shapes are different guesses
-# weights of the IoU with the predicted shape and of the codes' cosine; outline: 1
-VOXELS, NEARNESS = (
-    0.5,
-    0.5,
-)
-# weight of the distance of two outlines in pixels, and the largest that counts
-EDGES, FARTHEST = (
-    0.15,
-    6.0,
-)
-STRETCHING, STRETCH_STEPS = 1.0, 30  # weight of unequal factors along the axes, steps
-# points of the lattice along each axis, weight of their moves, steps
-LATTICE, BENDING, BENDING_STEPS = (
-    4,
-    1.5,
-    40,
-)
+VOXELS = 0.5  # weight of the IoU with the predicted shape; that of the outline is 1
+NEARNESS = 0.5  # weight of the codes' cosine
+EDGES = 0.15  # weight of the distance of two outlines in pixels
+FARTHEST = 6.0  # largest distance of outlines that counts
+STRETCHING = 1.0  # weight of unequal factors along the axes
+STRETCH_STEPS = 30
+LATTICE = 4  # points of the lattice along each axis
+BENDING = 1.5  # weight of their moves
+BENDING_STEPS = 40
 # maps most generated shapes to themselves, in the object frame
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
 # names of the tensors in a checkpoint

@@ -232,10 +232,8 @@ def wing(sections: Sequence[Sequence[float]], upright: bool = False) -> Part:
         + 0.02
     )
     span, rise, front, chord, ratio = np.array(sections, dtype=float).T[:, :, None]
-    y, z = (
-        rise + np.append(half, -half[::-1]) * chord * ratio,
-        front - np.append(c, c[::-1]) * chord,
-    )
+    y = rise + np.append(half, -half[::-1]) * chord * ratio
+    z = front - np.append(c, c[::-1]) * chord
     return loft(points(*((y, span, z) if upright else (span, y, z))), "strip")
 
 

@@ -132,10 +132,8 @@ def read_tables() -> dict[str, Table]:
         rows.setdefault(line["experiment"], {})[line["method"]] = row
     tables = {}
     for line in _read_csv("tables.csv"):
-        name, categories = (
-            line.pop("experiment"),
-            tuple(line["categories"].split()) or tuple(SYNSETS),
-        )
+        name = line.pop("experiment")
+        categories = tuple(line["categories"].split()) or tuple(SYNSETS)
         tables[name] = Table(
             **line | {"categories": categories, "seeds": int(line["seeds"]), "rows": rows[name]}
         )

@@ -178,10 +178,8 @@ def test_the_papers_seven_settings(text: str, count: int) -> None:
 
 
 def test_ends_of_the_range_belong_to_cells() -> None:
-    azimuths, elevations = (
-        np.array([180.0, -180.0, 179.9, 0.0, 0.0]),
-        np.array([40.0, -20.0, 40.0, 55.0, -90.0]),
-    )
+    azimuths = np.array([180.0, -180.0, 179.9, 0.0, 0.0])
+    elevations = np.array([40.0, -20.0, 40.0, 55.0, -90.0])
     assert AngleBins(15, 20).ids(LookAtPoses(azimuths, elevations, 2.0, 15.0)).tolist() == [
         71,
         0,

@@ -240,10 +240,8 @@ def test_photographs_without_poses_learn_from_an_estimate(chairs: Path, tmp_path
     (chairs / "poses.csv").unlink()
     assert photos.load(chairs.parent, "chair", "train").poses is None
     assert {text.split(":")[0] for _, text in check(chairs, "warning")} == {"has no poses"}
-    table, options = (
-        tmp_path / "poses.npz",
-        ["--steps", "2", "--restarts", "1", "--prototypes", "2"],
-    )
+    table = tmp_path / "poses.npz"
+    options = ["--steps", "2", "--restarts", "1", "--prototypes", "2"]
     words = [
         str(chairs.parent),
         "--category",

@@ -74,10 +74,8 @@ def test_a_photograph_with_damaged_exif_data_is_read(tmp_path):
 
 def test_shrinking_takes_the_mean_over_each_pixels_area():
     rng = np.random.default_rng(0)
-    color, mask = (
-        rng.integers(0, 256, (128, 128, 3), np.uint8),
-        rng.integers(0, 256, (128, 128), np.uint8),
-    )
+    color = rng.integers(0, 256, (128, 128, 3), np.uint8)
+    mask = rng.integers(0, 256, (128, 128), np.uint8)
     pixels = np.dstack([color, mask])
     image, small = shrink(pixels.transpose(2, 0, 1).astype(np.float32), 64)
     blocks = pixels.reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)

@@ -28,10 +28,8 @@ def random_parts(rng: np.random.Generator, polygons: bool) -> Parts:
     """Up to three parts with shared corners; polygons of up to 9 corners, star-shaped and mostly concave, in planes."""
     parts = []
     for _ in range(rng.integers(1, 4)):
-        vertices, faces = (
-            [rng.normal(size=(5, 3))],
-            [rng.permutation(5)[:3].tolist() for _ in range(rng.integers(1, 9))],
-        )
+        vertices = [rng.normal(size=(5, 3))]
+        faces = [rng.permutation(5)[:3].tolist() for _ in range(rng.integers(1, 9))]
         for _ in range(rng.integers(1, 4) if polygons else 0):
             size, first = int(rng.integers(4, 10)), sum(map(len, vertices))
             turns = 2 * np.pi * (np.arange(size) + rng.uniform(0, 0.5, size)) / size
@@ -166,9 +164,8 @@ def write_gltf(path: Path, parts: Parts, rng: np.random.Generator) -> None:
             -1,
         ]
         scale, storage = np.abs(local).max(), rng.choice(["floats", "sparse", "quantized"])
-        if (
-            np.abs(joined(parts)[0]).max() < 5
-        ):  # 16 bits are too few for a small mesh that is moved so far
+        # 16 bits are too few for a small mesh that is moved so far
+        if np.abs(joined(parts)[0]).max() < 5:
             storage = "floats"
         if storage == "quantized":
             rows = np.zeros((len(local), 4), "<i2")

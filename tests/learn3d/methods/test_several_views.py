@@ -69,10 +69,8 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views(method: MultiView) -> N
     with torch.no_grad():
         batch.images[:2] //= 8  # shapes that differ
         method.generator.layers[-1].weight *= 10
-        vertices, faces = (
-            method.decode(method.encode(batch.images)).vertices,
-            method.generator.faces,
-        )
+        vertices = method.decode(method.encode(batch.images)).vertices
+        faces = method.generator.faces
         losses = []
         for shapes, views in (
             ([0, 1], [0, 1]),

@@ -92,10 +92,8 @@ def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(
     tiny_set, monkeypatch
 ) -> None:
     take_steps(monkeypatch, 0, 5)
-    method, batches = (
-        make(37.5),
-        [tiny_set.batch(torch.tensor(chosen)) for chosen in ([0, 30], [0])],
-    )
+    method = make(37.5)
+    batches = [tiny_set.batch(torch.tensor(chosen)) for chosen in ([0, 30], [0])]
     both, alone = (refine(method, b.images, b.masks, b.poses).vertices for b in batches)
     torch.testing.assert_close(both[:1], alone, atol=5e-5, rtol=0)
     torch.testing.assert_close(method.generator.symmetrized(both), both)

@@ -133,10 +133,8 @@ def test_alternating_steps_train_one_side() -> None:
 
 
 def test_odd_steps_move_shapes_as_without_a_discriminator() -> None:
-    method, baseline = (
-        create(REIMPLEMENTED),
-        create(replace(REIMPLEMENTED, lambda_discriminator=0.0)),
-    )
+    method = create(REIMPLEMENTED)
+    baseline = create(replace(REIMPLEMENTED, lambda_discriminator=0.0))
     assert "discriminator" not in baseline.networks
     batch = make_batch(64)
     losses, plain = backpropagate(method, batch, 1), backpropagate(baseline, batch, 1)
@@ -151,10 +149,8 @@ def test_odd_steps_move_shapes_as_without_a_discriminator() -> None:
 def test_even_steps_pull_the_other_view_towards_real() -> None:
     """The gradient of an even step is that of projection + smoothness + lambda_D BCE(D(other view), 1)."""
     batch = make_batch(64)
-    baseline, method = (
-        create(replace(REIMPLEMENTED, lambda_discriminator=0.0)),
-        create(REIMPLEMENTED),
-    )
+    baseline = create(replace(REIMPLEMENTED, lambda_discriminator=0.0))
+    method = create(REIMPLEMENTED)
     backpropagate(baseline, batch, 2)
     weight, loss = backpropagate(method, batch, 2)["adversarial"]
     adversary = create(REIMPLEMENTED)

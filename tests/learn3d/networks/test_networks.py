@@ -347,10 +347,8 @@ def create(preset: str, seed: int = 0, device: str = "cpu", precision: str = "fp
 
 
 def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
-    with_d, without = (
-        create("peng2020-kato", seed=3).networks,
-        create("peng2020-kato-vanilla", seed=3).networks,
-    )
+    with_d = create("peng2020-kato", seed=3).networks
+    without = create("peng2020-kato-vanilla", seed=3).networks
     other = create("peng2020-kato-vanilla", seed=4).networks
     assert "discriminator" not in without
     for name in ("encoder", "generator"):

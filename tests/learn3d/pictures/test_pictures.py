@@ -108,9 +108,8 @@ def test_shaded_views_agree_with_the_renderings_at_the_poses(egg, kind) -> None:
     poses = LookAtPoses(
         torch.tensor([-75.0, -40.0, 100.0]), torch.tensor([30.0, 30.0, -10.0]), 2.732, 15.0
     )
-    if (
-        kind == "rotation"
-    ):  # the same cameras without perspective, the last one rolled by 25 degrees
+    # the same cameras without perspective, the last one rolled by 25 degrees
+    if kind == "rotation":
         poses = RotationPoses(
             torch.stack([rotation(-75, 30), rotation(-40, 30), rotation(100, -10, roll_deg=25)])
         )

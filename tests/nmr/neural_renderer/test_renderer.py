@@ -204,11 +204,9 @@ def test_chainer_default_is_look_at():
 
 def test_cameras_of_a_call_win_over_those_of_the_renderer():
     vertices, faces = sphere()
-    K, R, t = (
-        np.diag([64.0, 64, 1]).astype(np.float32),
-        np.eye(3, dtype=np.float32),
-        np.array([[[0, 0, 4.0]]]),
-    )
+    K = np.diag([64.0, 64, 1]).astype(np.float32)
+    R = np.eye(3, dtype=np.float32)
+    t = np.array([[[0, 0, 4.0]]])
     K[:2, 2] = 32
     expected = nr.Renderer(16, K=K[None], R=R[None], t=t, orig_size=64).render_silhouettes(
         vertices, faces

@@ -39,12 +39,10 @@ def _read_objects(
     for _ in range(count):
         if not any(line.startswith("OBJECT") for line in lines):
             return
-        fields, rows, polygons, key = (
-            {"name": "", "rot": "1 0 0 0 1 0 0 0 1", "loc": "0 0 0"},
-            [],
-            [],
-            "",
-        )
+        fields = {"name": "", "rot": "1 0 0 0 1 0 0 0 1", "loc": "0 0 0"}
+        rows = []
+        polygons = []
+        key = ""
         while key != "kids":
             key, _, value = next(lines).partition(" ")
             fields[key] = value
@@ -61,10 +59,8 @@ def _read_objects(
         children = list(_read_objects(lines, int(value), turn, shift, skip))
         if not skip(fields["name"].strip('"')):
             if polygons:
-                vertices, corners = (
-                    np.array(rows, np.float64).reshape(-1, 3) @ turn + shift,
-                    np.concatenate(polygons),
-                )
+                vertices = np.array(rows, np.float64).reshape(-1, 3) @ turn + shift
+                corners = np.concatenate(polygons)
                 yield RawMesh(
                     vertices,
                     corners[triangulate(vertices, corners, np.array([*map(len, polygons)]))],

@@ -88,10 +88,8 @@ def random_views(
     rng: np.random.Generator,
 ) -> LookAtPoses:
     """Draw `count` cameras with any azimuth whose images hold the whole bounding sphere of vertices [V, 3] around 0."""
-    azimuth_deg, elevation_deg = (
-        uniform(rng, (-180.0, 180.0), count),
-        uniform(rng, elevations_deg, count),
-    )
+    azimuth_deg = uniform(rng, (-180.0, 180.0), count)
+    elevation_deg = uniform(rng, elevations_deg, count)
     half_fov_deg = (
         half_fovs_deg if isinstance(half_fovs_deg, float) else uniform(rng, half_fovs_deg, count)
     )

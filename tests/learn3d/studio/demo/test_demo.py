@@ -127,10 +127,8 @@ def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> Non
 
 def test_the_side_of_the_input_is_found() -> None:
     mesh = make_shape("chair", np.random.default_rng(6))
-    vertices, faces = (
-        torch.from_numpy(mesh.vertices @ mesh_to_object("y", "z").T).float(),
-        torch.from_numpy(mesh.faces),
-    )
+    vertices = torch.from_numpy(mesh.vertices @ mesh_to_object("y", "z").T).float()
+    faces = torch.from_numpy(mesh.faces)
     for azimuth in (0.0, 45.0, 210.0):
         camera = nmr.LookAt.from_angles(2.732, 30.0, [azimuth], half_fov_deg=15.0)
         mask = (

@@ -152,10 +152,8 @@ def test_kar(tmp_path, folder):
 
 def test_colours_are_unmixed_from_white_and_mixed_with_backgrounds():
     rng = np.random.default_rng(0)
-    color, alpha = (
-        rng.integers(0, 256, (2, 8, 8, 3)),
-        rng.choice([0, 64, 128, 191, 255], (2, 8, 8)).astype(np.uint8),
-    )
+    color = rng.integers(0, 256, (2, 8, 8, 3))
+    alpha = rng.choice([0, 64, 128, 191, 255], (2, 8, 8)).astype(np.uint8)
     share = alpha[..., None] / 255
     rgb = np.rint(color * share + 255 * (1 - share)).astype(np.uint8)
     item = RenderedObject("a", "train", None, None, None, rgb, alpha, None, rng)

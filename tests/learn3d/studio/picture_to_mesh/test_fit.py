@@ -154,10 +154,8 @@ def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
     )
     # two legs, and another part near
     places = torch.tensor([(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)])
-    vertices, faces = (
-        (box + places[:, None]).flatten(0, 1),
-        torch.cat([faces, faces + 8, faces + 16]),
-    )
+    vertices = (box + places[:, None]).flatten(0, 1)
+    faces = torch.cat([faces, faces + 8, faces + 16])
     clear = np.arange(24) % 24 // 8 != 1
     nearest = _nearest_clear(vertices.numpy(), clear, joined(faces.numpy(), 24))
     assert nearest.tolist() == [*range(8), *range(8), *range(16, 24)]

@@ -97,10 +97,8 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set, poses) -> No
 @pytest.mark.parametrize("truth", [False, True])
 def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth) -> None:
     samples, methods = torch.tensor([3, 40]), {"large": Ellipsoids(), "small": GridEllipsoids(0.5)}
-    runs, batch = (
-        [TrainedModel(name, method, tiny_set) for name, method in methods.items()],
-        tiny_set.batch(samples),
-    )
+    runs = [TrainedModel(name, method, tiny_set) for name, method in methods.items()]
+    batch = tiny_set.batch(samples)
     grid = comparison_grid(runs, samples, truth=truth)
     shown = [method.decode(method.encode(batch.images)).surfaces() for method in methods.values()]
     if truth:
@@ -132,10 +130,8 @@ def test_the_truth_must_be_known(tiny_set) -> None:
 @pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
 def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_set, method) -> None:
     samples = torch.tensor([3, 30, 60])
-    strip, batch = (
-        interpolate(TrainedModel("a", method, tiny_set), samples),
-        tiny_set.batch(samples),
-    )
+    strip = interpolate(TrainedModel("a", method, tiny_set), samples)
+    batch = tiny_set.batch(samples)
     assert strip.shape[0] == 3 * STEP + MARGIN
     codes = method.encode(batch.images)
     way = torch.stack(
@@ -190,13 +186,11 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(
 ) -> None:
     points = np.random.default_rng(0).normal(size=(72, 2)).astype(np.float32)
     monkeypatch.setattr(tsne, "embed", lambda codes: points)
-    runs, wheel = (
-        [
-            TrainedModel("$\\bad$", Ellipsoids(), tiny_set),
-            TrainedModel("b", Ellipsoids(), tiny_set),
-        ],
-        tsne.cyclic_colors(),
-    )
+    runs = [
+        TrainedModel("$\\bad$", Ellipsoids(), tiny_set),
+        TrainedModel("b", Ellipsoids(), tiny_set),
+    ]
+    wheel = tsne.cyclic_colors()
     scatter = tsne.draw_tsne(runs).axes[0].collections[0]
     azimuths = azimuths_deg(tiny_set.poses).numpy() % 360
     for position, color in zip(scatter.get_offsets(), scatter.get_facecolors(), strict=True):
@@ -289,10 +283,8 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
 def test_other_data_are_shown_without_the_poses_of_the_training(
     tiny_config, tiny_set, tmp_path, monkeypatch
 ) -> None:
-    configs, loaded = (
-        {name: tiny_config(tmp_path, poses=tmp_path / name) for name in ("a", "b")},
-        [],
-    )
+    configs = {name: tiny_config(tmp_path, poses=tmp_path / name) for name in ("a", "b")}
+    loaded = []
     monkeypatch.setattr(
         checkpoint, "load_method", lambda path, which: (Ellipsoids(), configs[path.name], None)
     )
