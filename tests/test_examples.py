@@ -57,7 +57,7 @@ def test_every_example_is_tested_and_short():
     fits = ["fit_lit_vase", "fit_masks", "fit_packed", "fit_silhouette", "fit_texture"]
     draws = ["draw_fitting", "draw_gradients", "draw_small_model", "draw_surfaces", "draw_views"]
     assert scripts == [*draws, "find_camera", *fits, "make_photo_folder"]
-    assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 80 for name in scripts)
+    assert all(len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 100 for name in scripts)
 
 
 def test_draw_views_from_the_command_line(tmp_path):
