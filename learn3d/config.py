@@ -68,7 +68,7 @@ class TrainConfig:
     device: MayDiffer[Literal["cpu", "cuda"]] = "cpu"
     """Device on which the networks run. Rendering runs on the CPU."""
     precision: Literal["auto", "bf16", "fp32"] = "auto"
-    """Arithmetic of the networks. auto: bf16 if it is faster (CUDA, CPUs with bf16 instructions), else fp32."""
+    """Arithmetic of the networks. auto: bf16 where it is faster (CUDA, AMX, AMD), else fp32."""
     threads: MayDiffer[Annotated[int, Field(ge=1, le=4096)] | None] = None
     """Number of CPU threads. If not given: one or all, whichever is faster;
     measured at the start and when steps slow down."""

@@ -12,17 +12,19 @@ CPUINFO = "/proc/cpuinfo"  # Linux lists the CPU's instruction sets here
 def resolve_precision(
     precision: Literal["auto", "bf16", "fp32"], device: str
 ) -> Literal["bf16", "fp32"]:
-    """Turn 'auto' into the faster precision: bf16 on CUDA and on x86 CPUs with bf16 instructions, else fp32.
+    """Turn 'auto' into the faster precision: bf16 on CUDA and CPUs with fast bf16, else fp32.
 
-    bf16 instructions halve the time of the networks; without them bf16 is emulated and slower
-    than fp32.
+    Fast are AMX, and AVX-512's on AMD's processors: they halve the time of the networks. With
+    Intel's AVX-512 instructions alone bf16 takes 1.2 times the time of fp32; without any it is
+    emulated.
     """
     if precision != "auto":
         return precision
     if device == "cuda":
         return "bf16" if torch.cuda.is_bf16_supported(including_emulation=False) else "fp32"
-    flags = Path(CPUINFO).read_text() if Path(CPUINFO).exists() else ""
-    return "bf16" if "avx512_bf16" in flags or "amx_bf16" in flags else "fp32"
+    cpu = Path(CPUINFO).read_text() if Path(CPUINFO).exists() else ""
+    fast = "amx_bf16" in cpu or ("AuthenticAMD" in cpu and "avx512_bf16" in cpu)
+    return "bf16" if fast else "fp32"
 
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>

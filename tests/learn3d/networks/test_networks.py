@@ -358,11 +358,17 @@ def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flags", "wanted"), [("fpu avx512_bf16", "bf16"), ("amx_bf16", "bf16"), ("avx2", "fp32")]
+    ("vendor", "flags", "wanted"),
+    [
+        ("AuthenticAMD", "fpu avx512_bf16", "bf16"),
+        ("GenuineIntel", "fpu avx512_bf16", "fp32"),
+        ("GenuineIntel", "avx512_bf16 amx_bf16", "bf16"),
+        ("AuthenticAMD", "avx2", "fp32"),
+    ],
 )
-def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, flags: str, wanted: str) -> None:
+def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, vendor, flags, wanted) -> None:
     cpuinfo = tmp_path / "cpuinfo"
-    cpuinfo.write_text(f"model name : x\nflags\t\t: {flags}\n")
+    cpuinfo.write_text(f"vendor_id : {vendor}\nmodel name : x\nflags\t\t: {flags}\n")
     monkeypatch.setattr(precision_module, "CPUINFO", str(cpuinfo))
     assert resolve_precision("auto", "cpu") == wanted
     assert resolve_precision("fp32", "cpu") == "fp32"
