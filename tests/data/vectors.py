@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import torch
 
 _FOLDERS = [
     Path(__file__).parent / "vectors",
@@ -40,3 +41,12 @@ def gradient_tolerance(name: str) -> float:
     if entry["grad_fragile"]:
         return float("inf")
     return max(5 * max(entry["grad_l2rel_fma"], entry["grad_l2rel_f64"]), 1e-4)
+
+
+def tensors_of(vector: dict[str, np.ndarray], prefix: str) -> dict[str, torch.Tensor]:
+    """The numbers of a vector file whose names begin with a prefix, as tensors without it in their names."""
+    return {
+        key.removeprefix(prefix): torch.from_numpy(value)
+        for key, value in vector.items()
+        if key.startswith(prefix) and value.dtype.kind != "U"
+    }

@@ -3,7 +3,9 @@
 import pytest
 import reference
 import torch
-from scenes import random_soup
+from scenes import leaf_of, random_soup, uniform
+from torch.autograd import gradcheck
+from torch.testing import assert_close
 
 import nmr
 
@@ -12,13 +14,11 @@ NEAR, FAR = 0.1, 100.0
 
 def slow_layers(vertices, faces, size, layers, fill_back):
     """Draws the faces of one mesh one by one; sorts those at each pixel by depth, then by number. Row 0 = top."""
-    ids = range(2 * len(faces) if fill_back else len(faces))
-    triangles = reference.with_back_faces(faces, fill_back)
     face_indices, depths = [], []
-    for face in ids:
-        index = reference.face_index(vertices, triangles[face : face + 1], size, False, NEAR, FAR)
-        _, depth = reference.fragments(vertices, triangles[face : face + 1], index, FAR)
-        face_indices.append(torch.where(index < 0, -1, face)), depths.append(depth)
+    for number, face in enumerate(reference.with_back_faces(faces, fill_back)):
+        index = reference.face_index(vertices, face[None], size, False, NEAR, FAR)
+        depths.append(reference.fragments(vertices, face[None], index, FAR)[1])
+        face_indices.append(torch.where(index < 0, -1, number))
     depth, order = torch.stack(depths, -1).sort(dim=-1, stable=True)
     face_index = torch.stack(face_indices, -1).gather(-1, order)
     return face_index[..., :layers].flip(0), depth[..., :layers].flip(0)
@@ -28,78 +28,61 @@ def slow_layers(vertices, faces, size, layers, fill_back):
 @pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, fill_back):
     vertices, faces = random_soup(seed, 1)
-    fragments = nmr.render_fragments(
-        vertices, faces, image_size=20, fill_back=fill_back, faces_per_pixel=5, clip=False
-    )
+    how = dict(image_size=20, fill_back=fill_back, faces_per_pixel=5, clip=False)
+    fragments = nmr.render_fragments(vertices, faces, **how)
     face_index, depth = slow_layers(vertices[0], faces, 20, 5, fill_back)
-    assert (
-        torch.equal(fragments.sided_face_index[0].long(), face_index)
-        and (face_index[..., 1] >= 0).any()
-    )
-    torch.testing.assert_close(fragments.depth[0], depth, rtol=1e-9, atol=0)
+    assert torch.equal(fragments.sided_face_index[0].long(), face_index)
+    assert (face_index[..., 1] >= 0).any()
+    assert_close(fragments.depth[0], depth, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("image_size", [33, (20, 41)])
-def test_the_first_layer_is_what_is_seen(dtype, image_size):
-    for seed in range(4):
-        vertices, faces = random_soup(seed, 1, dtype=dtype)
-        plain = nmr.render_fragments(vertices, faces, image_size=image_size)
-        layers = nmr.render_fragments(vertices, faces, image_size=image_size, faces_per_pixel=3)
-        first = layers.layer(0)
-        for name in ("sided_face_index", "weights", "depth", "covered", "is_back", "face_index"):
-            assert torch.equal(getattr(first, name), getattr(plain, name))
-        assert torch.equal(first.normals(), plain.normals())
-        image = first.interpolate(vertices)
-        assert torch.equal(first.resolve(image), plain.resolve(plain.interpolate(vertices)))
-        one = nmr.render_fragments(vertices, faces, image_size=image_size, faces_per_pixel=1)
-        assert one.layers is None and torch.equal(one.sided_face_index, plain.sided_face_index)
+@pytest.mark.parametrize("seed", range(4))
+def test_the_first_layer_is_what_is_seen(dtype, image_size, seed):
+    vertices, faces = random_soup(seed, 1, dtype=dtype)
+    plain, one, layers = (
+        nmr.render_fragments(vertices, faces, image_size=image_size, **how)
+        for how in ({}, {"faces_per_pixel": 1}, {"faces_per_pixel": 3})
+    )
+    first = layers.layer(0)
+    for name in ("sided_face_index", "weights", "depth", "covered", "is_back", "face_index"):
+        assert torch.equal(getattr(first, name), getattr(plain, name))
+    assert torch.equal(first.normals(), plain.normals())
+    assert torch.equal(*(x.resolve(x.interpolate(vertices)) for x in (first, plain)))
+    assert one.layers is None and torch.equal(one.sided_face_index, plain.sided_face_index)
 
 
 def test_of_equally_near_faces_the_first_comes_first():
     vertices = torch.tensor([[-0.9, -0.9, 2.0], [0.9, -0.9, 2.0], [0.0, 0.9, 2.0]])
     faces = torch.tensor([[0, 1, 2], [1, 2, 0], [2, 1, 0], [0, 1, 2]])
-    face_index = nmr.render_fragments(
-        vertices, faces, image_size=8, faces_per_pixel=6
-    ).sided_face_index
+    fragments = nmr.render_fragments(vertices, faces, image_size=8, faces_per_pixel=6)
     # Faces 0, 1, 3 from their fronts, then 2 (4 + 2) from its back, where the depths have the same bits.
-    middle = face_index[0, 5, 4].tolist()
-    assert middle == [0, 1, 3, 6, -1, -1]
+    assert fragments.sided_face_index[0, 5, 4].tolist() == [0, 1, 3, 6, -1, -1]
 
 
 def test_a_sphere_has_two_surfaces():
     vertices, faces = nmr.icosphere(4)
     camera = nmr.LookAt([0.0, 0.0, -3.0], half_fov_deg=25.0)
     layers = nmr.render_fragments(vertices, faces, camera, image_size=32, faces_per_pixel=4)
-    assert layers.covered.sum((0, 1, 2))[2:].max() <= 2  # where an edge is hit exactly
-    both = layers.covered[..., 1]
+    covered = layers.covered
+    assert covered[..., 2:].sum((0, 1, 2)).max() <= 2  # where an edge is hit exactly
+    both, points = covered[..., 1], layers.interpolate(vertices)
     thickness = (layers.depth[..., 1] - layers.depth[..., 0])[both]
-    points = layers.interpolate(vertices)
-    torch.testing.assert_close(
-        points.norm(dim=-1)[layers.covered],
-        torch.ones(int(layers.covered.sum())),
-        atol=3e-3,
-        rtol=0,
-    )
     assert 1.9 < thickness.max() <= 2 and thickness.min() >= 0
-    normals = layers.normals(smooth=True)
-    towards = (normals * points).sum(-1)
-    assert (towards[..., 0][both] > 0.95).all() and (towards[..., 1][both] < -0.95).all()
+    assert ((points.norm(dim=-1)[covered] - 1).abs() < 3e-3).all()
+    towards = (layers.normals(smooth=True) * points).sum(-1)[both]
+    assert (towards[:, 0] > 0.95).all() and (towards[:, 1] < -0.95).all()
     numbers = layers.per_face(torch.arange(len(faces)).float().unsqueeze(-1)).squeeze(-1)
-    assert torch.equal(numbers[layers.covered], layers.face_index[layers.covered].float())
+    assert torch.equal(numbers[covered], layers.face_index[covered].float())
 
 
 def test_gradients_are_the_derivative():
     vertices, faces = random_soup(1, 1)
-    faces = faces[:8]
-    values = torch.rand(
-        vertices.shape[1], 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
-    )
+    values = uniform(vertices.shape[1], 2, seed=1)
 
     def draw(vertices):
-        layers = nmr.render_fragments(vertices, faces, image_size=6, faces_per_pixel=3)
+        layers = nmr.render_fragments(vertices, faces[:8], image_size=6, faces_per_pixel=3)
         return layers.weights, layers.depth, layers.interpolate(values)
 
-    assert torch.autograd.gradcheck(
-        draw, vertices.clone().requires_grad_(), eps=1e-7, atol=1e-5, rtol=1e-5
-    )
+    gradcheck(draw, leaf_of(vertices), eps=1e-7, atol=1e-5, rtol=1e-5)

@@ -6,7 +6,9 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from vectors import load_vector, vector_names
+from scenes import same_bits
+from torch.testing import assert_close
+from vectors import load_vector, tensors_of, vector_names
 
 import nmr
 import nmr.neural_renderer as nr
@@ -25,44 +27,43 @@ def sphere(batch=2):
     return vertices.expand(batch, -1, -1), faces.expand(batch, -1, -1)
 
 
+def textured_sphere(batch=2):
+    return *sphere(batch), torch.rand(batch, 80, 2, 2, 2, 3)
+
+
 @pytest.mark.parametrize("name", RENDERERS)
 def test_vectors(name):
     v = load_vector(name)
     renderer = nr.Renderer(camera_mode=str(v["camera_mode"]))
-    for key in v:
-        if key.startswith("renderer_"):
-            setattr(renderer, key.removeprefix("renderer_"), v[key].tolist())
-    inputs = {key: torch.from_numpy(v[key]).requires_grad_() for key in ("vertices", "textures")}
-    inputs |= {
-        key.removeprefix("param_"): torch.from_numpy(v[key]).requires_grad_()
-        for key in v
-        if key.startswith("param_")
+    for key, value in tensors_of(v, "renderer_").items():
+        setattr(renderer, key, value.tolist())
+    leaves = tensors_of(v, "param_") | {
+        key: torch.from_numpy(v[key]) for key in ("vertices", "textures")
     }
-    for key in set(inputs) - {"vertices", "textures"}:
-        setattr(renderer, key, inputs[key])
+    for key, leaf in leaves.items():
+        leaf.requires_grad_()
+        if key not in ("vertices", "textures"):
+            setattr(renderer, key, leaf)
     faces = torch.from_numpy(v["faces"]).expand(len(v["vertices"]), -1, -1)
     mode = str(v["output"])
     images = renderer(
-        inputs["vertices"], faces, inputs["textures"], mode=None if mode == "all" else mode
+        leaves["vertices"], faces, leaves["textures"], mode=None if mode == "all" else mode
     )
-    images = dict(zip(OUTPUTS[mode], images if mode == "all" else [images], strict=True))
-    torch.autograd.backward(
-        list(images.values()), [torch.from_numpy(v[f"upstream_{o}"]) for o in images]
-    )
-    for output, image in images.items():
+    images = images if mode == "all" else [images]
+    outputs = OUTPUTS[mode]
+    torch.autograd.backward(images, [torch.from_numpy(v[f"upstream_{o}"]) for o in outputs])
+    for output, image in zip(outputs, images, strict=True):
         close = np.isclose(image.detach().numpy(), v[f"out_{output}"], rtol=1e-5, atol=1e-5)
         close[tuple(v[f"fragile_{output}"].T)] = True
         assert close.all(), f"{output}: {np.argwhere(~close)[:5]}"
-    for key in inputs:
-        if f"grad_{key}" in v:
-            expected = v[f"grad_{key}"]
-            # How far a contracted multiply-add moves the published gradient says how far rounding may.
-            latitude = np.linalg.norm(
-                v.get(f"grad_{key}_fma", expected) - expected
-            ) / np.linalg.norm(expected)
-            error = np.linalg.norm(inputs[key].grad.numpy() - expected) / np.linalg.norm(expected)
-            # The camera rounds otherwise, too: its published formula in float64 moves gradients by up to 2e-4.
-            assert error <= max(5 * latitude, 1e-3), f"{key}: {error}, latitude {latitude}"
+    grads = tensors_of(v, "grad_")
+    for key in leaves.keys() & grads.keys():
+        expected = grads[key]
+        # How far a contracted multiply-add moves the published gradient says how far rounding may.
+        latitude = 5 * (grads.get(f"{key}_fma", expected) - expected).norm()
+        error = (leaves[key].grad - expected).norm()
+        # The camera rounds otherwise, too: its published formula in float64 moves gradients by up to 2e-4.
+        assert error <= max(latitude, 1e-3 * expected.norm()), f"{key}: {error}, {latitude}"
 
 
 def test_arguments_and_defaults_of_the_published_interface():
@@ -110,17 +111,13 @@ def test_arguments_and_defaults_of_the_published_interface():
 def test_faces_that_cross_the_plane_of_the_eye_are_not_clipped():
     """As published: x and y of a vertex behind the eye are divided by a negative depth."""
     vertices = torch.tensor([[[-1.0, -0.5, 0.5], [1, -0.5, 0.5], [0.3, -0.5, -4]]])
+    faces = torch.tensor([[0, 1, 2]])
     renderer = nr.Renderer(camera_mode="look", image_size=16)
     renderer.eye = [0, 0, -1]
-    _, depth, alpha = renderer(vertices, torch.tensor([[[0, 1, 2]]]), torch.ones(1, 1, 2, 2, 2, 3))
-    how = dict(outputs=("alpha", "depth"), image_size=16)
-    mesh = vertices, torch.tensor([[0, 1, 2]]), nmr.Look(renderer.eye)
-    plain, cut = (nmr.render(*mesh, clip=clip, **how) for clip in (False, True))
-    assert (
-        torch.equal(alpha, plain.alpha)
-        and torch.equal(depth, plain.depth)
-        and not torch.equal(alpha, cut.alpha)
-    )
+    _, depth, alpha = renderer(vertices, faces[None], torch.ones(1, 1, 2, 2, 2, 3))
+    how = dict(camera=nmr.Look(renderer.eye), outputs=("alpha", "depth"), image_size=16)
+    plain, cut = (nmr.render(vertices, faces, clip=clip, **how) for clip in (False, True))
+    assert same_bits((alpha, depth), plain) and not torch.equal(alpha, cut.alpha)
 
 
 def test_defaults_of_attributes():
@@ -131,24 +128,18 @@ def test_defaults_of_attributes():
 
 
 def test_calibrated_cameras_are_stored_as_published():
-    K, R, t = np.eye(3)[None], np.eye(3)[None], np.array([[0.0, 0, 4]])
-    renderer = nr.Renderer(K=K, R=R, t=t, dist_coeffs=np.zeros((1, 5)))
-    for value, given in (
-        (renderer.K, K),
-        (renderer.R, R),
-        (renderer.t, t),
-        (renderer.dist_coeffs, np.zeros((1, 5))),
-    ):
-        assert (
-            isinstance(value, torch.Tensor)
-            and value.dtype == torch.float32
-            and value.tolist() == given.tolist()
-        )
-    K[0, 0, 0] = 2  # the array is the caller's
+    given = dict(K=np.eye(3)[None], R=np.eye(3)[None], t=np.array([[0.0, 0, 4]]))
+    given["dist_coeffs"] = np.zeros((1, 5))
+    renderer = nr.Renderer(**given)
+    for name, array in given.items():
+        stored = getattr(renderer, name)
+        assert stored.dtype == torch.float32 and stored.tolist() == array.tolist()
+    given["K"][0, 0, 0] = 2  # the array is the caller's
     assert renderer.K[0, 0, 0] == 1
-    assert torch.equal(nr.Renderer(K=K, R=R, t=t).dist_coeffs, torch.zeros(1, 5))
+    del given["dist_coeffs"]
+    assert torch.equal(nr.Renderer(**given).dist_coeffs, torch.zeros(1, 5))
     leaf = torch.zeros(1, 3, requires_grad=True)
-    assert nr.Renderer(K=K, R=R, t=leaf).t is leaf
+    assert nr.Renderer(**given | {"t": leaf}).t is leaf
 
 
 @pytest.mark.parametrize("perspective", [True, False])
@@ -169,18 +160,17 @@ def test_up_of_the_camera(mode, perspective):
 
 
 def test_modes_of_a_call():
-    vertices, faces = sphere()
-    textures = torch.rand(2, 80, 2, 2, 2, 3)
+    vertices, faces, textures = textured_sphere()
     renderer = nr.Renderer(camera_mode="look_at", image_size=16)
     rgb, depth, alpha = renderer(vertices, faces, textures)
-    assert torch.equal(renderer(vertices, faces, textures, mode="rgb"), rgb)
-    assert torch.equal(renderer(vertices, faces, textures, "".join(["r", "gb"])), rgb)
-    assert torch.equal(renderer(vertices, faces, mode="silhouettes"), alpha)
-    assert torch.equal(renderer(vertices, faces, mode="depth"), depth)
-    with pytest.raises(
-        ValueError, match="mode must be None, 'rgb', 'silhouettes' or 'depth', got 'normals'"
+    for mode, image in (
+        ("rgb", rgb),
+        ("".join(["r", "gb"]), rgb),
+        ("silhouettes", alpha),
+        ("depth", depth),
     ):
-        renderer(vertices, faces, mode="normals")
+        given = textures if image is rgb else None
+        assert torch.equal(renderer(vertices, faces, given, mode), image)
 
 
 @pytest.mark.parametrize("mode", ["None", "none", None])
@@ -195,37 +185,28 @@ def test_vertices_in_renderer_space(mode):
 
 
 def test_chainer_default_is_look_at():
-    vertices, faces = sphere()
-    image = nr.Renderer(image_size=16).render_silhouettes(vertices, faces)
-    assert image.any() and torch.equal(
-        image, nr.Renderer(image_size=16, camera_mode="look_at").render_silhouettes(vertices, faces)
+    plain, look_at = (
+        nr.Renderer(image_size=16, **mode).render_silhouettes(*sphere())
+        for mode in ({}, {"camera_mode": "look_at"})
     )
+    assert plain.any() and torch.equal(plain, look_at)
 
 
 def test_cameras_of_a_call_win_over_those_of_the_renderer():
-    vertices, faces = sphere()
-    K = np.diag([64.0, 64, 1]).astype(np.float32)
-    R = np.eye(3, dtype=np.float32)
-    t = np.array([[[0, 0, 4.0]]])
-    K[:2, 2] = 32
-    expected = nr.Renderer(16, K=K[None], R=R[None], t=t, orig_size=64).render_silhouettes(
-        vertices, faces
-    )
+    mesh = sphere()
+    K = torch.tensor([[[64.0, 0, 32], [0, 64, 32], [0, 0, 1]]])
+    given = dict(K=K, R=torch.eye(3)[None], t=torch.tensor([[[0, 0, 4.0]]]), orig_size=64)
+    arrays = {key: np.asarray(value) for key, value in given.items()} | {"orig_size": 64}
+    expected = nr.Renderer(16, **arrays).render_silhouettes(*mesh)
     assert 0.05 < expected.mean() < 0.9
     renderer = nr.Renderer(16, K=torch.eye(3)[None], R=torch.eye(3)[None], t=torch.zeros(1, 1, 3))
-    given = dict(
-        K=torch.from_numpy(K)[None],
-        R=torch.from_numpy(R)[None],
-        t=torch.from_numpy(t),
-        orig_size=64,
-    )
-    assert torch.equal(renderer(vertices, faces, mode="silhouettes", **given), expected)
+    assert torch.equal(renderer(*mesh, mode="silhouettes", **given), expected)
     given["orig_size"] = np.array([64, 64])
-    assert torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected), (
+    assert torch.equal(renderer.render_silhouettes(*mesh, **given), expected), (
         "a pair, not two images"
     )
     given["dist_coeffs"] = torch.tensor([[0.5, 0, 0, 0, 0]])
-    assert not torch.equal(renderer.render_silhouettes(vertices, faces, **given), expected)
+    assert not torch.equal(renderer.render_silhouettes(*mesh, **given), expected)
 
 
 @pytest.mark.parametrize(
@@ -233,44 +214,38 @@ def test_cameras_of_a_call_win_over_those_of_the_renderer():
 )
 @pytest.mark.parametrize("batch", [False, True])
 def test_eyes_and_colours_in_any_container(convert, batch):
-    vertices, faces = sphere()
-    renderer = nr.Renderer(camera_mode="look", image_size=16)
-    textures = torch.rand(2, 80, 2, 2, 2, 3)
+    mesh, renderer = textured_sphere(), nr.Renderer(camera_mode="look", image_size=16)
+    values = dict(
+        eye=[0.5, 0.6, -3.0],
+        camera_direction=[-0.5, -0.6, 3.0],
+        background_color=[0.1, 0.2, 0.3],
+        light_direction=[0.0, 1.0, -1.0],
+        light_color_ambient=[0.9, 0.8, 0.7],
+        light_color_directional=[0.9, 0.8, 0.7],
+    )
 
-    def give(value):
-        return convert([value] * 2 if batch else value)
+    def drawn_with(give):
+        for name, value in values.items():
+            setattr(renderer, name, give(value))
+        return renderer(*mesh, mode="rgb")
 
-    def images():
-        renderer.eye, renderer.camera_direction = give([0.5, 0.6, -3.0]), give([-0.5, -0.6, 3.0])
-        renderer.background_color, renderer.light_direction = (
-            give([0.1, 0.2, 0.3]),
-            give([0.0, 1.0, -1.0]),
-        )
-        renderer.light_color_ambient = renderer.light_color_directional = give([0.9, 0.8, 0.7])
-        return renderer(vertices, faces, textures, mode="rgb")
-
-    out = images()
-    batch, convert = False, torch.tensor
-    torch.testing.assert_close(images(), out)
+    image = drawn_with(lambda value: convert([value] * 2 if batch else value))
+    assert_close(image, drawn_with(torch.tensor))
 
 
 def test_different_faces_of_one_set_of_vertices():
-    vertices, faces = sphere(2)
+    vertices, faces, textures = textured_sphere()
     faces = torch.stack([faces[0], faces[1].roll(7, 0)])
-    textures = torch.rand(2, 80, 2, 2, 2, 3)
     renderer = nr.Renderer(camera_mode="look_at", image_size=16)
     rgb = renderer.render_rgb(vertices[:1], faces, textures)
     assert torch.equal(rgb, renderer.render_rgb(vertices, faces, textures))
 
 
 def test_silhouettes_and_depth_have_their_own_range_as_published():
-    vertices, faces = sphere()
+    *mesh, textures = textured_sphere()
     renderer = nr.Renderer(camera_mode="look_at", image_size=16, near=1e-3, far=1.5)
-    assert (
-        renderer.render_silhouettes(vertices, faces).any()
-        and renderer.render_depth(vertices, faces).max() == 100
-    )
-    _, depth, alpha = renderer(vertices, faces, torch.rand(2, 80, 2, 2, 2, 3))
+    assert renderer.render_silhouettes(*mesh).any() and renderer.render_depth(*mesh).max() == 100
+    _, depth, alpha = renderer(*mesh, textures)
     assert not alpha.any() and torch.all(depth == 1.5)
 
 
@@ -290,6 +265,16 @@ def test_renderers_can_be_copied_and_nested():
 def test_a_renderer_saved_whole_by_the_published_code_draws():
     renderer = nr.Renderer(camera_mode="look_at", image_size=16)
     assert "camera_up" not in renderer.__dict__, "which has no such attribute"
-    vertices, faces = nmr.icosphere(1)
-    again = pickle.loads(pickle.dumps(renderer))
-    assert again.render_silhouettes(0.5 * vertices[None], faces[None]).any()
+    assert pickle.loads(pickle.dumps(renderer)).render_silhouettes(*sphere()).any()
+
+
+@pytest.mark.parametrize("size", [(16, 32), [16, 32], np.array([16, 32]), torch.tensor([16, 32])])
+@pytest.mark.parametrize("mode", ["look", "look_at"])
+@pytest.mark.parametrize("perspective", [True, False])
+def test_wide_images_show_more_at_the_sides(size, mode, perspective):
+    mesh, renderer = textured_sphere(), nr.Renderer(16, camera_mode=mode, perspective=perspective)
+    square = renderer(*mesh)
+    renderer.image_size = size
+    for image, wide in zip(square, renderer(*mesh), strict=True):
+        assert wide.shape[-2:] == (16, 32)
+        assert_close(wide[..., 8:24], image, atol=1e-5, rtol=1e-5)
