@@ -1,10 +1,36 @@
-"""Gradients of a method's losses without a step of its optimizers."""
+"""Methods that learn without a run: made of a preset, and the gradients of their losses."""
 
-from learn3d.methods.method import Losses
+from __future__ import annotations
+
+import dataclasses
+
+from learn3d.data.dataset import Batch, DatasetInfo
+from learn3d.methods import create_method
+from learn3d.methods.method import Losses, Method, MethodSettings
+from learn3d.methods.optimization import TrainingSchedule
+from learn3d.presets import PRESETS
+
+INFO = DatasetInfo(24, inverted=False)
+TINY = {"encoder": "conv-small", "generator": "sphere-small"}
 
 
-def backpropagate(method, batch, step: int) -> Losses:
-    """The losses of the step; their weighted sum is backpropagated."""
+def make_method(
+    settings: str | MethodSettings,
+    info: DatasetInfo = INFO,
+    schedule: TrainingSchedule = TrainingSchedule(),  # noqa: B008 (it is frozen)
+    seed: int = 0,
+    **changes: object,
+) -> Method:
+    """The method of these settings, or of those of a preset, with changes; on the CPU in float32."""
+    if isinstance(settings, str):
+        settings = PRESETS[settings].settings
+    settings = dataclasses.replace(settings, **changes)
+    options = {"device": "cpu", "precision": "fp32", "seed": seed, "schedule": schedule}
+    return create_method(settings, info, **options)
+
+
+def backpropagate(method: Method, batch: Batch, step: int) -> Losses:
+    """The losses of the step; their weighted sum is backpropagated, and no optimizer steps."""
     losses = method.losses(batch, step)
     sum(weight * loss for weight, loss in losses.values()).backward()
     return losses

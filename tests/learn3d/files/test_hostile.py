@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import struct
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+from gltf_files import glb
 from PIL import Image
 from python2_pickles import npy
 
@@ -174,15 +174,7 @@ def glb_of_a_great_array(path: Path) -> None:
         "bufferViews": [{"buffer": 0, "byteLength": 10**10}],
         "buffers": [{"byteLength": 4}],
     }
-    text = json.dumps(scene).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = (
-        struct.pack("<II", len(text), 0x4E4F534A)
-        + text
-        + struct.pack("<II", 4, 0x004E4942)
-        + bytes(4)
-    )
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    path.write_bytes(glb(scene, bytes(4)))
 
 
 def write_text(text: str) -> Callable[[Path], object]:

@@ -5,7 +5,6 @@ MESHES=2000 in the environment makes more of them than the usual few.
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import struct
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from gltf_files import Arrays, glb
 
 from learn3d.files import formats
 from learn3d.files.formats import read_mesh
@@ -55,49 +55,46 @@ def joined(parts: Parts) -> tuple[np.ndarray, list[list[int]]]:
 
 
 def write_obj(path: Path, parts: Parts, rng: np.random.Generator) -> None:
-    lines, total, relative = [], 0, rng.random() < 0.5
+    lines, total, relative = ["# größe"], 0, rng.random() < 0.5
     gap = rng.choice([" ", "\t", "  "])
     for k, (vertices, polygons) in enumerate(parts):
         lines.append(f"o part {k}")
         lines += ["v" + gap + gap.join(map(repr, row)) for row in vertices.tolist()]
+        first = -len(vertices) if relative else total + 1
         total += len(vertices)
         for one in polygons:
-            numbers = [
-                i - len(vertices) if relative else i + 1 + total - len(vertices) for i in one
-            ]
             form = rng.choice(["{}", "{}//1", "{}//"])
-            lines.append(
-                gap.join(["f", *(form.format(i) for i in numbers)])
-                + rng.choice(["", " # x", " \\\n"])
-            )
-    path.write_bytes(rng.choice(["\n", "\r\n"]).join(lines).encode())
+            words = [form.format(first + i) for i in one]
+            lines.append(gap.join(["f", *words]) + rng.choice(["", " # x", " \\\n"]))
+    path.write_bytes(rng.choice(["\n", "\r\n"]).join(lines).encode("latin-1"))
 
 
 def write_off(path: Path, parts: Parts, rng: np.random.Generator) -> None:
+    """With or without colours, or plain and without lines."""
     vertices, polygons = joined(parts)
-    colored = rng.random() < 0.5
-    rows = [" ".join(map(repr, row)) + " 255 0 0 255" * colored for row in vertices.tolist()]
-    rows += [" ".join(map(str, [len(one), *one])) + " 0.5 0.5 0.5" * colored for one in polygons]
-    head = f"{'COFF' if colored else 'OFF'}{rng.choice([' ', chr(10)])}{len(vertices)} {len(polygons)} 0"
-    path.write_text("\n\n".join([head, "# comment", *rows]))
+    kind = rng.choice(["OFF", "COFF", "off"])
+    color, gray = (" 255 0 0 255", " 0.5 0.5 0.5") if kind == "COFF" else ("", "")
+    rows = [" ".join(map(repr, row)) + color for row in vertices.tolist()]
+    rows += [" ".join(map(str, [len(one), *one])) + gray for one in polygons]
+    head = f"{kind}{rng.choice([' ', chr(10)])}{len(vertices)} {len(polygons)} 0"
+    text = " ".join([head, *rows]) if kind == "off" else "\n\n".join([head, "# größe", *rows])
+    path.write_text(text, "latin-1")
 
 
 def write_ply(path: Path, parts: Parts, rng: np.random.Generator) -> None:
     vertices, polygons = joined(parts)
-    kind, order = [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")][
-        rng.integers(3)
-    ]
+    kinds = [("ascii", ""), ("binary_little_endian", "<"), ("binary_big_endian", ">")]
+    kind, order = kinds[rng.integers(3)]
     count_type, count_code = [("uchar", "B"), ("int", "i"), ("ushort", "H")][rng.integers(3)]
     with_uv = rng.random() < 0.5
-    head = f"ply\nformat {kind} 1.0\ncomment Größe\nelement vertex {len(vertices)}\nproperty uchar red\n"
-    head += (
-        "property double x\nproperty double y\nproperty double z\n"
-        + f"element face {len(polygons)}\n"
-    )
-    head += (
-        "property list uchar float texcoord\n" * with_uv
-        + f"property list {count_type} int vertex_indices\n"
-    )
+    head = [
+        f"ply\nformat {kind} 1.0\ncomment Größe",
+        f"element vertex {len(vertices)}\nproperty uchar red",
+        "property double x\nproperty double y\nproperty double z",
+        f"element face {len(polygons)}",
+        *["property list uchar float texcoord"] * with_uv,
+        f"property list {count_type} int vertex_indices\nend_header\n",
+    ]
     body = [[("B", 7), *(("d", x) for x in row)] for row in vertices.tolist()]
     for one in polygons:
         uv = [("B", 2 * len(one)), *[("f", 0.5)] * 2 * len(one)] if with_uv else []
@@ -106,125 +103,73 @@ def write_ply(path: Path, parts: Parts, rng: np.random.Generator) -> None:
         content = "\n".join(" ".join(repr(value) for _, value in row) for row in body).encode()
     else:
         content = b"".join(struct.pack(order + code, value) for row in body for code, value in row)
-    path.write_bytes((head + "end_header\n").encode("latin-1") + content)
+    path.write_bytes("\n".join(head).encode("latin-1") + content)
 
 
 def write_stl(path: Path, parts: Parts, rng: np.random.Generator) -> None:
     vertices, triangles = joined(parts)
     corners = vertices[np.array(triangles)].astype("<f4")
     if rng.random() < 0.5:
-        rows = [np.zeros(3, "<f4").tobytes() + one.tobytes() + b"\0\0" for one in corners]
-        path.write_bytes(
-            b"solid b".ljust(80)
-            + struct.pack("<I", len(rows))
-            + b"".join(rows)
-            + b"\n" * rng.integers(2)
-        )
-    else:
-        rows = ["vertex " + " ".join(f"{x:.9g}" for x in row) for one in corners for row in one]
-        facets = [f"facet normal 0 0 0\nouter loop\n{chr(10).join(rows[i : i + 3])}\nendloop\nendfacet" for i in range(0, len(rows), 3)]  # fmt: skip # noqa: E501
-        path.write_bytes("\n".join(["solid Größe", *facets, "endsolid"]).encode("latin-1"))
+        rows = b"".join(bytes(12) + one.tobytes() + bytes(2) for one in corners)
+        head = b"solid b".ljust(80) + struct.pack("<I", len(corners))
+        path.write_bytes(head + rows + b"\n" * rng.integers(2))
+        return
+    lines = ["solid Größe"]
+    for one in corners:
+        rows = ["vertex " + " ".join(f"{x:.9g}" for x in row) for row in one]
+        lines += ["facet normal 0 0 0\nouter loop", *rows, "endloop\nendfacet"]
+    path.write_text("\n".join([*lines, "endsolid"]), "latin-1")
 
 
 def write_gltf(path: Path, parts: Parts, rng: np.random.Generator) -> None:
     """A part is a mesh of a node, whose parent turns and scales; its triangles are a list, strips or fans."""
+    arrays, meshes, nodes = Arrays(), [], []
+    # 16 bits are too few for a small mesh that is moved so far
+    small = np.abs(joined(parts)[0]).max() < 5
+    for vertices, triangles in parts:
+        turn, shift = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = 2 * turn, shift
+        local = ((vertices - shift) @ turn / 2 + [1, 2, 3]) / [2, 1, -1]
+        scale, rows = 1.0, local.astype("<f4")
+        storage = "floats" if small else rng.choice(["floats", "sparse", "quantized"])
+        if storage == "quantized":
+            scale = np.abs(local).max()
+            rows = np.pad(np.round(local / scale * 32767), ((0, 0), (0, 1))).astype("<i2")
+            position = arrays.add(rows, type="VEC3", normalized=True)
+            arrays.views[position]["byteStride"] = 8
+        elif storage == "floats":
+            position = arrays.add(rows)
+        else:
+            position = arrays.add(0 * rows)
+            which, values = arrays.add(np.arange(len(rows), dtype="<u2")), arrays.add(rows)
+            arrays.accessors[position]["sparse"] = {
+                "count": len(rows),
+                "indices": {"bufferView": which, "componentType": 5123},
+                "values": {"bufferView": values},
+            }
+        mode = int(rng.integers(4, 7))
+        primitive = {"attributes": {"POSITION": position}}
+        primitives = [primitive | {"mode": 0}]  # points
+        for group in [np.ravel(triangles)] if mode == 4 else triangles:
+            indices = arrays.add(np.array(group, "<u2"))
+            primitives.append(primitive | {"indices": indices, "mode": mode})
+        place = {"translation": [-1, -2, -3], "scale": (scale * np.array([2, 1, -1])).tolist()}
+        nodes.append({"matrix": matrix.T.ravel().tolist(), "children": [len(nodes) + 1]})
+        nodes.append({"mesh": len(meshes)} | place)
+        meshes.append({"primitives": primitives})
     tree = {
         "asset": {"version": "2.0"},
+        "extensionsRequired": ["KHR_mesh_quantization"],
         "scene": 1,
-        "scenes": [{"nodes": []}, {"nodes": []}],
-        "nodes": [],
-        "meshes": [],
+        "scenes": [{"nodes": []}, {"nodes": [*range(0, len(nodes), 2)]}],
+        "nodes": nodes,
+        "meshes": meshes,
     }
-    tree |= {"accessors": [], "bufferViews": []}
-    blob = b""
-
-    def accessor(values: np.ndarray, component: int, width: str) -> int:
-        nonlocal blob
-        blob += b"\0" * (-len(blob) % 4)
-        view = {"buffer": 0, "byteOffset": len(blob), "byteLength": values.nbytes}
-        blob += values.tobytes()
-        tree["bufferViews"].append(view)
-        found = {
-            "bufferView": len(tree["bufferViews"]) - 1,
-            "componentType": component,
-            "count": len(values),
-        }
-        tree["accessors"].append(found | {"type": width})
-        return len(tree["accessors"]) - 1
-
-    for vertices, triangles in parts:
-        mode = int(rng.integers(4, 7))
-        groups = [np.ravel(triangles)] if mode == 4 else [np.array(one) for one in triangles]
-        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = 2 * turn, rng.normal(size=3)
-        local = ((vertices - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T + [1, 2, 3]) / [
-            2,
-            1,
-            -1,
-        ]
-        scale, storage = np.abs(local).max(), rng.choice(["floats", "sparse", "quantized"])
-        # 16 bits are too few for a small mesh that is moved so far
-        if np.abs(joined(parts)[0]).max() < 5:
-            storage = "floats"
-        if storage == "quantized":
-            rows = np.zeros((len(local), 4), "<i2")
-            rows[:, :3] = np.round(local / scale * 32767)
-            position = accessor(rows, 5122, "VEC3")
-            tree["accessors"][position]["normalized"] = True
-            tree["bufferViews"][position]["byteStride"] = 8
-            tree["extensionsRequired"] = ["KHR_mesh_quantization"]
-        else:
-            rows = local.astype("<f4")
-            position = accessor(rows * (storage == "floats"), 5126, "VEC3")
-            scale = 1.0
-        if storage == "sparse":
-            chosen = np.arange(len(rows))
-            sparse = {
-                "indices": accessor(chosen.astype("<u2"), 5123, "SCALAR"),
-                "values": accessor(rows, 5126, "VEC3"),
-            }
-            sparse = {
-                key: {"bufferView": view, "componentType": 5123} for key, view in sparse.items()
-            }
-            tree["accessors"][position]["sparse"] = {"count": len(chosen), **sparse}
-        primitives = [
-            {
-                "attributes": {"POSITION": position},
-                "indices": accessor(one.astype("<u2"), 5123, "SCALAR"),
-                "mode": mode,
-            }
-            for one in groups
-        ]
-        tree["meshes"].append(
-            {"primitives": [{"attributes": {"POSITION": position}, "mode": 0}, *primitives]}
-        )
-        tree["scenes"][1]["nodes"].append(len(tree["nodes"]))
-        tree["nodes"].append(
-            {"matrix": matrix.T.ravel().tolist(), "children": [len(tree["nodes"]) + 1]}
-        )
-        node = {
-            "mesh": len(tree["meshes"]) - 1,
-            "translation": [-1, -2, -3],
-            "scale": (scale * np.array([2, 1, -1])).tolist(),
-        }
-        tree["nodes"].append(node)
-    tree["buffers"] = [{"byteLength": len(blob)}]
     if path.suffix == ".gltf":
-        tree["buffers"][0]["uri"] = (
-            "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
-        )
-        path.write_text(json.dumps(tree))
-        return
-    text, blob = json.dumps(tree).encode(), blob + b"\0" * (-len(blob) % 4)
-    text += b" " * (-len(text) % 4)
-    chunks = (
-        struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(blob), b"BIN\0")
-        + blob
-    )
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        path.write_text(json.dumps(tree | arrays.tree(embedded=True)))
+    else:
+        path.write_bytes(glb(tree | arrays.tree(embedded=False), arrays.content))
 
 
 def write_trimesh(path: Path, parts: Parts, rng: np.random.Generator) -> None:
@@ -343,11 +288,9 @@ def test_files_that_are_cut_short_say_so(tmp_path: Path, name: str) -> None:
 
 def gltf(**changes: object) -> str:
     """A triangle."""
-    view = {"buffer": 0, "byteLength": 36}
-    corners = base64.b64encode(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]).tobytes()).decode()
-    tree = {"asset": {"version": "2.0"}, "nodes": [{"mesh": 0}], "bufferViews": [view]}
-    tree["buffers"] = [{"byteLength": 36, "uri": f"data:;base64,{corners}"}]
-    tree["accessors"] = [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}]
+    arrays = Arrays()
+    arrays.add(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
+    tree = {"asset": {"version": "2.0"}, "nodes": [{"mesh": 0}]} | arrays.tree(embedded=True)
     tree["meshes"] = [{"primitives": [{"attributes": {"POSITION": 0}}]}]
     return json.dumps(tree | changes)
 
@@ -385,6 +328,10 @@ REFUSED = {
         gltf(bufferViews=[BUFFER | {"byteOffset": 4}]),
         "an array of 3 elements exceeds its buffer",
     ),
+    "elsewhere.gltf": (
+        gltf(buffers=[{"byteLength": 36, "uri": "../a.bin"}]),
+        "'../a.bin', which is outside of",
+    ),
     "nan.ply": (PLY + "0 0 0 1 0 nan 0 1 0 3 0 1 2", "1 of its corners are not finite"),
     "one.ply": (PLY + "1 2 3 1 2 3 1 2 3 3 0 1 2", "all its corners are at one place"),
     "far.ply": (PLY + "0 0 0 1 0 0 0 1 0 3 0 1 3", "missing vertex; there are 3"),
@@ -417,6 +364,12 @@ def test_meshes_that_are_refused(tmp_path: Path, name: str) -> None:
     assert FETCH_AGAIN not in str(error.value)
 
 
+def test_a_missing_buffer_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.gltf").write_text(gltf(buffers=[{"byteLength": 36, "uri": "b.bin"}]))
+    with pytest.raises(FileNotFoundError, match=r"b\.bin: is missing"):
+        read_mesh(tmp_path / "a.gltf")
+
+
 def test_a_missing_package_is_named(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "collada", None)
     path = tmp_path / "a.dae"
@@ -425,59 +378,29 @@ def test_a_missing_package_is_named(tmp_path: Path, monkeypatch) -> None:
         formats._triangles(path, file)
 
 
-def test_off_files_need_no_lines(tmp_path: Path) -> None:
-    (tmp_path / "a.off").write_text("off 4 2 0 0 0 0 1 0 0 1 1 0\n0 1 0 3 0 1 2\n3 0 2 3")
-    mesh = read_mesh(tmp_path / "a.off")
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-    assert mesh.vertices[2].tolist() == [1, 1, 0]
-
-
 def test_skins_and_morph_targets_move_corners(tmp_path: Path) -> None:
     """Joint 0 is moved by 5 in x. Joint 1 is at y = 2, scaled by 2, and was bound there unscaled."""
-    corners = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    arrays = {
-        "POSITION": corners,
-        "JOINTS_0": np.uint8([[0, 1, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]]),
-        "WEIGHTS_0": np.float32([[0.5, 0.5, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]]),
-        "target": np.float32([[0, 0, 0], [0, 0, 4], [0, 0, 0]]),
-        "inverse": np.stack([np.eye(4), [[1, 0, 0, 0], [0, 1, 0, -2], [0, 0, 1, 0], [0, 0, 0, 1]]]),
+    binds = np.stack([np.eye(4)] * 2)
+    binds[1, 1, 3] = -2
+    arrays = Arrays()
+    attributes = {
+        "POSITION": arrays.add(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])),
+        "JOINTS_0": arrays.add(np.uint8([[0, 1, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]])),
+        "WEIGHTS_0": arrays.add(np.float32([[0.5, 0.5, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]])),
     }
-    arrays["inverse"] = arrays["inverse"].swapaxes(1, 2).astype(np.float32).reshape(2, 16)
-    content, views, accessors = b"", [], []
-    for values in arrays.values():
-        kind = {3: "VEC3", 4: "VEC4", 16: "MAT4"}[values.shape[1]]
-        component = 5121 if values.dtype == np.uint8 else 5126
-        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": values.nbytes})
-        accessors.append(
-            {
-                "bufferView": len(accessors),
-                "componentType": component,
-                "count": len(values),
-                "type": kind,
-            }
-        )
-        content += values.tobytes()
-    primitive = {
-        "attributes": {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2},
-        "targets": [{"POSITION": 3}],
-    }
+    target = {"POSITION": arrays.add(np.float32([[0, 0, 0], [0, 0, 4], [0, 0, 0]]))}
+    inverse = arrays.add(binds.swapaxes(1, 2).astype(np.float32))
     tree = {
-        "buffers": [
-            {
-                "byteLength": len(content),
-                "uri": f"data:;base64,{base64.b64encode(content).decode()}",
-            }
+        "meshes": [
+            {"primitives": [{"attributes": attributes, "targets": [target]}], "weights": [0.5]}
         ],
-        "bufferViews": views,
-        "accessors": accessors,
-        "meshes": [{"primitives": [primitive], "weights": [0.5]}],
-        "skins": [{"joints": [1, 2], "inverseBindMatrices": 4}],
+        "skins": [{"joints": [1, 2], "inverseBindMatrices": inverse}],
         "nodes": [
             {"mesh": 0, "skin": 0, "translation": [100, 0, 0]},  # has no effect
             {"translation": [5, 0, 0]},
             {"translation": [0, 2, 0], "scale": [2, 2, 2]},
         ],
     }
-    (tmp_path / "a.gltf").write_text(gltf(**tree))
+    (tmp_path / "a.gltf").write_text(gltf(**tree, **arrays.tree(embedded=True)))
     found = read_mesh(tmp_path / "a.gltf").vertices
     assert found == pytest.approx(np.array([[2.5, -1, 0], [6, 0, 2], [0, 0, 0]]))

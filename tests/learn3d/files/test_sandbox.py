@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import strange_functions as strange
+from children import environment
 
 from learn3d.files.reading import DamagedFile, MissingFile
 from learn3d.files.sandbox import Call, cores, read, read_all
@@ -112,7 +113,6 @@ def _script(path: Path, code: str, **options: object) -> subprocess.Popen:
     """A program that prints the number of its worker, and then does `code`."""
     start = f"import os, sys, strange_functions as s; from learn3d.files.sandbox import read; p = {str(path)!r}\n"
     start += "print(read(s.sleep, p, 0.0), flush=True)\n"
-    paths = os.pathsep.join([str(Path(strange.__file__).parent), *sys.path])
     pipes = {
         "stdout": subprocess.PIPE,
         "stderr": subprocess.PIPE,
@@ -120,7 +120,7 @@ def _script(path: Path, code: str, **options: object) -> subprocess.Popen:
         "start_new_session": True,
     }
     command = [sys.executable, "-c", start + code]
-    return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, **pipes, **options)
+    return subprocess.Popen(command, env=environment(), **pipes, **options)
 
 
 @linux

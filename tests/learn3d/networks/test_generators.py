@@ -6,7 +6,8 @@ import math
 
 import pytest
 import torch
-from torch import Tensor, nn
+from mirrors import reflected
+from torch import nn
 
 import nmr
 from learn3d.networks.generators import (
@@ -29,14 +30,6 @@ def narrow(name: str, symmetry: Symmetry | None) -> MeshGenerator:
         return GENERATORS[name](symmetry)
     kind, channels = cubes[name]
     return kind(symmetry, channels=channels)
-
-
-def reflected(points: Tensor, azimuth_deg: float) -> Tensor:
-    """Points mirrored at the plane through the y axis and the eye of a camera at this azimuth."""
-    angle = math.radians(azimuth_deg)
-    # across the eye's (sin a, 0, -cos a)
-    normal = torch.tensor([math.cos(angle), 0.0, math.sin(angle)])
-    return points - 2 * (points @ normal)[..., None] * normal
 
 
 @pytest.mark.parametrize("name", GENERATORS)
