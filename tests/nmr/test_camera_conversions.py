@@ -5,6 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
+from scenes import double, for_threads, normal, same_bits, uniform, value_and_gradients
+from torch.autograd import gradcheck
+from torch.testing import assert_close
 
 import nmr
 from nmr import cameras, ops
@@ -30,65 +34,49 @@ def pixels(camera, vertices, size=SIZE):
 
 K = np.array([[60.0, 2.0, 22.0], [0.0, 55.0, 26.0], [0.0, 0.0, 1.0]])
 DISTORTION = np.array([0.1, -0.05, 0.01, -0.02, 0.03])
+T = np.array([0.1, -0.2, 3.0])
+
+
+def batch_of(*arrays):
+    """Arrays as tensors [1, ...]."""
+    return [torch.as_tensor(np.asarray(x))[None] for x in arrays]
 
 
 def opencv_pixels(vertices, K, R, t, d):
     """The formulas of OpenCV's calib3d page; centres of pixels are integers."""
-    k1, k2, p1, p2, k3 = d
-    out = []
-    for X in vertices:
-        x, y, z = R @ X + t
-        a, b = x / z, y / z
-        r2 = a * a + b * b
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        u = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
-        v = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
-        out.append([K[0, 0] * u + K[0, 1] * v + K[0, 2], K[1, 1] * v + K[1, 2], z])
-    return np.array(out)
-
-
-T = np.array([0.1, -0.2, 3.0])
+    origin, extent = np.zeros(3), 1.0
+    arguments = vertices, np.column_stack([R, t]), K[:2], d, origin, extent
+    return chain(*batch_of(*arguments), True)[0].numpy()
 
 
 @pytest.mark.parametrize("column", [False, True])
 @pytest.mark.parametrize("count", [0, 4, 5])
 def test_opencv_pixels(count, column):
-    d = np.zeros(5)
-    d[:count] = DISTORTION[:count]
-    shape = (-1, 1) if column else (-1,)
-    camera = cameras.from_opencv(
-        K,
-        rotation(1),
-        T.reshape(shape),
-        d[:count].reshape(shape) if count else None,
-        height=SIZE,
-        width=SIZE,
-    )
-    np.testing.assert_allclose(
-        pixels(camera, points()), opencv_pixels(points(), K, rotation(1), T, d), atol=1e-10
-    )
+    d, t = DISTORTION * (np.arange(5) < count), T
+    given = d[:count] if count else None
+    if column:
+        t, given = t[:, None], given[:, None] if count else None
+    camera = cameras.from_opencv(K, rotation(1), t, given, height=SIZE, width=SIZE)
+    wanted = opencv_pixels(points(), K, rotation(1), T, d)
+    assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
 
 
 def test_pixel_center_is_where_counting_begins():
     """A calibration that counts from the corner of the first pixel is what Pinhole itself takes."""
-    camera = cameras.from_opencv(K, rotation(1), T, height=SIZE, width=SIZE, pixel_center=0.5)
-    plain = nmr.Pinhole(K, rotation(1), T, orig_size=SIZE)
-    np.testing.assert_allclose(pixels(camera, points()), pixels(plain, points()), atol=1e-12)
-    back = cameras.to_opencv(plain, height=SIZE, width=SIZE, pixel_center=0.5)
-    for a, b in zip(back[:3], (K, rotation(1), T), strict=True):
-        np.testing.assert_allclose(a[0], b, atol=1e-12)
+    given, how = (K, rotation(1), T), dict(height=SIZE, width=SIZE, pixel_center=0.5)
+    plain = nmr.Pinhole(*given, orig_size=SIZE)
+    camera = cameras.from_opencv(*given, **how)
+    assert_allclose(pixels(camera, points()), pixels(plain, points()), atol=1e-12)
+    for back, value in zip(cameras.to_opencv(plain, **how), given, strict=False):
+        assert_allclose(back[0], value, atol=1e-12)
 
 
 def opengl_pixels(vertices, view, projection):
     """clip = P V (X, 1), divided by w; the viewport has its origin at the lower left, centres at half-integers."""
-    out = []
-    for X in vertices:
-        eye = view @ [*X, 1.0]
-        clip = projection @ eye
-        x, y = clip[:2] / clip[3]
-        from_left, from_below = (x + 1) / 2 * SIZE, (y + 1) / 2 * SIZE
-        out.append([from_left - 0.5, SIZE - from_below - 0.5, -eye[2]])
-    return np.array(out)
+    eye = np.column_stack([vertices, np.ones(len(vertices))]) @ view.T
+    clip = eye @ projection.T
+    from_left, from_below = ((clip[:, k] / clip[:, 3] + 1) / 2 * SIZE for k in (0, 1))
+    return np.column_stack([from_left - 0.5, SIZE - from_below - 0.5, -eye[:, 2]])
 
 
 def gl_view(seed=3):
@@ -99,11 +87,12 @@ def gl_view(seed=3):
 
 def gl_frustum(left, right, bottom, top, n, f):
     """As glFrustum documents it."""
+    width, height, depth = right - left, top - bottom, f - n
     return np.array(
         [
-            [2 * n / (right - left), 0, (right + left) / (right - left), 0],
-            [0, 2 * n / (top - bottom), (top + bottom) / (top - bottom), 0],
-            [0, 0, -(f + n) / (f - n), -2 * f * n / (f - n)],
+            [2 * n / width, 0, (right + left) / width, 0],
+            [0, 2 * n / height, (top + bottom) / height, 0],
+            [0, 0, -(f + n) / depth, -2 * f * n / depth],
             [0, 0, -1, 0],
         ]
     )
@@ -111,40 +100,29 @@ def gl_frustum(left, right, bottom, top, n, f):
 
 def gl_ortho(left, right, bottom, top, n, f):
     """As glOrtho documents it."""
-    return np.array(
-        [
-            [2 / (right - left), 0, 0, -(right + left) / (right - left)],
-            [0, 2 / (top - bottom), 0, -(top + bottom) / (top - bottom)],
-            [0, 0, -2 / (f - n), -(f + n) / (f - n)],
-            [0, 0, 0, 1],
-        ]
-    )
+    size = np.array([right - left, top - bottom, f - n])
+    matrix = np.diag([*(np.array([2, 2, -2]) / size), 1])
+    matrix[:3, 3] = -np.array([right + left, top + bottom, f + n]) / size
+    return matrix
 
 
 @pytest.mark.parametrize("make", [gl_frustum, gl_ortho])
 def test_opengl_pixels_and_round_trip(make):
-    projection = make(-0.3, 0.2, -0.1, 0.4, 0.5, 20.0)
-    camera = cameras.from_opengl(gl_view(), projection)
-    np.testing.assert_allclose(
-        pixels(camera, points()), opengl_pixels(points(), gl_view(), projection), atol=1e-10
-    )
-    view, back = cameras.to_opengl(camera, near=0.5, far=20.0)
-    np.testing.assert_allclose(view[0], gl_view(), atol=1e-12)
-    np.testing.assert_allclose(back[0], projection, atol=1e-12)
+    given = gl_view(), make(-0.3, 0.2, -0.1, 0.4, 0.5, 20.0)
+    camera = cameras.from_opengl(*given)
+    assert_allclose(pixels(camera, points()), opengl_pixels(points(), *given), atol=1e-10)
+    for back, value in zip(cameras.to_opengl(camera, near=0.5, far=20.0), given, strict=True):
+        assert_allclose(back[0], value, atol=1e-12)
 
 
-def pytorch3d_pixels(vertices, R, T, focal, principal, height, width, orthographic=False):
+def pytorch3d_pixels(focal, principal, height, width, orthographic=False):
     """NDC as the page on cameras documents it: X left, Y up; the shorter side of the image spans [-1, 1]."""
-    out = []
-    for X in vertices:
-        x, y, z = X @ R + T
-        depth = 1.0 if orthographic else z
-        x_ndc, y_ndc = focal[0] * x / depth + principal[0], focal[1] * y / depth + principal[1]
-        shorter = min(height, width)
-        from_left, from_top = width / 2 - x_ndc * shorter / 2, height / 2 - y_ndc * shorter / 2
-        # our square image shows all of theirs
-        out.append([from_left / width * SIZE - 0.5, from_top / height * SIZE - 0.5, z])
-    return np.array(out)
+    x, y, z = (points() @ rotation(4) + T).T
+    depth = 1.0 if orthographic else z
+    ndc = np.array([focal[0] * x / depth + principal[0], focal[1] * y / depth + principal[1]])
+    from_left, from_top = np.array([[width], [height]]) / 2 - ndc * min(height, width) / 2
+    # our square image shows all of theirs
+    return np.column_stack([from_left / width * SIZE - 0.5, from_top / height * SIZE - 0.5, z])
 
 
 FOCAL, PRINCIPAL = [1.3, 1.1], [0.2, -0.1]
@@ -153,37 +131,30 @@ FOCAL, PRINCIPAL = [1.3, 1.1], [0.2, -0.1]
 @pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("height, width", [(48, 48), (40, 60), (60, 40)])
 def test_pytorch3d_pixels_and_round_trip(height, width, orthographic):
-    camera = cameras.from_pytorch3d(
-        rotation(4), T, [FOCAL], [PRINCIPAL], image_size=(height, width), orthographic=orthographic
-    )
-    wanted = pytorch3d_pixels(
-        points(), rotation(4), T, FOCAL, PRINCIPAL, height, width, orthographic
-    )
-    np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
-    back = cameras.to_pytorch3d(camera, image_size=(height, width))
-    assert back["in_ndc"] is True and back["image_size"].tolist() == [[height, width]]
-    for name, value in {
-        "R": rotation(4),
-        "T": T,
-        "focal_length": FOCAL,
-        "principal_point": PRINCIPAL,
-    }.items():
-        np.testing.assert_allclose(back[name][0], value, atol=1e-12)
+    given = dict(R=rotation(4), T=T, focal_length=[FOCAL], principal_point=[PRINCIPAL])
+    size = dict(image_size=(height, width))
+    camera = cameras.from_pytorch3d(**given, **size, orthographic=orthographic)
+    wanted = pytorch3d_pixels(FOCAL, PRINCIPAL, height, width, orthographic)
+    assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
+    back = cameras.to_pytorch3d(camera, **size)
+    assert back.pop("in_ndc") is True and back.pop("image_size").tolist() == [[height, width]]
+    for name, value in back.items():
+        assert_allclose(value, np.reshape(given[name], value.shape), atol=1e-12)
 
 
 @pytest.mark.parametrize("height, width", [(40, 60), (60, 40)])
 def test_pytorch3d_screen_space(height, width):
     """f_ndc = 2 f / s, p_ndc = -(p - size / 2) 2 / s with s the shorter side."""
-    s, focal, principal = min(height, width), np.array([50.0, 45.0]), np.array([27.0, 22.0])
-    camera = cameras.from_pytorch3d(
-        rotation(4), T, [focal], [principal], in_ndc=False, image_size=(height, width)
-    )
-    ndc = -(principal - np.array([width, height]) / 2) * 2 / s
-    wanted = pytorch3d_pixels(points(), rotation(4), T, focal * 2 / s, ndc, height, width)
-    np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
-    back = cameras.to_pytorch3d(camera, in_ndc=False, image_size=(height, width))
-    np.testing.assert_allclose(back["focal_length"][0], focal)
-    np.testing.assert_allclose(back["principal_point"][0], principal)
+    focal, principal = np.array([50.0, 45.0]), np.array([27.0, 22.0])
+    how = dict(in_ndc=False, image_size=(height, width))
+    camera = cameras.from_pytorch3d(rotation(4), T, [focal], [principal], **how)
+    scale = 2 / min(height, width)
+    ndc = -(principal - np.array([width, height]) / 2) * scale
+    wanted = pytorch3d_pixels(focal * scale, ndc, height, width)
+    assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
+    back = cameras.to_pytorch3d(camera, **how)
+    assert_allclose(back["focal_length"][0], focal)
+    assert_allclose(back["principal_point"][0], principal)
 
 
 @pytest.mark.parametrize("degrees", [True, False])
@@ -192,32 +163,28 @@ def test_pytorch3d_field_of_view(degrees):
     fov = 50.0 if degrees else math.radians(50.0)
     camera = cameras.from_pytorch3d_fov(rotation(4), T, fov, 1.25, degrees=degrees)
     focal = 1 / math.tan(math.radians(25.0))
-    wanted = pytorch3d_pixels(points(), rotation(4), T, [focal / 1.25, focal], [0, 0], SIZE, SIZE)
-    np.testing.assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
+    wanted = pytorch3d_pixels([focal / 1.25, focal], [0, 0], SIZE, SIZE)
+    assert_allclose(pixels(camera, points()), wanted, atol=1e-10)
 
 
+UPRIGHT = K * [[1, 0, 1], [1, 1, 1], [1, 1, 1]]  # without skew, which PyTorch3D cannot express
 CAMERAS = {
     "LookAt": nmr.LookAt.from_angles(2.0, [10.0, 20.0], [30.0, 200.0], half_fov_deg=[25.0, 30.0]),
     "Look": nmr.Look([0.1, 0.2, -2.0], [0.0, -0.1, 1.0]),
     "Orthographic": nmr.Orthographic([0.1, 0.2, -2.0], scale=0.8),
-    "Pinhole": nmr.Pinhole(
-        np.diag([60.0, 55.0, 1.0]) + [[0, 0, 22], [0, 0, 26], [0, 0, 0]],
-        rotation(1),
-        T,
-        orig_size=48,
-    ),
+    "Pinhole": nmr.Pinhole(UPRIGHT, rotation(1), T, orig_size=48),
 }
 
 
-def through(camera, convention):
+def through(camera, convention, **size):
     if convention == "opencv":
-        return cameras.from_opencv(
-            *cameras.to_opencv(camera, height=40, width=60), height=40, width=60
-        )
+        how = dict(height=40, width=60)
+        return cameras.from_opencv(*cameras.to_opencv(camera, **how), **how)
     if convention == "opengl":
-        return cameras.from_opengl(*cameras.to_opengl(camera, near=0.1, far=10.0))
-    arguments = cameras.to_pytorch3d(camera)
-    return cameras.from_pytorch3d(**arguments, orthographic=not camera.projection().perspective)
+        return cameras.from_opengl(*cameras.to_opengl(camera, near=0.1, far=10.0, **size))
+    arguments = cameras.to_pytorch3d(camera, **size)
+    orthographic = not camera.projection().perspective
+    return cameras.from_pytorch3d(**arguments, orthographic=orthographic)
 
 
 @pytest.mark.parametrize("convention", ["opencv", "opengl", "pytorch3d"])
@@ -228,9 +195,7 @@ def test_every_camera_survives_every_convention(name, convention):
         pytest.skip("OpenCV has no orthographic camera")
     vertices = torch.from_numpy(points())[None]
     expected = camera.for_image(40, 60) if convention == "opencv" else camera
-    torch.testing.assert_close(
-        through(camera, convention).transform(vertices), expected.transform(vertices)
-    )
+    assert_close(through(camera, convention).transform(vertices), expected.transform(vertices))
 
 
 @pytest.mark.parametrize("size", [(40, 60), (60, 40)])
@@ -240,58 +205,51 @@ def test_images_that_are_not_square(name, size):
     camera, vertices = CAMERAS[name], torch.from_numpy(points())[None]
     expected = camera.for_image(*size).transform(vertices)
     assert (name == "Pinhole") == torch.equal(expected, camera.transform(vertices))
-    opengl = cameras.to_opengl(camera, near=0.1, far=10.0, image_size=size)
-    torch.testing.assert_close(cameras.from_opengl(*opengl).transform(vertices), expected)
     arguments = cameras.to_pytorch3d(camera, image_size=size)
     assert arguments.pop("image_size").tolist() == [list(size)]
     arguments["orthographic"] = not camera.projection().perspective
-    sized = cameras.from_pytorch3d(**arguments, image_size=size)
-    torch.testing.assert_close(sized.transform(vertices), expected)
-    free = cameras.from_pytorch3d(**arguments).for_image(*size)
-    torch.testing.assert_close(free.transform(vertices), expected)
+    for back in (
+        through(camera, "opengl", image_size=size),
+        cameras.from_pytorch3d(**arguments, image_size=size),
+        cameras.from_pytorch3d(**arguments).for_image(*size),
+    ):
+        assert_close(back.transform(vertices), expected)
 
 
 def test_a_proper_rotation_for_mirrored_vertices():
     """The recipe of the module's docs: vertices * (1, 1, -1) and R diag(1, 1, -1)."""
-    mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    mirror, size = torch.diag(double([1.0, 1.0, -1.0])), dict(height=48, width=48)
     vertices = torch.from_numpy(points())[None]
-    K, R, t, _ = cameras.to_opencv(CAMERAS["LookAt"], height=48, width=48)
-    proper = cameras.from_opencv(K, R @ mirror, t, height=48, width=48)
-    wanted = CAMERAS["LookAt"].transform(vertices)
-    torch.testing.assert_close(proper.transform(vertices @ mirror), wanted)
+    K, R, t, _ = cameras.to_opencv(CAMERAS["LookAt"], **size)
     given = cameras.to_pytorch3d(CAMERAS["Look"])
-    proper = cameras.from_pytorch3d(**given | {"R": mirror @ given["R"]})
-    torch.testing.assert_close(
-        proper.transform(vertices @ mirror), CAMERAS["Look"].transform(vertices)
-    )
+    for name, proper in (
+        ("LookAt", cameras.from_opencv(K, R @ mirror, t, **size)),
+        ("Look", cameras.from_pytorch3d(**given | {"R": mirror @ given["R"]})),
+    ):
+        assert_close(proper.transform(vertices @ mirror), CAMERAS[name].transform(vertices))
 
 
 def test_conversions_are_differentiable():
-    def parameter(values):
-        return torch.as_tensor(values, dtype=torch.float64).requires_grad_()
+    vertices, size = torch.from_numpy(points(n=4))[None], dict(height=SIZE, width=SIZE)
 
-    vertices = torch.from_numpy(points(n=4))[None]
+    def opencv(*calibration):
+        return through(cameras.from_opencv(*calibration, **size), "opencv").transform(vertices)
 
-    def opencv(K, R, t, d):
-        return through(
-            cameras.from_opencv(K, R, t, d, height=SIZE, width=SIZE), "opencv"
-        ).transform(vertices)
+    def pytorch3d(eye, *camera):
+        first = through(cameras.from_pytorch3d(*camera, image_size=(4, 5)), "pytorch3d")
+        second = through(nmr.LookAt(eye), "opengl")
+        return first.transform(vertices) + through(second, "pytorch3d").transform(vertices)
 
-    assert torch.autograd.gradcheck(opencv, tuple(map(parameter, (K, rotation(1), T, DISTORTION))))
+    def field_of_view(x):
+        return cameras.from_pytorch3d_fov(rotation(4), T, x).transform(vertices)
 
-    def pytorch3d(R, t, f, p, eye):
-        first = cameras.from_pytorch3d(R, t, f, p, image_size=(4, 5))
-        second = through(nmr.LookAt(eye), "pytorch3d")
-        return through(first, "pytorch3d").transform(vertices) + through(
-            second, "opengl"
-        ).transform(vertices)
-
-    values = rotation(4), T, [FOCAL], [PRINCIPAL], [0.1, 0.2, -2.0]
-    assert torch.autograd.gradcheck(pytorch3d, tuple(map(parameter, values)))
-    fov = parameter([40.0, 50.0])
-    assert torch.autograd.gradcheck(
-        lambda x: cameras.from_pytorch3d_fov(rotation(4), T, x).transform(vertices), fov
-    )
+    for function, values in (
+        (opencv, (K, rotation(1), T, DISTORTION)),
+        (pytorch3d, ([0.1, 0.2, -2.0], rotation(4), T, [FOCAL], [PRINCIPAL])),
+        (field_of_view, ([40.0, 50.0],)),
+    ):
+        leaves = [torch.as_tensor(x, dtype=torch.float64).requires_grad_() for x in values]
+        gradcheck(function, leaves)
 
 
 def chain(vertices, matrix, intrinsics, distortion, origin, extent, perspective):
@@ -311,69 +269,46 @@ def chain(vertices, matrix, intrinsics, distortion, origin, extent, perspective)
     return torch.cat([xy, u[..., 2:]], dim=-1)
 
 
-def random_arguments(
-    batch, num_vertices, *, shared=False, distorted=True, dtype=torch.float64, seed=0
-):
+def random_arguments(batch, num_vertices, shared, distorted=True):
     """vertices, matrix, intrinsics, distortion, origin, extent: all general, all vertices in front of the camera."""
-    torch.manual_seed(seed)
-    vertices = torch.rand(1 if shared else batch, num_vertices, 3, dtype=torch.float64) - 0.5
-    matrix, intrinsics = torch.randn(batch, 3, 4), torch.randn(batch, 2, 3)
+    vertices = uniform(1 if shared else batch, num_vertices, 3) - 0.5
+    matrix, intrinsics = normal(batch, 3, 4), normal(batch, 2, 3, seed=1)
     matrix[:, 2] = torch.tensor([0.1, -0.2, 1.0, 3.0])
     # all vertices are within its reach
-    distortion = 0.01 * torch.randn(batch, 5) if distorted else None
-    arguments = (
-        vertices,
-        matrix,
-        intrinsics,
-        distortion,
-        0.1 * torch.randn(batch, 3),
-        0.5 + torch.rand(batch),
-    )
-    return [None if x is None else x.to(dtype) for x in arguments]
+    distortion = 0.01 * normal(batch, 5, seed=2) if distorted else None
+    origin, extent = 0.1 * normal(batch, 3, seed=3), 0.5 + uniform(batch, seed=1)
+    return vertices, matrix, intrinsics, distortion, origin, extent
 
 
-def project(
-    vertices, matrix, intrinsics, distortion, origin, extent, perspective=True, starts=None
-):
-    origin = torch.zeros_like(matrix[:, 0, :3]) if origin is None else origin
-    extent = torch.ones_like(matrix[:, 0, 0]) if extent is None else extent
-    camera = torch.cat(
-        [matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)], dim=1
-    )
-    return ops.project(vertices, camera, distortion, starts, perspective)
+def project(vertices, matrix, intrinsics, distortion, origin, extent, perspective=True):
+    rows = matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)
+    return ops.project(vertices, torch.cat(rows, dim=1), distortion, None, perspective)
 
 
-@pytest.mark.parametrize(
-    "perspective, distorted", [(True, True), (True, False), (False, False), (False, True)]
-)
+@pytest.mark.parametrize("perspective", [True, False])
+@pytest.mark.parametrize("distorted", [True, False])
 @pytest.mark.parametrize("shared", [False, True])
 def test_project_is_the_chain_and_its_gradient(perspective, distorted, shared):
     """1100 vertices: several chunks, and a last group that is not full."""
-    arguments = random_arguments(3, 1100, shared=shared, distorted=distorted)
-    inputs = [x.requires_grad_() for x in arguments if x is not None]
-    upstream = torch.randn(3, 1100, 3, dtype=torch.float64)
-    got, wanted = project(*arguments, perspective), chain(*arguments, perspective)
-    torch.testing.assert_close(got, wanted, rtol=1e-12, atol=1e-12)
-    kwargs = {"grad_outputs": upstream, "allow_unused": True, "materialize_grads": True}
-    for a, b in zip(
-        torch.autograd.grad(got, inputs, **kwargs),
-        torch.autograd.grad(wanted, inputs, **kwargs),
-        strict=True,
-    ):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+    arguments = random_arguments(3, 1100, shared, distorted)
+    given = [x for x in arguments if x is not None]
+
+    def through_all(function):
+        def call(*given):
+            rest = iter(given)
+            return function(*(None if x is None else next(rest) for x in arguments), perspective)
+
+        return call
+
+    (got, *grads), (wanted, *wanted_grads) = (
+        value_and_gradients(through_all(function), *given) for function in (project, chain)
+    )
+    assert_close(got, wanted, rtol=1e-12, atol=1e-12)
+    assert_close(grads, wanted_grads, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_same_bits_for_any_number_of_threads(shared):
-    arguments = random_arguments(5, 1500, shared=shared, dtype=torch.float32)
-    upstream, before, results = torch.randn(5, 1500, 3), torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            inputs = [x.clone().requires_grad_() for x in arguments]
-            out = project(*inputs)
-            results.append([out.detach(), *torch.autograd.grad(out, inputs, upstream)])
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    arguments = [x.float() for x in random_arguments(5, 1500, shared)]
+    one, *others = for_threads((1, 2, 5), lambda: value_and_gradients(project, *arguments))
+    assert all(same_bits(one, other) for other in others)

@@ -8,7 +8,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import for_threads
 from vectors import load_vector, vector_names
 
 import nmr
@@ -24,48 +23,32 @@ def test_the_vectors_are_there():
 @pytest.mark.parametrize("name", VOXELS)
 def test_published_voxels(name):
     v = load_vector(name)
-    voxels = nmr.voxelize(
-        torch.from_numpy(v["vertices"]),
-        torch.from_numpy(v["faces"]),
-        int(v["size"]),
-        bool(v["normalize"]),
-    )
+    vertices, faces = torch.from_numpy(v["vertices"]), torch.from_numpy(v["faces"])
+    voxels = nmr.voxelize(vertices, faces, int(v["size"]), bool(v["normalize"]))
     assert np.array_equal(voxels.numpy(), v["voxels"].astype(bool))
 
 
-def test_a_box_fills_its_cells_and_axes_keep_their_order():
-    corners = torch.tensor(
-        [[x, y, z] for x in (0.12, 0.88) for y in (0.32, 0.68) for z in (0.46, 0.56)]
-    )
+def box(*sides):
+    """A box from pairs (low, high): vertices, faces."""
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = torch.tensor([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    voxels = nmr.voxelize(corners, faces, 20)[0]
-    extent = [
-        voxels.any(dim).any(0 if other else -1).sum().item()
-        for dim, other in ((1, 0), (0, 0), (0, 1))
-    ]
-    assert extent == [16, 8, 3]
-    inside = voxels[voxels.any(1).any(1)][:, voxels.any(0).any(1)][:, :, voxels.any(0).any(0)]
-    assert inside.all()
+    faces = [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))]
+    return torch.cartesian_prod(*map(torch.tensor, sides)), torch.tensor(faces)
+
+
+def test_a_box_fills_its_cells_and_axes_keep_their_order():
+    voxels = nmr.voxelize(*box((0.12, 0.88), (0.32, 0.68), (0.46, 0.56)), 20)[0]
+    cells = voxels.nonzero()
+    extent = cells.amax(0) - cells.amin(0) + 1
+    assert extent.tolist() == [16, 8, 3] and len(cells) == 16 * 8 * 3
 
 
 @pytest.mark.parametrize("definition", DEFINITIONS)
 def test_a_shape_that_leaves_the_grid_is_hollow(definition):
     vertices, faces = nmr.icosphere(3)
-    closed = nmr.voxelize(0.4 * vertices + 0.5, faces, definition=definition)[0]
-    opened = nmr.voxelize(
-        0.4 * vertices + torch.tensor([0.2, 0.5, 0.5]), faces, definition=definition
-    )[0]
-    assert closed[16, 16, 16] and not opened[6, 16, 16]
-
-
-@pytest.mark.parametrize("definition", DEFINITIONS)
-def test_same_grid_for_any_number_of_threads_and_batch(definition):
-    vertices, faces = nmr.icosphere(2)
-    batch = torch.stack([s * vertices + 0.5 for s in (0.1, 0.2, 0.3, 0.4, 0.45)])
-    grids = for_threads((1, 2, 5), lambda: nmr.voxelize(batch, faces, definition=definition))
-    assert torch.equal(grids[0], grids[1]) and torch.equal(grids[0], grids[2])
-    assert torch.equal(nmr.voxelize(batch[3], faces, definition=definition)[0], grids[0][3])
+    for x, filled in ((0.5, True), (0.2, False)):
+        placed = 0.4 * vertices + torch.tensor([x, 0.5, 0.5])
+        grid = nmr.voxelize(placed, faces, definition=definition)[0]
+        assert grid[int(32 * x), 16, 16] == filled
 
 
 def touched_cells(corners, size):
@@ -75,10 +58,8 @@ def touched_cells(corners, size):
     side of its answer, relative to the length of the axis.
     """
     unit = 64 if np.issubdtype(corners.dtype, np.integer) else 1
-    grid = np.arange(size + 1) * unit
-    boxes = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), -1)
-    offsets = list(itertools.product((0, 1), repeat=3))
-    eight = np.stack([boxes[x : size + x, y : size + y, z : size + z] for x, y, z in offsets], 3)
+    first = np.stack(np.indices((size,) * 3), -1)[..., None, :]
+    eight = (first + list(itertools.product((0, 1), repeat=3))) * unit
     touched, margin = np.zeros((size,) * 3, bool), np.full((size,) * 3, np.inf)
     for a, b, c in corners:
         sides = (b - a, c - b, a - c)
@@ -96,22 +77,15 @@ def touched_cells(corners, size):
 
 def fill(surface):
     """All that is not reached from the border through faces of cells off the surface."""
-    outside = np.zeros_like(surface)
-    border = np.pad(
-        np.zeros([max(n - 2, 0) for n in surface.shape], bool),
-        [(1, min(n - 1, 1)) for n in surface.shape],
-        constant_values=True,
-    )
-    outside[border & ~surface] = True
+    open_cells = np.pad(~surface, 1, constant_values=True)
+    outside = np.zeros_like(open_cells)
+    outside[0, 0, 0] = True
     while True:
-        grown = np.pad(outside, 1)
-        reached = np.any([np.roll(grown, step, axis) for axis in range(3) for step in (1, -1)], 0)[
-            1:-1, 1:-1, 1:-1
-        ]
-        more = reached & ~surface & ~outside
-        if not more.any():
-            return ~outside
-        outside |= more
+        steps = [np.roll(outside, step, axis) for axis in range(3) for step in (1, -1)]
+        grown = np.any([outside, *steps], 0) & open_cells
+        if np.array_equal(grown, outside):
+            return ~outside[1:-1, 1:-1, 1:-1]
+        outside = grown
 
 
 def kato19(vertices, faces, size):
@@ -148,10 +122,8 @@ def test_kato19_is_its_slow_definition_elsewhere(seed):
 
 
 def test_a_box_that_fills_the_grid_is_open_in_kato18():
-    corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = torch.tensor([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    thick, thin = (nmr.voxelize(corners, faces, 8, definition=d)[0] for d in ("kato19", "kato18"))
+    whole = box(*[(0.0, 1.0)] * 3)
+    thin, thick = (nmr.voxelize(*whole, 8, definition=d)[0] for d in DEFINITIONS)
     assert thick.all() and not thin[4, 4, 4]
 
 
@@ -161,26 +133,21 @@ NOT_NUMBERS = [float("nan"), float("inf"), -float("inf"), 3e38, -1e30, 1e10]
 @pytest.mark.parametrize("value", NOT_NUMBERS)
 @pytest.mark.parametrize("place", range(9))
 def test_kato19_of_a_face_that_is_not_there(value, place):
-    vertices = torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.3, 0.4], [0.4, 0.8, 0.9]])
-    good = nmr.voxelize(vertices, torch.tensor([[0, 1, 2]]), 16, definition="kato19")
-    bad = vertices.clone()
-    bad.view(-1)[place] = value
-    assert not nmr.voxelize(bad, torch.tensor([[0, 1, 2]]), 16, definition="kato19").any()
-    both = torch.cat([bad, vertices])
-    grid = nmr.voxelize(both, torch.tensor([[0, 1, 2], [3, 4, 5]]), 16, definition="kato19")
-    assert torch.equal(grid, good) and good.any()
+    vertices, face = np.float32([[0.1, 0.2, 0.3], [0.9, 0.3, 0.4], [0.4, 0.8, 0.9]]), [[0, 1, 2]]
+    bad = vertices.copy()
+    bad.flat[place] = value
+    assert not kato19(bad, face, 16).any()
+    good, both = kato19(vertices, face, 16), np.concatenate([bad, vertices])
+    assert np.array_equal(kato19(both, [[0, 1, 2], [3, 4, 5]], 16), good) and good.any()
 
 
 def test_kato19_of_a_face_far_larger_than_the_grid():
     """Many grids wide and through its middle: a slab of cells, found without looking at every cell."""
-    vertices = torch.tensor([[-900.0, -900.0, 0.3], [900.0, -900.0, 0.3], [0.0, 900.0, 0.3]])
-    grid = nmr.voxelize(vertices, torch.tensor([[0, 1, 2]]), 256, definition="kato19")[0]
+    vertices = np.float32([[-900, -900, 0.3], [900, -900, 0.3], [0, 900, 0.3]])
+    grid = kato19(vertices, [[0, 1, 2]], 256)
     assert grid[:, :, 76].all() and grid.sum() == 256 * 256
-    tilted = (
-        vertices + torch.tensor([0.0, 0.0, 0.2]) + torch.tensor([0.0, 0.0, 1.0]) * vertices[:, :1]
-    )
-    grid = nmr.voxelize(tilted, torch.tensor([[0, 1, 2]]), 256, definition="kato19")[0]
-    assert 256 * 250 > grid.sum(0).bool().sum() > 128 * 250
+    vertices[:, 2] += 0.2 + vertices[:, 0]  # tilted
+    assert 256 * 250 > kato19(vertices, [[0, 1, 2]], 256).any(0).sum() > 128 * 250
 
 
 @settings(max_examples=150, deadline=None)

@@ -3,20 +3,19 @@
 import numpy as np
 import pytest
 import torch
+from scenes import leaf_of, uniform
+from torch.testing import assert_close
 
 import nmr
 import nmr.neural_renderer as nr
 from nmr.neural_renderer.load_obj import bake_textures
 
 
-def scene(batch=2, ts=2, dtype=torch.float32):
+def scene(batch=2, ts=2):
     vertices, faces = nmr.icosphere(1)
-    generator = torch.Generator().manual_seed(0)
-    vertices = vertices.to(dtype) * (
-        0.8 + 0.2 * torch.rand(batch, len(vertices), 1, generator=generator, dtype=dtype)
-    )
-    textures = torch.rand(batch, len(faces), ts, ts, ts, 3, generator=generator, dtype=dtype)
-    return vertices, faces.expand(batch, -1, -1), textures
+    radius = 0.8 + 0.2 * uniform(batch, len(vertices), 1, dtype=torch.float32)
+    textures = uniform(batch, len(faces), ts, ts, ts, 3, seed=1, dtype=torch.float32)
+    return radius * vertices, faces.expand(batch, -1, -1), textures
 
 
 def look_at_renderer(**settings):
@@ -25,20 +24,10 @@ def look_at_renderer(**settings):
     return renderer
 
 
-def test_light_on_three_faces():
-    faces, textures = torch.rand(3, 1, 3, 3), torch.rand(3, 1, 2, 2, 2, 3)
-    together = nr.lighting(faces, textures, direction=(0.3, 0.5, 0.8))
-    for b in range(3):
-        one = slice(b, b + 1)
-        torch.testing.assert_close(
-            together[one], nr.lighting(faces[one], textures[one], direction=(0.3, 0.5, 0.8))
-        )
-
-
 @pytest.mark.parametrize("fill_back", [True, False])
 def test_textures_stay_as_they_are(fill_back):
     vertices, faces, textures = scene()
-    leaf = textures.clone().requires_grad_()
+    leaf = leaf_of(textures)
     renderer = look_at_renderer(fill_back=fill_back)
     first, second = (renderer.render_rgb(vertices, faces, leaf) for _ in range(2))
     assert torch.equal(leaf, textures) and torch.equal(first, second)
@@ -49,31 +38,29 @@ def test_textures_stay_as_they_are(fill_back):
 
 
 @pytest.mark.parametrize("wrapping", ["REPEAT", "MIRRORED_REPEAT", "CLAMP_TO_EDGE"])
-def test_texture_coordinates_of_exactly_0_and_1(wrapping):
+@pytest.mark.parametrize("shift", [0, 2, -4])
+def test_texture_coordinates_of_exactly_0_and_1(wrapping, shift):
+    if shift and wrapping == "CLAMP_TO_EDGE":
+        pytest.skip("there are no coordinates beyond the edge")
     image = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
-    for shift in (0, 2, -4) if wrapping != "CLAMP_TO_EDGE" else (0,):
-        uv = np.array([[[0, 0], [1, 0], [1, 1]]], dtype=np.float32) + shift
-        kept = uv.copy()
-        baked = bake_textures(image, uv, 4, wrapping, True)
-        assert np.array_equal(uv, kept)
-        for k, corner in enumerate([image[1, 0], image[1, 1], image[0, 1]]):
-            assert np.array_equal(baked[(0, *(3 * (np.arange(3) == k)))], corner)
+    uv = np.array([[[0, 0], [1, 0], [1, 1]]], dtype=np.float32) + shift
+    kept = uv.copy()
+    baked = bake_textures(image, uv, 4, wrapping, True)
+    assert np.array_equal(uv, kept)
+    for k, corner in enumerate([image[1, 0], image[1, 1], image[0, 1]]):
+        assert np.array_equal(baked[(0, *(3 * (np.arange(3) == k)))], corner)
     if wrapping == "REPEAT":
-        odd = np.array([[[1, 1], [2, 1], [2, 2]]], dtype=np.float32)
-        assert np.array_equal(
-            bake_textures(image, odd, 4, wrapping, True),
-            bake_textures(image, odd - 1, 4, wrapping, True),
-        )
+        assert np.array_equal(bake_textures(image, uv + 1, 4, wrapping, True), baked)
 
 
 @pytest.mark.parametrize("light", [0.0, 0.5])
 def test_one_texel_is_one_colour(light):
     vertices, faces, textures = scene(ts=1)
     renderer = look_at_renderer(light_intensity_directional=light)
-    leaf = textures.clone().requires_grad_()
+    leaf = leaf_of(textures)
     image = renderer.render_rgb(vertices, faces, leaf)
     larger = renderer.render_rgb(vertices, faces, textures.expand(-1, -1, 4, 4, 4, -1))
-    torch.testing.assert_close(image, larger)
+    assert_close(image, larger)
     image.sum().backward()
     assert leaf.grad.shape == textures.shape and leaf.grad.any()
 
@@ -95,8 +82,7 @@ def test_textures_of_more_than_two_to_the_31_numbers():
 
 @pytest.mark.parametrize("mode", ["rgb", "silhouettes", "depth", None])
 def test_no_meshes_at_all(mode):
-    vertices, faces, textures = scene()
-    images = look_at_renderer()(vertices[:0].requires_grad_(), faces[:0], textures[:0], mode=mode)
+    images = look_at_renderer()(*(x[:0] for x in scene()), mode=mode)
     for image in images if mode is None else [images]:
         assert image.shape[0] == 0 and image.shape[-2:] == (16, 16)
 
@@ -104,12 +90,19 @@ def test_no_meshes_at_all(mode):
 @pytest.mark.parametrize("mode", ["rgb", "silhouettes", "depth"])
 def test_fill_back_without_doubled_faces_is_fill_back(mode):
     vertices, faces, textures = scene()
-    faces = faces[:, ::2]  # with holes, through which one sees the inside
-    textures = textures[:, ::2]
-    inside = look_at_renderer(fill_back=True)(vertices, faces, textures, mode=mode)
+    faces, textures = (
+        faces[:, ::2],
+        textures[:, ::2],
+    )  # with holes, through which one sees the inside
     doubled = torch.cat([faces, faces.flip(2)], dim=1)
     cubes = torch.cat([textures, textures.permute(0, 1, 4, 3, 2, 5)], dim=1)
-    expected = look_at_renderer(fill_back=False)(vertices, doubled, cubes, mode=mode)
-    torch.testing.assert_close(inside, expected, rtol=1e-5, atol=1e-6)
-    outside = look_at_renderer(fill_back=False)(vertices, faces, textures, mode=mode)
+    inside, expected, outside = (
+        look_at_renderer(fill_back=fill_back)(vertices, *given, mode=mode)
+        for fill_back, *given in (
+            (True, faces, textures),
+            (False, doubled, cubes),
+            (False, faces, textures),
+        )
+    )
+    assert_close(inside, expected, rtol=1e-5, atol=1e-6)
     assert not torch.allclose(inside, outside)

@@ -3,54 +3,49 @@
 import numpy as np
 import pytest
 import torch
-from vectors import load_vector
+from scenes import value_and_gradients
+from torch.testing import assert_close
+from vectors import load_vector, tensors_of
 
 import nmr
 import nmr.neural_renderer as nr
 
 
-def settings_of(v):
-    names = (
-        "intensity_ambient",
-        "intensity_directional",
-        "color_ambient",
-        "color_directional",
-        "direction",
-    )
-    return {name: v[name].tolist() for name in names}
-
-
 def test_values_and_gradients():
     v = load_vector("lighting")
-    faces, textures = (torch.from_numpy(v[name]).requires_grad_() for name in ("faces", "textures"))
-    out = nr.lighting(faces, textures, **settings_of(v))
-    torch.testing.assert_close(out, torch.from_numpy(v["out"]), rtol=0, atol=1e-6)
-    out.backward(torch.from_numpy(v["upstream"]))
-    torch.testing.assert_close(faces.grad, torch.from_numpy(v["grad_faces"]), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(
-        textures.grad, torch.from_numpy(v["grad_textures"]), rtol=1e-5, atol=1e-6
+    names = "intensity_ambient intensity_directional color_ambient color_directional direction"
+    settings = {name: v[name].tolist() for name in names.split()}
+    published = tensors_of(v, "")
+    out, *grads = value_and_gradients(
+        lambda faces, textures: nr.lighting(faces, textures, **settings),
+        published["faces"],
+        published["textures"],
+        upstream=published["upstream"],
     )
+    assert_close(out, published["out"], rtol=0, atol=1e-6)
+    assert_close(grads[0], published["grad_faces"], rtol=1e-4, atol=1e-5)
+    assert_close(grads[1], published["grad_textures"], rtol=1e-5, atol=1e-6)
 
 
-def test_colours_and_direction_per_image_in_any_container():
-    faces, textures = torch.rand(2, 5, 3, 3), torch.rand(2, 5, 2, 2, 2, 3)
-    per_image = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
-    out = nr.lighting(faces, textures, 0.4, 0.7, per_image, per_image.tolist(), per_image.numpy())
-    for b in range(2):
-        color = tuple(per_image[b].tolist())
-        one = nr.lighting(faces[b : b + 1], textures[b : b + 1], 0.4, 0.7, color, color, color)
-        torch.testing.assert_close(out[b : b + 1], one)
+@pytest.mark.parametrize("batch", [2, 3])
+def test_colours_and_direction_per_image_in_any_container(batch):
+    """Three images of one face, too: the published function takes the cross product along the batch."""
+    faces, textures = torch.rand(batch, 1, 3, 3), torch.rand(batch, 1, 2, 2, 2, 3)
+    colors = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])[:batch]
+    out = nr.lighting(faces, textures, 0.4, 0.7, colors, colors.tolist(), colors.numpy())
+    for b in range(batch):
+        given = [tuple(colors[b].tolist())] * 3
+        one = nr.lighting(faces[b : b + 1], textures[b : b + 1], 0.4, 0.7, *given)
+        assert_close(out[b : b + 1], one)
 
 
 def test_attributes():
-    vertices, faces = nmr.icosphere(1)
-    mesh = nr.Mesh(vertices, faces)
+    sphere, textures = nmr.icosphere(1), torch.rand(80, 3, 3, 3, 3)
+    mesh, given = nr.Mesh(*sphere), nr.Mesh(*sphere, textures)
     assert mesh.num_vertices == 42 and mesh.num_faces == 80 and mesh.texture_size == 4
     assert isinstance(mesh.textures, torch.nn.Parameter) and mesh.textures.shape == (80, 4, 4, 4, 3)
     assert 0.04 < mesh.textures.std() < 0.06
-    textures = torch.rand(80, 3, 3, 3, 3)
-    mesh = nr.Mesh(vertices, faces, textures)
-    assert mesh.textures is textures and mesh.texture_size == 3
+    assert given.textures is textures and given.texture_size == 3
 
 
 def test_fromobj(tmp_path):
@@ -61,29 +56,26 @@ def test_fromobj(tmp_path):
     pytest.importorskip("PIL")
     nr.save_obj(tmp_path / "a.obj", vertices, faces, torch.full((20, 2, 2, 2, 3), 0.2))
     mesh = nr.Mesh.fromobj(tmp_path / "a.obj", load_texture=True)
-    torch.testing.assert_close(mesh.textures, torch.full((20, 4, 4, 4, 3), 0.2))
+    assert_close(mesh.textures, torch.full((20, 4, 4, 4, 3), 0.2))
 
 
 def test_batches_share_memory_and_gradients():
     mesh = nr.Mesh(*nmr.icosphere(0), texture_size=2)
-    vertices, faces, textures = mesh.get_batch(3)
-    assert (
-        vertices.shape == (3, 12, 3)
-        and faces.shape == (3, 20, 3)
-        and textures.shape == (3, 20, 2, 2, 2, 3)
-    )
-    textures.sum().backward()
+    batch = mesh.get_batch(3)
+    assert [tuple(x.shape) for x in batch] == [(3, 12, 3), (3, 20, 3), (3, 20, 2, 2, 2, 3)]
+    batch[2].sum().backward()
     assert torch.all(mesh.textures.grad > 0)
 
 
 @pytest.mark.parametrize("kind", [torch.int32, torch.int64, torch.float32, "array"])
 def test_corners(kind):
-    vertices = torch.rand(2, 7, 3, requires_grad=True)
-    faces = torch.randint(0, 7, (2, 5, 3))
+    vertices, faces = torch.rand(2, 7, 3), torch.randint(0, 7, (2, 5, 3))
     given = faces.numpy().astype(np.int32) if kind == "array" else faces.to(kind)
-    corners = nr.vertices_to_faces(vertices, given)
+    upstream = torch.ones(2, 5, 3, 3)
+    corners, grad = value_and_gradients(
+        lambda x: nr.vertices_to_faces(x, given), vertices, upstream=upstream
+    )
     assert torch.equal(corners, torch.stack([vertices[b, faces[b]] for b in range(2)]))
-    assert torch.equal(nr.vertices_to_faces(vertices, given[:1]), vertices[:, faces[0]])
-    assert torch.equal(nr.vertices_to_faces(vertices, given[0]), vertices[:, faces[0]])
-    corners.sum().backward()
-    assert torch.equal(vertices.grad[..., 0].sum(1), torch.tensor([15.0, 15.0]))
+    for one in (given[:1], given[0]):
+        assert torch.equal(nr.vertices_to_faces(vertices, one), vertices[:, faces[0]])
+    assert torch.equal(grad[..., 0].sum(1), torch.tensor([15.0, 15.0]))
