@@ -24,10 +24,10 @@ face_normals, vertex_normals    unit normals, differentiable
 neural_renderer     the interface of neural_renderer_pytorch 1.1.3; import it explicitly
 nvdiffrast          the interface of nvdiffrast.torch; import it explicitly
 
-Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]`` with faces ``[F, 3]`` or
-``[B, F, 3]``, or lists of ``[V_b, 3]`` and ``[F_b, 3]``. In renderer space x points right, y up, both in [-1, 1] across
-the image, and z is the depth in front of the camera. Images are ``[B, h, w]``, with channels ``[B, h, w, C]``; row 0 is
-at the top.
+Conventions (``docs/conventions.md`` has the drawing): vertices are ``[B, V, 3]`` with faces
+``[F, 3]`` or ``[B, F, 3]``, or lists of ``[V_b, 3]`` and ``[F_b, 3]``. In renderer space x points
+right, y up, both in [-1, 1] across the image, and z is the depth in front of the camera. Images
+are ``[B, h, w]``, with channels ``[B, h, w, C]``; row 0 is at the top.
 """
 
 import torch as _torch  # noqa: F401  torch first: the extension then shares torch's OpenMP runtime

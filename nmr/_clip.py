@@ -1,6 +1,8 @@
-"""Near-plane clipping: the meshes that are drawn in place of those that cross the plane, and the way back to these.
+"""Near-plane clipping: the meshes that are drawn in place of those that cross the plane, and the
+way back to these.
 
-The kernels then see a packed mesh in which faces are cut. Users see face indices and weights of their own faces.
+The kernels then see a packed mesh in which faces are cut. Users see face indices and weights of
+their own faces.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ from ._packing import LARGEST_COORDINATE, MeshBatch, packed_starts
 from .cameras import Camera
 from .cameras.projection import ProjectingCamera
 
-# Faces are cut at these shares of far: the first with near = 0 (the image of a point in the plane of the eye is
-# infinitely large), the second with a positive near below it (nearer new vertices are too large for float32).
+# Faces are cut at these shares of far: the first with near = 0 (the image of a point in the plane
+# of the eye is infinitely large), the second with a positive near below it (nearer new vertices
+# are too large for float32).
 _NEAREST, _SMALLEST = 1e-5, 1e-8
 
 
@@ -33,7 +36,9 @@ class Clipped(NamedTuple):
     place_starts: Tensor  # [B + 1, 2]: first of the places and first face of each mesh
 
     def face_index(self, face_index: Tensor) -> Tensor:
-        """A face index map of the drawn meshes as one of the user's: ``[B, H, W]`` or ``[B, H, W, K]``."""
+        """A face index map of the drawn meshes as one of the user's: ``[B, H, W]`` or
+        ``[B, H, W, K]``.
+        """
         one = (-1, *(1,) * (face_index.ndim - 1))
         drawn, num_faces = self.mesh.num_faces.view(one), self.num_faces
         num_faces = num_faces.view(one) if isinstance(num_faces, Tensor) else num_faces
@@ -45,10 +50,11 @@ class Clipped(NamedTuple):
         return torch.where(back, source + num_faces, source)
 
     def weights(self, face_index: Tensor, weights: Tensor) -> Tensor:
-        """Weights on the drawn faces ``[B, H, W, 3]`` (of their face index map) as weights on the user's faces.
+        """Weights on the drawn faces ``[B, H, W, 3]`` (of their face index map) as weights on the
+        user's faces.
 
-        Both are linear in space: a point with weights b_k on a face with its corners at B_k has the weights
-        sum_k b_k B_k.
+        Both are linear in space: a point with weights b_k on a face with its corners at B_k has
+        the weights sum_k b_k B_k.
         """
         return ops.interpolate(self.places, self.corners, face_index, weights, self.place_starts)
 
@@ -61,10 +67,12 @@ def clip_plane(near: float, far: float) -> float:
 def clip_near(
     world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float
 ) -> Clipped | None:
-    """Cuts the faces that cross z = plane and leaves out those behind it; None if the meshes may stay as they are.
+    """Cuts the faces that cross z = plane and leaves out those behind it; None if the meshes may
+    stay as they are.
 
-    ``world`` and ``mesh`` are the meshes before and after the camera. The new vertices are interpolated in the world
-    and then go through the camera, so that gradients reach the corners of the cut edges.
+    ``world`` and ``mesh`` are the meshes before and after the camera. The new vertices are
+    interpolated in the world and then go through the camera, so that gradients reach the corners
+    of the cut edges.
     """
     room = _room(mesh, plane)
     if room is None:
@@ -93,7 +101,8 @@ def clip_near(
 def _room(mesh: MeshBatch, plane: float) -> list[tuple[int, int]] | None:
     """New vertices and drawn faces of each mesh; None if nothing is cut.
 
-    Meshes whose values are not known yet (torch.compile, torch.func.vmap) get room for every face to be cut.
+    Meshes whose values are not known yet (torch.compile, torch.func.vmap) get room for every face
+    to be cut.
     """
     if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active():
         room = ops.clip_count(*mesh[:3], plane).tolist()
@@ -109,7 +118,9 @@ def _new_vertices(
     rows: Tensor,
     starts: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The new vertices between two rows of the vertices: how far from the first ``[P, 1]``, and in renderer space."""
+    """The new vertices between two rows of the vertices: how far from the first ``[P, 1]``, and
+    in renderer space.
+    """
     # the perspective image (x, y, z) of a point is linear in space as (x z, y z, z)
     if camera is None:
         ends = F.embedding(rows, mesh.vertices.reshape(-1, 3))
@@ -121,7 +132,8 @@ def _new_vertices(
         shared = mesh.starts is None and world.shape[0] == 1
         ends = F.embedding(rows % world.shape[1] if shared else rows, world.reshape(-1, 3))
         if isinstance(camera, ProjectingCamera):
-            # Without the division, also points in the plane of the eye have a depth, with a gradient.
+            # Without the division, also points in the plane of the eye have a depth, with a
+            # gradient.
             flat = replace(camera.projection(world.dtype), perspective=False, distortion=None)
             z = flat.transform(ends.view(-1, 3), starts=2 * starts).view(-1, 2, 3)[..., 2:]
         else:
@@ -148,7 +160,9 @@ def _moderate(ends: Tensor) -> Tensor:
 def _transform_padded(
     points: Tensor, world: Tensor, batch: int, camera: Camera, starts: Tensor
 ) -> Tensor:
-    """Packed points through a camera that takes batches ``[B, V, 3]`` only; vertices of the mesh fill the gaps."""
+    """Packed points through a camera that takes batches ``[B, V, 3]`` only; vertices of the mesh
+    fill the gaps.
+    """
     counts = starts[:, 0].diff().tolist()
     fill = world[:, :1].expand(batch, max(counts), 3)
     parts = [

@@ -1,4 +1,6 @@
-"""Batches of meshes as the operators take them: stacked if they have one size, else packed end to end."""
+"""Batches of meshes as the operators take them: stacked if they have one size, else packed end to
+end.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from torch import Tensor
 
 from ._validate import cast_under_autocast, check_faces, check_vertices, describe
 
-# A farther point counts as not finite: products of three coordinates, and with gradients, could overflow in float32.
+# A farther point counts as not finite: products of three coordinates, and with gradients, could
+# overflow in float32.
 LARGEST_COORDINATE = 1e12
 
 # result of check_values: a tensor with a batch axis, or one tensor per mesh
@@ -19,7 +22,9 @@ Values = Tensor | tuple[Tensor, ...]
 
 
 class MeshBatch(NamedTuple):
-    """B meshes: vertices ``[B, V, 3]`` with faces ``[F, 3]`` or ``[B, F, 3]``, or packed ``[N, 3]`` and ``[M, 3]``."""
+    """B meshes: vertices ``[B, V, 3]`` with faces ``[F, 3]`` or ``[B, F, 3]``, or packed
+    ``[N, 3]`` and ``[M, 3]``.
+    """
 
     vertices: Tensor
     faces: Tensor  # int64; vertex numbers count from the mesh's own first vertex
@@ -50,7 +55,9 @@ class MeshBatch(NamedTuple):
         )
 
     def first_faces(self, value_batch: int) -> int | Tensor:
-        """First face of each image, when per-face values ``[value_batch, F, ...]`` are laid end to end."""
+        """First face of each image, when per-face values ``[value_batch, F, ...]`` are laid end
+        to end.
+        """
         if self.starts is not None:
             return self.starts[:-1, 1].to(self.faces.device).view(-1, 1, 1)
         if value_batch == 1:
@@ -61,7 +68,8 @@ class MeshBatch(NamedTuple):
         )
 
     def values(self, values: Values, name: str, per: str | None = None) -> Tensor:
-        """Values in the layout of these meshes, ``[B | 1, n, ...]`` or packed ``[sum of n_b, ...]``.
+        """Values in the layout of these meshes, ``[B | 1, n, ...]`` or packed
+        ``[sum of n_b, ...]``.
 
         ``per``: "vertex" or "face" if each of them needs one row; None allows any number of rows.
         """
@@ -95,7 +103,9 @@ class MeshBatch(NamedTuple):
     def corners(
         self, corners: object, attributes: Values, name: str
     ) -> tuple[Tensor, Tensor | None]:
-        """Checks faces that index rows of attributes; returns (corners, starts) as the operators take them."""
+        """Checks faces that index rows of attributes; returns (corners, starts) as the operators
+        take them.
+        """
         device = self.faces.device
         if self.starts is None:
             if is_list(corners):
@@ -144,7 +154,9 @@ def is_list(value: object) -> bool:
 
 
 def pack_meshes(vertices: object, faces: object) -> MeshBatch:
-    """Meshes given as lists, checked and laid end to end; a list of one becomes the batch ``[1, V, 3]``."""
+    """Meshes given as lists, checked and laid end to end; a list of one becomes the batch
+    ``[1, V, 3]``.
+    """
     if is_list(vertices):
         vertices = [cast_under_autocast(part) for part in vertices]
         for part in vertices:

@@ -1,4 +1,6 @@
-"""Shared by the rendering functions: checks the arguments, applies the camera, calls the operators."""
+"""Shared by the rendering functions: checks the arguments, applies the camera, calls the
+operators.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ Meshes = Tensor | Sequence[Tensor]
 class Scene(NamedTuple):
     """Checked arguments: meshes before and after the camera, and the settings of the render.
 
-    If faces cross the near plane, ``clipped`` has the meshes that are drawn. Face index maps are then of these.
+    If faces cross the near plane, ``clipped`` has the meshes that are drawn. Face index maps are
+    then of these.
     """
 
     world: Tensor
@@ -192,7 +195,8 @@ def shade(
     background: float | Sequence[float] | Tensor,
     interpolation_gradient: bool,
 ) -> tuple[Tensor, Tensor]:
-    """The shaded raster ``[B, H, W, C]``, undefined at pixels without a face, and the background ``[B | 1, C]``.
+    """The shaded raster ``[B, H, W, C]``, undefined at pixels without a face, and the background
+    ``[B | 1, C]``.
 
     With layers the raster is ``[B, H, W, K, C]``.
     """
@@ -229,7 +233,9 @@ def shade(
 
 
 def background_rows(background: object, channels: int, batch: int, like: Tensor) -> Tensor:
-    """The background of ``batch`` images as ``[B | 1, channels]``, in the dtype and on the device of ``like``."""
+    """The background of ``batch`` images as ``[B | 1, channels]``, in the dtype and on the device
+    of ``like``.
+    """
     wanted = f"a number, [{channels}] or [{batch}, {channels}]"
     behind = as_floats(background, "background", wanted).to(like)
     if behind.ndim > 2 or any(

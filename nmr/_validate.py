@@ -1,4 +1,6 @@
-"""Checks shared by the public functions. Each error names the expected value, the given one, and a remedy."""
+"""Checks shared by the public functions. Each error names the expected value, the given one, and
+a remedy.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def describe(value: object) -> str:
 
 
 def callers_level() -> int:
-    """``stacklevel`` for a warning that is to name the line outside of this package which called it."""
+    """``stacklevel`` for a warning that is to name the line outside of this package which called
+    it.
+    """
     level, frame = 1, sys._getframe(1)
     while (
         frame.f_back is not None
@@ -44,7 +48,9 @@ def callers_level() -> int:
 
 
 def cast_under_autocast(tensor: object) -> object:
-    """Half precision becomes float32 inside ``torch.autocast``, as for torch's own functions that need float32."""
+    """Half precision becomes float32 inside ``torch.autocast``, as for torch's own functions that
+    need float32.
+    """
     half = isinstance(tensor, Tensor) and tensor.dtype in (torch.float16, torch.bfloat16)
     if half and torch.is_autocast_enabled(tensor.device.type):
         return tensor.float()
@@ -52,7 +58,9 @@ def cast_under_autocast(tensor: object) -> object:
 
 
 def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
-    """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: other accepted types, for the error."""
+    """``vertices`` as ``[B, V, 3]`` float32 or float64; ``otherwise``: other accepted types, for
+    the error.
+    """
     if not isinstance(vertices, Tensor):
         remedy = (
             ", or one call for each mesh if their sizes differ"
@@ -81,7 +89,8 @@ def check_vertices(vertices: object, otherwise: str = "") -> Tensor:
 
 
 def check_faces(faces: object, batch: int, device: torch.device, name: str = "faces") -> Tensor:
-    """``faces`` as int64 ``[F, 3]`` or ``[B, F, 3]`` on ``device``; their indices are checked by the kernels.
+    """``faces`` as int64 ``[F, 3]`` or ``[B, F, 3]`` on ``device``; their indices are checked by
+    the kernels.
 
     ``[1, F, 3]`` is shared by all meshes.
     """
@@ -106,7 +115,9 @@ def check_faces(faces: object, batch: int, device: torch.device, name: str = "fa
 
 
 def check_camera(camera: object, packed: bool) -> None:
-    """A camera must have ``transform(vertices)``; for lists of meshes ``transform(vertices, starts)``."""
+    """A camera must have ``transform(vertices)``; for lists of meshes
+    ``transform(vertices, starts)``.
+    """
     if isinstance(camera, type):
         raise TypeError(
             f"camera must be an instance, got the class {camera.__name__}; create one: {camera.__name__}(...)"
@@ -123,7 +134,9 @@ def check_camera(camera: object, packed: bool) -> None:
 
 
 def check_transformed(vertices: object, world: Tensor, packed: bool) -> None:
-    """The vertices that a camera returned must have type, device and shape of ``world`` (one mesh may become B)."""
+    """The vertices that a camera returned must have type, device and shape of ``world`` (one mesh
+    may become B).
+    """
     like = isinstance(vertices, Tensor) and (vertices.dtype, vertices.device) == (
         world.dtype,
         world.device,
@@ -143,9 +156,11 @@ def check_transformed(vertices: object, world: Tensor, packed: bool) -> None:
 
 
 def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor, ...]:
-    """Float values of meshes: a tensor with these axes, with or without a batch axis, or a list of one per mesh.
+    """Float values of meshes: a tensor with these axes, with or without a batch axis, or a list
+    of one per mesh.
 
-    Returns the tensor with its batch axis, or a tuple of tensors without one. ``axes`` is like ``"V, C"``.
+    Returns the tensor with its batch axis, or a tuple of tensors without one. ``axes`` is like
+    ``"V, C"``.
     """
     ndim = axes.count(",") + 1
     wanted = f"{name} must be a float tensor [{axes}] or [B, {axes}], or a list of [{axes}], one per mesh"
@@ -178,7 +193,8 @@ def check_values(values: object, name: str, axes: str) -> Tensor | tuple[Tensor,
 
 
 def as_numbers(value: object, name: str, wanted: str) -> Tensor:
-    """A number, nested sequences of numbers or tensors, an array or a tensor, as a tensor; numbers become float64.
+    """A number, nested sequences of numbers or tensors, an array or a tensor, as a tensor;
+    numbers become float64.
 
     Gradients reach tensors, also those inside sequences.
     """
@@ -250,7 +266,9 @@ def check_flag(value: object, name: str) -> bool:
 
 
 def holds_for_all(condition: Tensor) -> bool:
-    """Whether all values are true; also true if they cannot be read, in torch.compile and torch.func.vmap."""
+    """Whether all values are true; also true if they cannot be read, in torch.compile and
+    torch.func.vmap.
+    """
     if torch.compiler.is_compiling() or condition.device.type != "cpu":
         return True
     try:
@@ -270,7 +288,9 @@ def check_number(value: object, name: str) -> float:
 
 
 def as_positive(value: object, name: str, dtype: torch.dtype) -> Tensor:
-    """A number, or a float tensor with one element, which may want a gradient, as a tensor ``[]``."""
+    """A number, or a float tensor with one element, which may want a gradient, as a tensor
+    ``[]``.
+    """
     tensor = as_floats(value, name, "a number or a tensor []")
     if tensor.numel() != 1:
         raise ValueError(f"{name} must be a number or a tensor [], got {describe(tensor)}")

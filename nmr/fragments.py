@@ -30,31 +30,36 @@ if TYPE_CHECKING:
 class Fragments:
     """The nearest face at each centre of the raster, made by :func:`nmr.render_fragments`.
 
-    H and W are those of the image, or twice as many with anti-aliasing. Row 0 is the top. For shading of your own,
-    compute an image ``[B, H, W, C]`` from these and call :meth:`resolve`, which averages pixels and gives the vertices
-    NMR's gradient.
+    H and W are those of the image, or twice as many with anti-aliasing. Row 0 is the top. For
+    shading of your own, compute an image ``[B, H, W, C]`` from these and call :meth:`resolve`,
+    which averages pixels and gives the vertices NMR's gradient.
 
     Attributes
     ----------
     sided_face_index : int32 Tensor [B, H, W]
-        Face index as :mod:`nmr.ops` takes it. ``sided_face_index[b, y, x] = f``: face f is nearest and seen from its
-        front; ``F + f``: from its back; -1: background. ``face_index`` and ``is_back`` say the same as two tensors.
+        Face index as :mod:`nmr.ops` takes it. ``sided_face_index[b, y, x] = f``: face f is
+        nearest and seen from its front; ``F + f``: from its back; -1: background. ``face_index``
+        and ``is_back`` say the same as two tensors.
     weights : Tensor [B, H, W, 3]
-        Barycentric weights in space (perspective-correct) of the face's vertices in their own order; their sum is 1. 0
-        on background. Differentiable in the vertices (at fixed face indices). Use ``weights.detach()`` for NMR's
-        definition, in which colours move vertices only through edges.
+        Barycentric weights in space (perspective-correct) of the face's vertices in their own
+        order; their sum is 1. 0 on background. Differentiable in the vertices (at fixed face
+        indices). Use ``weights.detach()`` for NMR's definition, in which colours move vertices
+        only through edges.
     depth : Tensor [B, H, W]
-        z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed face indices).
+        z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed
+        face indices).
     vertices, faces
-        The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh after the other.
+        The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh
+        after the other.
 
     distances : Tensor [B, H, W, K], or None without blur_radius
-        Squared distance of the pixel from the border of the face, in units of half the shorter side of the image;
-        negative inside of the face. Differentiable in x and y of the vertices.
+        Squared distance of the pixel from the border of the face, in units of half the shorter
+        side of the image; negative inside of the face. Differentiable in x and y of the vertices.
 
-    With ``faces_per_pixel`` K > 1 or a ``blur_radius`` these have one more axis: sided_face_index and depth ``[B, H, W,
-    K]``, weights ``[B, H, W, K, 3]``, nearest first. So do the results of :meth:`interpolate`, :meth:`per_face`,
-    :meth:`normals`, of colours and lights, and of the properties. :meth:`resolve` takes one image.
+    With ``faces_per_pixel`` K > 1 or a ``blur_radius`` these have one more axis: sided_face_index
+    and depth ``[B, H, W, K]``, weights ``[B, H, W, K, 3]``, nearest first. So do the results of
+    :meth:`interpolate`, :meth:`per_face`, :meth:`normals`, of colours and lights, and of the
+    properties. :meth:`resolve` takes one image.
 
     Examples
     --------
@@ -95,8 +100,8 @@ class Fragments:
     def layer(self, k: int) -> Fragments:
         """The k-th nearest surfaces, without the axis for K; 0 is the visible one.
 
-        Everything can be done with it, except that only layer 0 can be resolved: NMR's gradient is that of the edges
-        that are seen.
+        Everything can be done with it, except that only layer 0 can be resolved: NMR's gradient
+        is that of the edges that are seen.
         """
         if self.layers is None or not -self.layers <= k < self.layers:
             have = (
@@ -137,12 +142,16 @@ class Fragments:
 
     @property
     def is_back(self) -> Tensor:
-        """bool ``[B, H, W]``: the face there is seen from its back (its vertices run clockwise on the screen)."""
+        """bool ``[B, H, W]``: the face there is seen from its back (its vertices run clockwise on
+        the screen).
+        """
         return self.sided_face_index >= self._num_faces
 
     @property
     def face_index(self) -> Tensor:
-        """int32 ``[B, H, W]``: index of the nearest face, seen from either side; -1 is background."""
+        """int32 ``[B, H, W]``: index of the nearest face, seen from either side; -1 is
+        background.
+        """
         return torch.where(
             self.is_back, self.sided_face_index - self._num_faces, self.sided_face_index
         )
@@ -157,13 +166,15 @@ class Fragments:
     def interpolate(
         self, attributes: Tensor | list[Tensor], corners: Tensor | list[Tensor] | None = None
     ) -> Tensor:
-        """Values given at vertices, interpolated at each pixel: ``[B, H, W, C]``, 0 on background.
+        """Values given at vertices, interpolated at each pixel: ``[B, H, W, C]``, 0 on
+        background.
 
         Parameters
         ----------
         attributes : float Tensor [V, C] or [B, V, C]; for a list of meshes a list of [V_b, C]
         corners : integer Tensor [F, 3] or [B, F, 3] (or a list), optional
-            Row of attributes at each corner of each face, if there is not one row per vertex: a texture with seams.
+            Row of attributes at each corner of each face, if there is not one row per vertex: a
+            texture with seams.
 
         Differentiable in attributes, and in weights.
         """
@@ -182,14 +193,18 @@ class Fragments:
     def _corner_values(
         self, attributes: object, corners: object, name: str, corners_name: str
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Checked attributes, their rows at the corners of faces, and starts, as the operators take them."""
+        """Checked attributes, their rows at the corners of faces, and starts, as the operators
+        take them.
+        """
         values = check_values(attributes, name, "V, C")
         if corners is None:
             return self.mesh.values(values, name, "vertex"), self.faces, self.mesh.starts
         return self.mesh.values(values, name), *self.mesh.corners(corners, values, corners_name)
 
     def per_face(self, values: Tensor | list[Tensor]) -> Tensor:
-        """Values of faces, ``[F, C]``, ``[B, F, C]`` or a list, at each pixel: ``[B, H, W, C]``, 0 on background."""
+        """Values of faces, ``[F, C]``, ``[B, F, C]`` or a list, at each pixel: ``[B, H, W, C]``,
+        0 on background.
+        """
         return self._per_face(values, "values")
 
     def _per_face(self, values: object, name: str) -> Tensor:
@@ -206,14 +221,15 @@ class Fragments:
     def normals(self, smooth: bool = False, space: str = "world") -> Tensor:
         """Unit normals of the side that is seen, ``[B, H, W, 3]``, 0 on background.
 
-        Flat: the normal of the face. Smooth: the normals of its vertices (means over the adjacent faces, weighted by
-        area), interpolated. In a left-handed world (LookAt) the front of face (v0, v1, v2) has the normal
-        ``(v0 - v1) x (v2 - v1)``, as in the published renderer, in a right-handed one (Pinhole) the opposite one.
-        Differentiable in the world-space vertices and, if smooth, in weights.
+        Flat: the normal of the face. Smooth: the normals of its vertices (means over the adjacent
+        faces, weighted by area), interpolated. In a left-handed world (LookAt) the front of face
+        (v0, v1, v2) has the normal ``(v0 - v1) x (v2 - v1)``, as in the published renderer, in a
+        right-handed one (Pinhole) the opposite one. Differentiable in the world-space vertices
+        and, if smooth, in weights.
 
-        With ``space="camera"`` the axes are those of renderer space: x to the right of the image, y up, z away from the
-        viewer (so z is negative if a face looks at the viewer). It needs one of nmr's cameras, or none, and is
-        differentiable in its rotation, too.
+        With ``space="camera"`` the axes are those of renderer space: x to the right of the image,
+        y up, z away from the viewer (so z is negative if a face looks at the viewer). It needs
+        one of nmr's cameras, or none, and is differentiable in its rotation, too.
         """
         check_choice(space, "space", ("world", "camera"))
         if self.layers:
@@ -244,8 +260,9 @@ class Fragments:
     ) -> Tensor:
         """Lit colours ``[B, H, W, 3]`` (:func:`nmr.ops.lit`); without parameters the normals.
 
-        ``positions``: the light depends on the position of a point; ``highlights``: also on that of the eye; ``own``:
-        outward normals of the vertices in the layout of the meshes, or of the pixels ``[B, H, W, 3]``.
+        ``positions``: the light depends on the position of a point; ``highlights``: also on that
+        of the eye; ``own``: outward normals of the vertices in the layout of the meshes, or of
+        the pixels ``[B, H, W, 3]``.
         """
         viewer = self._viewer(highlights)
         if own is not None and own.ndim == 4:  # a mesh of one face with one vertex for each pixel
@@ -293,17 +310,20 @@ class Fragments:
         return torch.cat([eye, eye.new_tensor([1.0, side]).expand(batch, 2)], dim=1)
 
     def resolve(self, image: Tensor, gradient: str = "nmr") -> Tensor:
-        """The image ``[B, h, w, C]`` of a shaded raster ``[B, H, W, C]``, with NMR's gradient or another one.
+        """The image ``[B, h, w, C]`` of a shaded raster ``[B, H, W, C]``, with NMR's gradient or
+        another one.
 
-        The mean of 2x2 pixels with anti-aliasing, else the image itself. The gradient goes back to the raster and, by
-        NMR's definition, to x and y of the vertices: every visible edge is pulled by those pixels whose loss would fall
-        if the edge moved over them. The change of the loss is summed over all C channels. With ``gradient="local"`` or
-        ``"none"``: as in :func:`nmr.render`. No second derivative.
+        The mean of 2x2 pixels with anti-aliasing, else the image itself. The gradient goes back
+        to the raster and, by NMR's definition, to x and y of the vertices: every visible edge is
+        pulled by those pixels whose loss would fall if the edge moved over them. The change of
+        the loss is summed over all C channels. With ``gradient="local"`` or ``"none"``: as in
+        :func:`nmr.render`. No second derivative.
 
         Raises
         ------
         TypeError, ValueError
-            If image is not a float tensor [B, H, W, C] of the dtype of the vertices, or for another gradient.
+            If image is not a float tensor [B, H, W, C] of the dtype of the vertices, or for
+            another gradient.
         """
         check_choice(gradient, "gradient", GRADIENTS)
         image = cast_under_autocast(image)
@@ -323,7 +343,9 @@ class Fragments:
         return self._resolve(image, None, gradient)
 
     def _resolve(self, image: Tensor, background: Tensor | None, gradient: str) -> Tensor:
-        """The same; pixels without a face have the colour ``background [B | 1, C]``, if it is given."""
+        """The same; pixels without a face have the colour ``background [B | 1, C]``, if it is
+        given.
+        """
         vertices, faces, starts = self._drawn[:3]
         vertices = vertices.detach() if gradient == "none" else vertices
         edges = self.anti_aliasing, self.eps, gradient == "local", has_perspective(self.camera)
@@ -333,7 +355,9 @@ class Fragments:
 
 
 def _image_axes(intrinsics: Tensor) -> Tensor:
-    """Right and up in the image and the direction of view ``[B, 3, 3]``, in camera axes; a skew turns nothing."""
+    """Right and up in the image and the direction of view ``[B, 3, 3]``, in camera axes; a skew
+    turns nothing.
+    """
     up = _unit(intrinsics[:, 1, :2])
     right = torch.stack([up[:, 1], -up[:, 0]], dim=1)
     right = right * torch.where((right * intrinsics[:, 0, :2]).sum(1, keepdim=True) < 0, -1.0, 1.0)
@@ -342,7 +366,9 @@ def _image_axes(intrinsics: Tensor) -> Tensor:
 
 
 def usable(points: Tensor) -> Tensor:
-    """Puts points that are not finite, or so large that a product overflows, at the origin, without gradient."""
+    """Puts points that are not finite, or so large that a product overflows, at the origin,
+    without gradient.
+    """
     return torch.where(
         (points.abs() < LARGEST_COORDINATE).all(-1, keepdim=True), points, torch.zeros_like(points)
     )

@@ -15,8 +15,8 @@ OUTPUTS = ("rgb", "alpha", "depth", "normals", "fragments")
 class Images:
     """The outputs of :func:`render`, as attributes; unpacking gives them in the requested order.
 
-    ``rgb [B, h, w, C]``, ``alpha [B, h, w]``, ``depth [B, h, w]``, ``normals [B, h, w, 3]``, ``fragments``
-    (:class:`Fragments`). Outputs that were not requested raise an AttributeError.
+    ``rgb [B, h, w, C]``, ``alpha [B, h, w]``, ``depth [B, h, w]``, ``normals [B, h, w, 3]``,
+    ``fragments`` (:class:`Fragments`). Outputs that were not requested raise an AttributeError.
 
     Examples
     --------

@@ -39,12 +39,14 @@ def render_soft(
     far: float = 100.0,
     clip: bool = True,
 ) -> Images:
-    """The soft colours of SoftRas (Liu et al. 2019), as PyTorch3D's softmax_rgb_blend blends them, and their alpha.
+    """The soft colours of SoftRas (Liu et al. 2019), as PyTorch3D's softmax_rgb_blend blends
+    them, and their alpha.
 
     Parameters
     ----------
     vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
+        z = depth.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
         Vertex indices.
     camera : Camera, optional
@@ -56,13 +58,16 @@ def render_soft(
     background : number, [C], or Tensor [B, C]
         Colour of pixels without a face.
     sigma : float or Tensor []
-        Blur beyond the border of faces, as in :func:`render_soft_silhouette`: ``D = sigmoid(+-d^2 / sigma)``, + inside.
+        Blur beyond the border of faces, as in :func:`render_soft_silhouette`:
+        ``D = sigmoid(+-d^2 / sigma)``, + inside.
     gamma : float or Tensor []
         How sharply nearer faces hide others.
     faces_per_pixel : int
-        K in 1..1024: the nearest K of the faces that reach a pixel are blended. SoftRas takes all.
+        K in 1..1024: the nearest K of the faces that reach a pixel are blended. SoftRas takes
+        all.
     dist_eps : float
-        Faces for which D would be less than this at a pixel outside are left out there. In (0, 0.5).
+        Faces for which D would be less than this at a pixel outside are left out there. In (0,
+        0.5).
     background_eps : float
         Closeness e of the background: 1e-3 in SoftRas, 1e-10 in PyTorch3D.
     image_size : int or (height, width)
@@ -74,35 +79,39 @@ def render_soft(
     near, far : float
         A pixel is covered only if near < depth < far.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
+        Cut the faces that reach behind the plane at depth ``near`` (details:
+        :func:`render_silhouette`).
 
     Returns
     -------
     Images
-        ``rgb, alpha = render_soft(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With C_j the colour of face j at the
-        pixel, lit, and ``c_j = (far - z_j) / (far - near)`` the closeness of its depth::
+        ``rgb, alpha = render_soft(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With C_j the colour
+        of face j at the pixel, lit, and ``c_j = (far - z_j) / (far - near)`` the closeness of its
+        depth::
 
             rgb = (sum_j w_j C_j + w_b background) / (sum_j w_j + w_b)
             w_j = D_j exp(c_j / gamma),    w_b = exp(e / gamma),    alpha = 1 - product_j (1 - D_j)
 
-        Of a face that does not contain the pixel, C_j and z_j belong to the weights that are clamped to [0, 1] and
-        divided by their sum.
+        Of a face that does not contain the pixel, C_j and z_j belong to the weights that are
+        clamped to [0, 1] and divided by their sum.
 
     Notes
     -----
-    Source: Liu et al. 2019, equations 2 and 3, and the published code, in which ``near`` is 1 by default. There colours
-    are interpolated on the screen, here in space. PyTorch3D also keeps ``w_b`` above 1e-10 of the nearest
-    ``exp(c_j / gamma)``.
+    Source: Liu et al. 2019, equations 2 and 3, and the published code, in which ``near`` is 1 by
+    default. There colours are interpolated on the screen, here in space. PyTorch3D also keeps
+    ``w_b`` above 1e-10 of the nearest ``exp(c_j / gamma)``.
 
-    Differentiable in all three coordinates of the vertices, in colours, lights, background, sigma and gamma: the true
-    derivative of the image, up to the jumps where faces come within reach or leave the K nearest. The memory is that of
-    B h w K faces, about 100 bytes each with gradients in float32. There is no second derivative.
+    Differentiable in all three coordinates of the vertices, in colours, lights, background, sigma
+    and gamma: the true derivative of the image, up to the jumps where faces come within reach or
+    leave the K nearest. The memory is that of B h w K faces, about 100 bytes each with gradients
+    in float32. There is no second derivative.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit, a sigma or gamma that
-        is not positive, a dist_eps outside (0, 0.5), and a faces_per_pixel that is not an integer in 1..1024.
+        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit, a
+        sigma or gamma that is not positive, a dist_eps outside (0, 0.5), and a faces_per_pixel
+        that is not an integer in 1..1024.
 
     Examples
     --------
@@ -134,7 +143,9 @@ def _blend(
     near: float,
     far: float,
 ) -> tuple[Tensor, Tensor]:
-    """The formula of :func:`render_soft` for colours ``[B, H, W, K, C]`` on a background ``[B | 1, C]``."""
+    """The formula of :func:`render_soft` for colours ``[B, H, W, K, C]`` on a background
+    ``[B | 1, C]``.
+    """
     sigma, gamma, zero = sigma.to(colors), gamma.to(colors), colors.new_zeros(())
     covers = torch.where(fragments.covered, torch.sigmoid(-fragments.distances / sigma), zero)
     closeness = (far - fragments.depth) / (far - near)
@@ -166,12 +177,14 @@ def render_transparent(
     eps: float = 1e-4,
     interpolation_gradient: bool = False,
 ) -> Images:
-    """Colour images of transparent surfaces: the K nearest of each pixel are shaded and composited front to back.
+    """Colour images of transparent surfaces: the K nearest of each pixel are shaded and
+    composited front to back.
 
     Parameters
     ----------
     vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1], z = depth.
+        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
+        z = depth.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
         Vertex indices.
     camera : Camera, optional
@@ -183,7 +196,8 @@ def render_transparent(
     background : number, [C], or Tensor [B, C]
         Colour of pixels without a face.
     opacity : number in [0, 1], Tensor [] or [B], or colours of one channel
-        How much of the light from behind a surface is held back. For instance ``nmr.FaceColors`` of ``[F, 1]``.
+        How much of the light from behind a surface is held back. For instance ``nmr.FaceColors``
+        of ``[F, 1]``.
     faces_per_pixel : int
         K in 1..1024. Surfaces behind the K nearest are left out.
     image_size : int or (height, width)
@@ -195,33 +209,36 @@ def render_transparent(
     near, far : float
         A pixel is covered only if near < depth < far.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details: :func:`render_silhouette`).
+        Cut the faces that reach behind the plane at depth ``near`` (details:
+        :func:`render_silhouette`).
     eps : float
         In NMR's gradient, added to the distance between an edge and a pixel.
     interpolation_gradient : bool
-        Adds the true derivative of interpolated colours with respect to the position of a pixel on its face, so that
-        vertices also move to shift colours under the pixels. The published renderer does not have this: there colours
-        move vertices only through edges.
+        Adds the true derivative of interpolated colours with respect to the position of a pixel
+        on its face, so that vertices also move to shift colours under the pixels. The published
+        renderer does not have this: there colours move vertices only through edges.
 
     Returns
     -------
     Images
-        ``rgb, alpha = render_transparent(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With o_k the opacity and C_k the
-        colour, lit, of the k-th nearest surface and ``T_k = product over j < k of (1 - o_j)``::
+        ``rgb, alpha = render_transparent(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With o_k the
+        opacity and C_k the colour, lit, of the k-th nearest surface and
+        ``T_k = product over j < k of (1 - o_j)``::
 
             rgb = sum_k T_k o_k C_k + T_K background,    alpha = 1 - T_K
 
     Notes
     -----
-    This is the "over" operator (Porter and Duff 1984). Colours, opacity, lights and background have true derivatives.
-    x and y of the vertices have NMR's edge gradient at the edges that are seen, as in :func:`render_rgb`; the hidden
-    edges of other layers have none.
+    This is the "over" operator (Porter and Duff 1984). Colours, opacity, lights and background
+    have true derivatives. x and y of the vertices have NMR's edge gradient at the edges that are
+    seen, as in :func:`render_rgb`; the hidden edges of other layers have none.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit, an opacity outside
-        [0, 1] or of several channels, and a faces_per_pixel that is not an integer in 1..1024.
+        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit,
+        an opacity outside [0, 1] or of several channels, and a faces_per_pixel that is not an
+        integer in 1..1024.
 
     Examples
     --------
@@ -250,7 +267,9 @@ def render_transparent(
 
 
 def _running_products(factors: Tensor) -> Tensor:
-    """As torch.cumprod along the last axis, whose gradient rounds otherwise if one factor of the batch is 0."""
+    """As torch.cumprod along the last axis, whose gradient rounds otherwise if one factor of the
+    batch is 0.
+    """
     return torch.stack([*accumulate(factors.unbind(-1), torch.mul)], dim=-1)
 
 

@@ -1,4 +1,6 @@
-"""Light: ambient and directional, as in the Neural Mesh Renderer; point lights; highlights; spherical harmonics."""
+"""Light: ambient and directional, as in the Neural Mesh Renderer; point lights; highlights;
+spherical harmonics.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ __all__ = ["Lights"]
 
 Numbers = float | Sequence | Tensor
 
-# Real spherical harmonics of bands 0 to 2: the factors of 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2.
+# Real spherical harmonics of bands 0 to 2: the factors of 1; y, z, x; xy, yz, 3 z^2 - 1, xz,
+# x^2 - y^2.
 _HARMONICS = (
     0.28209479,
     0.48860251,
@@ -33,8 +36,8 @@ _HARMONICS = (
     0.54627422,
 )
 
-# In the order of the kernel's enum LightParameter: accepted shapes, as text and as numbers of axes;
-# then 1 for vectors, else 0.
+# In the order of the kernel's enum LightParameter: accepted shapes, as text and as numbers of
+# axes; then 1 for vectors, else 0.
 _SHAPES = {
     "ambient": ("[] or [B]", (0, 1), 0),
     "ambient_color": ("[3] or [B, 3]", (1, 2), 1),
@@ -54,19 +57,21 @@ _POINT = ("point", "point_color", "position", "falloff")
 
 @dataclass(frozen=True, eq=False)
 class Lights:
-    """Ambient light, directional lights, point lights, the highlights of the last two, and spherical harmonics.
+    """Ambient light, directional lights, point lights, the highlights of the last two, and
+    spherical harmonics.
 
-    ``rgb = color * light + highlight``, with n the unit normal in world space of the side that is seen
-    (:meth:`Fragments.normals`) and x the point that is seen::
+    ``rgb = color * light + highlight``, with n the unit normal in world space of the side that is
+    seen (:meth:`Fragments.normals`) and x the point that is seen::
 
         light = ambient ambient_color + sum over lights of c relu(n . l) + sum over i of harmonics_i Y_i(n)
         highlight = specular * sum over lights with n . l > 0 of c relu(r . v)^shininess        (Phong)
 
-    A directional light has ``l = direction`` and ``c = directional directional_color``. A point light has l of length 1
-    towards its position and ``c = point point_color / (1 + falloff |position - x|^2)``. r is l, reflected by the
-    surface, and v points towards the eye; highlights use the unit vector along direction, and multiply c by its length.
-    n is the normal of the face, as in the published renderer, or, if ``smooth``, the interpolated normal of the
-    vertices. The defaults are the published ones.
+    A directional light has ``l = direction`` and ``c = directional directional_color``. A point
+    light has l of length 1 towards its position and
+    ``c = point point_color / (1 + falloff |position - x|^2)``. r is l, reflected by the surface,
+    and v points towards the eye; highlights use the unit vector along direction, and multiply c
+    by its length. n is the normal of the face, as in the published renderer, or, if ``smooth``,
+    the interpolated normal of the vertices. The defaults are the published ones.
 
     Parameters
     ----------
@@ -75,40 +80,47 @@ class Lights:
     directional : number, or Tensor [], [L] or [B, L]
         Intensity of each light with a direction.
     direction : [3], [L, 3] or [B, L, 3]
-        World-space direction towards the light. It is not normalised: a longer vector gives more light.
+        World-space direction towards the light. It is not normalised: a longer vector gives more
+        light.
     ambient_color : [3] or [B, 3]
     directional_color : [3], [L, 3] or [B, L, 3]
     smooth : bool
     position : [3], [L, 3] or [B, L, 3], optional; keyword only, as all that follow
-        World-space positions of point lights (default: no point lights). Their number may differ from that of the
-        directional lights.
+        World-space positions of point lights (default: no point lights). Their number may differ
+        from that of the directional lights.
     point : number, or Tensor [], [L] or [B, L]
         Intensity of each point light.
     point_color : [3], [L, 3] or [B, L, 3]
     falloff : number, or Tensor [], [L] or [B, L]
-        0: as bright at every distance. Otherwise the light falls to one half at the distance ``falloff^(-1/2)``.
+        0: as bright at every distance. Otherwise the light falls to one half at the distance
+        ``falloff^(-1/2)``.
     specular : number, or Tensor [] or [B]
-        Strength of highlights. They have the colour of the light, not of the surface. The number 0: none.
+        Strength of highlights. They have the colour of the light, not of the surface. The number
+        0: none.
     shininess : number, or Tensor [] or [B]
         The larger, the smaller a highlight is.
     harmonics : [9, 3] or [B, 9, 3], optional
-        Light from all around as a function of n: coefficients of the real, orthonormal spherical harmonics of bands 0,
-        1, 2, that is of 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2, for each colour. From those of an environment map
-        L, ``harmonics = L * [1, 2/3, 1/4]`` by band (Ramamoorthi and Hanrahan 2001, divided by pi). It may be negative.
+        Light from all around as a function of n: coefficients of the real, orthonormal spherical
+        harmonics of bands 0, 1, 2, that is of 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2, for
+        each colour. From those of an environment map L, ``harmonics = L * [1, 2/3, 1/4]`` by band
+        (Ramamoorthi and Hanrahan 2001, divided by pi). It may be negative.
     normals : Tensor [V, 3], [B, V, 3], a list of [V_b, 3], :class:`NormalMap` or any object with ``sample``, optional
-        Own normals in world space in place of those of the mesh: of the vertices, interpolated and normalised (as
-        :func:`vertex_normals` they point outward), or of pixels: ``sample(fragments) -> [B, H, W, 3]``. If a face shows
-        the side from which its :func:`face_normals` points away, they are turned. ``smooth`` is then ignored.
+        Own normals in world space in place of those of the mesh: of the vertices, interpolated
+        and normalised (as :func:`vertex_normals` they point outward), or of pixels:
+        ``sample(fragments) -> [B, H, W, 3]``. If a face shows the side from which its
+        :func:`face_normals` points away, they are turned. ``smooth`` is then ignored.
 
-    Tensors are differentiable, and so are the vertices: through their normals, and through the points that are lit.
-    The eye is known for nmr's cameras (without a camera the viewer looks along z); for highlights, a camera of your own
-    needs an attribute ``eye``, [3] or [B, 3]. The eye counts as a constant. B is the number of images.
+    Tensors are differentiable, and so are the vertices: through their normals, and through the
+    points that are lit. The eye is known for nmr's cameras (without a camera the viewer looks
+    along z); for highlights, a camera of your own needs an attribute ``eye``, [3] or [B, 3]. The
+    eye counts as a constant. B is the number of images.
 
     Raises
     ------
     TypeError, ValueError
-        For values that are not floats or not finite, a negative shininess, wrong shapes, and if the numbers of lights
-        differ; when drawn, also if values per image do not match the number of images.
+        For values that are not floats or not finite, a negative shininess, wrong shapes, and if
+        the numbers of lights differ; when drawn, also if values per image do not match the number
+        of images.
 
     Examples
     --------
@@ -177,7 +189,8 @@ class Lights:
                 )
 
     def shade(self, fragments: Fragments, colors: Tensor | None = None) -> Tensor:
-        """``colors`` ``[B, H, W, 3 or 1]``, lit: ``[B, H, W, 3]``; 0 on background. Without colours a white surface.
+        """``colors`` ``[B, H, W, 3 or 1]``, lit: ``[B, H, W, 3]``; 0 on background. Without
+        colours a white surface.
 
         Of fragments with layers, ``[B, H, W, K, 3]``.
         """

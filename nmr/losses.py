@@ -1,7 +1,8 @@
 """Losses on silhouettes and meshes.
 
-Most losses on meshes take a table of edges, which is made once per mesh. ``edges = nmr.edge_table(faces)`` works for
-all of these; those that do not use faces also take :func:`nmr.unique_edges`, which accepts any mesh.
+Most losses on meshes take a table of edges, which is made once per mesh.
+``edges = nmr.edge_table(faces)`` works for all of these; those that do not use faces also take
+:func:`nmr.unique_edges`, which accepts any mesh.
 """
 
 from __future__ import annotations
@@ -29,24 +30,27 @@ __all__ = [
 
 
 def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
-    """One minus the mean soft intersection over union: ``1 - mean_b(sum(p t) / sum(p + t - p t))``.
+    """One minus the mean soft intersection over union:
+    ``1 - mean_b(sum(p t) / sum(p + t - p t))``.
 
     Parameters
     ----------
     prediction : float Tensor [B, ...], in [0, 1]
-        One image needs its batch axis, ``image[None]``: the rows of ``[H, W]`` would count as H images.
+        One image needs its batch axis, ``image[None]``: the rows of ``[H, W]`` would count as H
+        images.
     target : Tensor of the same shape, in [0, 1] (not 0..255), of any type
 
     Returns
     -------
     scalar Tensor, float64 if prediction is, else float32 (also for half precision)
-        0 if all pairs are binary and equal. A pair of two empty images counts as equal (the published code returns
-        NaN); its gradient is 0. Differentiable in both arguments, twice.
+        0 if all pairs are binary and equal. A pair of two empty images counts as equal (the
+        published code returns NaN); its gradient is 0. Differentiable in both arguments, twice.
 
     Raises
     ------
     TypeError, ValueError
-        If the shapes differ, the batch is empty, or the target is far outside [0, 1], as masks of 0 and 255 are.
+        If the shapes differ, the batch is empty, or the target is far outside [0, 1], as masks of
+        0 and 255 are.
 
     Examples
     --------
@@ -80,7 +84,9 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def _soft_iou(prediction: Tensor, target: Tensor) -> Tensor:
-    """Soft IoU ``[B]`` of pairs ``[B, N]``, by torch: on the device of the images, and in forward mode."""
+    """Soft IoU ``[B]`` of pairs ``[B, N]``, by torch: on the device of the images, and in forward
+    mode.
+    """
     intersection = (prediction * target).sum(1)
     union = (prediction + target).sum(1) - intersection
     empty = union == 0
@@ -88,14 +94,15 @@ def _soft_iou(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
-    """How far neighbouring faces are from flat: mean over meshes of ``sum over edges (1 + cos(theta_e))^2``.
+    """How far neighbouring faces are from flat: mean over meshes of
+    ``sum over edges (1 + cos(theta_e))^2``.
 
     The form is that of Kato et al. 2018; SoftRas calls it the flattening loss.
 
-    theta_e is the angle between the two faces at edge e: pi (cos = -1) when flat. With ``a = v1 - v0`` along the edge
-    and ``b = v_k - v0`` to an opposite corner, each face has the height ``h = b - a (a.b) / (|a|^2 + e)`` of length
-    ``|b| sqrt(1 - cos(a, b)^2 + e)``, and ``cos(theta) = h.h' / (|h| |h'| + e)``, e = 1e-6 in every root and
-    denominator.
+    theta_e is the angle between the two faces at edge e: pi (cos = -1) when flat. With
+    ``a = v1 - v0`` along the edge and ``b = v_k - v0`` to an opposite corner, each face has the
+    height ``h = b - a (a.b) / (|a|^2 + e)`` of length ``|b| sqrt(1 - cos(a, b)^2 + e)``, and
+    ``cos(theta) = h.h' / (|h| |h'| + e)``, e = 1e-6 in every root and denominator.
 
     Parameters
     ----------
@@ -123,10 +130,12 @@ def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:
 
 
 def laplacian_loss(vertices: Tensor, edges: Tensor) -> Tensor:
-    """How far the vertices are from the mean of their neighbours: mean over meshes of ``sum_i |v_i - mean_j v_j|^2``.
+    """How far the vertices are from the mean of their neighbours: mean over meshes of
+    ``sum_i |v_i - mean_j v_j|^2``.
 
-    j runs over the vertices that share an edge with i: the uniform Laplacian. This is the published form of SoftRas and
-    of Kato and Harada 2019; PyTorch3D takes the mean of the lengths instead.
+    j runs over the vertices that share an edge with i: the uniform Laplacian. This is the
+    published form of SoftRas and of Kato and Harada 2019; PyTorch3D takes the mean of the lengths
+    instead.
 
     Parameters
     ----------
@@ -162,17 +171,19 @@ def laplacian_loss(vertices: Tensor, edges: Tensor) -> Tensor:
 
 
 def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = None) -> Tensor:
-    """How much the edges differ in length: mean over meshes of ``sum over edges (|v1 - v0| - target)^2``.
+    """How much the edges differ in length: mean over meshes of
+    ``sum over edges (|v1 - v0| - target)^2``.
 
-    Kato and Harada's 2019 code counts an edge once for each of its faces: on a closed mesh that is twice this loss.
-    PyTorch3D takes the mean over the edges instead of the sum.
+    Kato and Harada's 2019 code counts an edge once for each of its faces: on a closed mesh that
+    is twice this loss. PyTorch3D takes the mean over the edges instead of the sum.
 
     Parameters
     ----------
     vertices : Tensor [B, V, 3] or [V, 3], float32 or float64
     edges : int64 Tensor [E, 2] of :func:`nmr.unique_edges`, or [E, 4] of :func:`nmr.edge_table`
     target : float, optional
-        The length to reach, in the unit of the vertices; by default the mean length of each mesh's own edges.
+        The length to reach, in the unit of the vertices; by default the mean length of each
+        mesh's own edges.
 
     Returns
     -------
@@ -182,8 +193,8 @@ def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = Non
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, for edges that refer to missing vertices, and for a target that is negative or not
-        finite.
+        For wrong types and shapes, for edges that refer to missing vertices, and for a target
+        that is negative or not finite.
 
     Examples
     --------
@@ -204,11 +215,12 @@ def edge_length_loss(vertices: Tensor, edges: Tensor, target: float | None = Non
 
 
 def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
-    """How much neighbouring faces differ in direction: mean over meshes and edges of ``1 - cos(n, n')``.
+    """How much neighbouring faces differ in direction: mean over meshes and edges of
+    ``1 - cos(n, n')``.
 
-    n and n' are the normals of the two faces at an edge, both on the same side of the surface: the order of the faces'
-    vertices does not matter. 0 when flat. This is PyTorch3D's definition (``mesh_normal_consistency``) for meshes whose
-    edges have one face or two.
+    n and n' are the normals of the two faces at an edge, both on the same side of the surface:
+    the order of the faces' vertices does not matter. 0 when flat. This is PyTorch3D's definition
+    (``mesh_normal_consistency``) for meshes whose edges have one face or two.
 
     Parameters
     ----------
@@ -218,7 +230,8 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Differentiable in ``vertices``. An edge at a face without area contributes 1 and has no gradient.
+        Differentiable in ``vertices``. An edge at a face without area contributes 1 and has no
+        gradient.
 
     Raises
     ------
@@ -246,11 +259,12 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
 
 
 def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
-    """A pressure from inside: mean over meshes of ``sum over faces f and their corners k |v_k + n_f - v_k|``.
+    """A pressure from inside: mean over meshes of
+    ``sum over faces f and their corners k |v_k + n_f - v_k|``.
 
-    For the gradient, the first v_k and the unit normal n_f are constants. The value is therefore 3 for every face. The
-    gradient is ``-n_f`` at each corner, so that gradient descent moves every vertex outwards. From the code of Kato and
-    Harada 2019 (view prior learning).
+    For the gradient, the first v_k and the unit normal n_f are constants. The value is therefore
+    3 for every face. The gradient is ``-n_f`` at each corner, so that gradient descent moves
+    every vertex outwards. From the code of Kato and Harada 2019 (view prior learning).
 
     Parameters
     ----------
@@ -260,7 +274,8 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Its gradient in ``vertices`` is the one above, not the derivative of the value. Faces without area contribute 0.
+        Its gradient in ``vertices`` is the one above, not the derivative of the value. Faces
+        without area contribute 0.
 
     Raises
     ------
@@ -281,8 +296,8 @@ def inflation_loss(vertices: Tensor, faces: Tensor) -> Tensor:
 def area_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     """The area of surfaces: mean over meshes of ``sum over faces |(v1 - v0) x (v2 - v0)| / 2``.
 
-    Among the shapes that match given silhouettes, a small weight on the area selects one without folds, flat on the
-    sides that no camera sees.
+    Among the shapes that match given silhouettes, a small weight on the area selects one without
+    folds, flat on the sides that no camera sees.
 
     Parameters
     ----------
@@ -309,10 +324,12 @@ def area_loss(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def volume_loss(vertices: Tensor, faces: Tensor) -> Tensor:
-    """The volume that closed surfaces enclose: mean over meshes of ``sum over faces v0 . (v1 x v2) / 6``.
+    """The volume that closed surfaces enclose: mean over meshes of
+    ``sum over faces v0 . (v1 x v2) / 6``.
 
-    Of the shapes that agree with given silhouettes, the visual hull is the largest. A small weight on the volume
-    removes parts that no silhouette needs, such as the filling between a seat and its legs.
+    Of the shapes that agree with given silhouettes, the visual hull is the largest. A small
+    weight on the volume removes parts that no silhouette needs, such as the filling between a
+    seat and its legs.
 
     Parameters
     ----------
@@ -322,8 +339,8 @@ def volume_loss(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     scalar Tensor
-        Differentiable in ``vertices``. Negative if a surface is turned inside out. It does not depend on the place
-        of a mesh if the surface is closed.
+        Differentiable in ``vertices``. Negative if a surface is turned inside out. It does not
+        depend on the place of a mesh if the surface is closed.
 
     Raises
     ------

@@ -15,7 +15,8 @@ from .obj import find_image, find_libraries, load, match_materials, read_mtl
 
 
 def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
-    """A unit sphere of 10 * 4^n + 2 vertices and 20 * 4^n faces: a subdivided icosahedron (n = 3: 642 and 1280).
+    """A unit sphere of 10 * 4^n + 2 vertices and 20 * 4^n faces: a subdivided icosahedron (n = 3:
+    642 and 1280).
 
     Returns
     -------
@@ -91,34 +92,36 @@ class ObjMesh(NamedTuple):
 def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) -> ObjMesh:
     """Read a Wavefront OBJ file.
 
-    Polygons are cut into triangles; concave ones keep their outline. Relative numbers count from their line. Groups,
-    points, lines and normals are skipped, and so are the texture coordinates of a face that has them at some corners
-    only.
+    Polygons are cut into triangles; concave ones keep their outline. Relative numbers count from
+    their line. Groups, points, lines and normals are skipped, and so are the texture coordinates
+    of a face that has them at some corners only.
 
     Parameters
     ----------
     filename : str or path
     dtype : torch.float32 or torch.float64
-        Type of the floating-point tensors. For coordinates as large as UTM's take float64, subtract the middle, then
-        call ``.float()``.
+        Type of the floating-point tensors. For coordinates as large as UTM's take float64,
+        subtract the middle, then call ``.float()``.
 
     Returns
     -------
     ObjMesh
-        A named tuple of tensors on the default device. ``faces[f]`` and ``uv_faces[f]`` are the rows of ``vertices
-        [V, 3]`` and ``uv [T, 2]`` at the corners of face f, in the order of the file; (0, 0) of ``uv`` is the lower
-        left corner of an image. ``materials[face_material[f]]`` has name, colour and image path of its material. Read
-        the image with a library of your own, and draw with :class:`UVTexture`. ``colors [V, 3]`` are those of the
-        lines ``v x y z r g b``, None if there are none. Values above 1 count as 0..255; vertices without a colour are
-        grey (0.5).
+        A named tuple of tensors on the default device. ``faces[f]`` and ``uv_faces[f]`` are the
+        rows of ``vertices [V, 3]`` and ``uv [T, 2]`` at the corners of face f, in the order of
+        the file; (0, 0) of ``uv`` is the lower left corner of an image.
+        ``materials[face_material[f]]`` has name, colour and image path of its material. Read the
+        image with a library of your own, and draw with :class:`UVTexture`. ``colors [V, 3]`` are
+        those of the lines ``v x y z r g b``, None if there are none. Values above 1 count as
+        0..255; vertices without a colour are grey (0.5).
 
     Raises
     ------
     FileNotFoundError
-        If the file is missing. A missing MTL file is a warning, and so are faces without a known material.
+        If the file is missing. A missing MTL file is a warning, and so are faces without a known
+        material.
     ValueError
-        If the file has no vertices or no faces, or if a line cannot be read or refers to a missing element: the message
-        has the number of the line.
+        If the file has no vertices or no faces, or if a line cannot be read or refers to a
+        missing element: the message has the number of the line.
 
     Examples
     --------
@@ -172,7 +175,8 @@ def unique_edges(faces: Tensor) -> Tensor:
     Returns
     -------
     int64 Tensor [E, 2]
-        Row ``(v0, v1)``: an edge, v0 < v1. Rows are sorted. A side from a vertex to itself is no edge.
+        Row ``(v0, v1)``: an edge, v0 < v1. Rows are sorted. A side from a vertex to itself is no
+        edge.
 
     Raises
     ------
@@ -201,14 +205,15 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     Returns
     -------
     int64 Tensor [E, 4]
-        Row ``(v0, v1, v2, v3)``: the edge's vertices with v0 < v1, then the opposite corners of its two faces (in
-        face order). Rows are sorted by (v0, v1).
+        Row ``(v0, v1, v2, v3)``: the edge's vertices with v0 < v1, then the opposite corners of
+        its two faces (in face order). Rows are sorted by (v0, v1).
 
     Raises
     ------
     TypeError, ValueError
-        For a wrong type or shape, and for a mesh with an edge that does not have exactly two faces (a border, unless
-        `open_mesh`; a non-manifold edge or a degenerate face): the message says how many edges and names the first.
+        For a wrong type or shape, and for a mesh with an edge that does not have exactly two
+        faces (a border, unless `open_mesh`; a non-manifold edge or a degenerate face): the
+        message says how many edges and names the first.
 
     Examples
     --------
@@ -217,7 +222,8 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     tensor([[0, 2, 1, 3]])
     """
     faces = _one_mesh(faces)
-    # Sides 0-1, 1-2 and 2-0 with their opposite corners, grouped by edge; a stable sort keeps the face order.
+    # Sides 0-1, 1-2 and 2-0 with their opposite corners, grouped by edge; a stable sort keeps the
+    # face order.
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
     order = torch.argsort(torch.arange(len(faces), device="cpu").repeat(3), stable=True)
     sides, opposite = _sides(faces)[order], opposite[order]
@@ -244,7 +250,8 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
 
 
 def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
-    """The corners of every face, ``[B, F, 3 corners, 3]`` (``[F, 3, 3]`` for vertices ``[V, 3]``).
+    """The corners of every face, ``[B, F, 3 corners, 3]`` (``[F, 3, 3]`` for vertices
+    ``[V, 3]``).
 
     Parameters
     ----------
@@ -254,7 +261,8 @@ def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     Tensor
-        ``face_vertices[b, f, k]`` is vertex ``faces[f, k]`` of mesh b. Differentiable in ``vertices``.
+        ``face_vertices[b, f, k]`` is vertex ``faces[f, k]`` of mesh b. Differentiable in
+        ``vertices``.
 
     Raises
     ------
@@ -269,9 +277,11 @@ def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Unit normals of the faces: ``(p1 - p0) x (p2 - p0)``, normalised, p0, p1, p2 the face's corners in order.
+    """Unit normals of the faces: ``(p1 - p0) x (p2 - p0)``, normalised, p0, p1, p2 the face's
+    corners in order.
 
-    Counter-clockwise faces of a right-handed world (as those of :func:`icosphere`) have normals that point outwards.
+    Counter-clockwise faces of a right-handed world (as those of :func:`icosphere`) have normals
+    that point outwards.
 
     Parameters
     ----------
@@ -281,7 +291,8 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     Tensor [B, F, 3], or [F, 3] for vertices [V, 3]
-        Of length 1; 0 for a face without area. Differentiable in ``vertices`` (a face without area has no gradient).
+        Of length 1; 0 for a face without area. Differentiable in ``vertices`` (a face without
+        area has no gradient).
 
     Raises
     ------
@@ -298,7 +309,8 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Unit normals at the vertices: the normals of the faces around each, weighted by their areas, normalised.
+    """Unit normals at the vertices: the normals of the faces around each, weighted by their
+    areas, normalised.
 
     Parameters
     ----------
@@ -308,7 +320,8 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     Tensor like vertices
-        Of length 1; 0 at a vertex that no face with an area touches. Differentiable in ``vertices``.
+        Of length 1; 0 at a vertex that no face with an area touches. Differentiable in
+        ``vertices``.
 
     Raises
     ------
@@ -338,8 +351,8 @@ def _face_cross(corners: Tensor) -> Tensor:
 
 def _unit(vectors: Tensor) -> Tensor:
     """Vectors over their lengths; 0, with gradient 0, if the length is 0."""
-    # Scaled to a largest coordinate of 1 first, so that the squares neither under- nor overflow. The result does not
-    # depend on the scale, so neither does its derivative.
+    # Scaled to a largest coordinate of 1 first, so that the squares neither under- nor overflow.
+    # The result does not depend on the scale, so neither does its derivative.
     scale = vectors.detach().abs().amax(-1, keepdim=True)
     zero = scale < torch.finfo(vectors.dtype).tiny
     vectors = torch.where(zero, 1.0, vectors / torch.where(zero, 1.0, scale))
@@ -362,7 +375,9 @@ def _sides(faces: Tensor) -> Tensor:
 
 
 def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> None:
-    """Raise a ValueError if an index is outside 0..V-1. (Values are unknown when compiled or under vmap.)"""
+    """Raise a ValueError if an index is outside 0..V-1. (Values are unknown when compiled or
+    under vmap.)
+    """
     if torch.compiler.is_compiling() or indices.numel() == 0:
         return
     try:
@@ -382,7 +397,9 @@ def _expanded(indices: Tensor, batch: int) -> Tensor:
 
 
 def _gather(rows: Tensor, indices: Tensor) -> Tensor:
-    """Rows ``[B, N, 3]`` of ``[B, V, 3]``. On a CPU, torch.gather is the fastest way, forward and backward."""
+    """Rows ``[B, N, 3]`` of ``[B, V, 3]``. On a CPU, torch.gather is the fastest way, forward and
+    backward.
+    """
     return torch.gather(rows, 1, _expanded(indices, rows.shape[0]))
 
 

@@ -1,8 +1,9 @@
 """How close two shapes are: points on surfaces, Chamfer distance, F-score, IoU of grids.
 
-Nearest points are found by SciPy's k-d tree if SciPy is installed and the points are in host memory, otherwise by
-comparing all pairs in chunks. Both are exact. They differ in speed (7 ms and 0.3 s for 10,000 and 10,000 points on two
-cores), and may choose different points among equally near ones.
+Nearest points are found by SciPy's k-d tree if SciPy is installed and the points are in host
+memory, otherwise by comparing all pairs in chunks. Both are exact. They differ in speed (7 ms and
+0.3 s for 10,000 and 10,000 points on two cores), and may choose different points among equally
+near ones.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def sample_surface(
 ) -> SurfacePoints:
     """Random points on meshes, uniform over their area.
 
-    A face is drawn with probability proportional to its area, then a point on it, p = (1 - r) p0 + r (1 - s) p1 +
-    r s p2 with r^2 and s uniform in [0, 1].
+    A face is drawn with probability proportional to its area, then a point on it, p = (1 - r)
+    p0 + r (1 - s) p1 + r s p2 with r^2 and s uniform in [0, 1].
 
     Parameters
     ----------
@@ -56,13 +57,15 @@ def sample_surface(
     count : int
         N, points per mesh.
     generator : torch.Generator, optional
-        Source of the random numbers, on the device of the vertices; by default torch's global generator.
+        Source of the random numbers, on the device of the vertices; by default torch's global
+        generator.
 
     Returns
     -------
     SurfacePoints (points, normals, face_index)
-        ``points[b, n]`` is on face ``face_index[b, n]`` of mesh b, whose unit normal is ``normals[b, n]``. points and
-        normals are differentiable in ``vertices``; which faces are drawn is not.
+        ``points[b, n]`` is on face ``face_index[b, n]`` of mesh b, whose unit normal is
+        ``normals[b, n]``. points and normals are differentiable in ``vertices``; which faces are
+        drawn is not.
 
     Raises
     ------
@@ -118,12 +121,14 @@ def chamfer_distance(
     Returns
     -------
     Tensor [B], or a scalar for points [N, 3]
-        Differentiable in both sets: each point is pulled to its nearest one (the gradient is 0 at distance 0).
+        Differentiable in both sets: each point is pulled to its nearest one (the gradient is 0 at
+        distance 0).
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, empty sets, coordinates that are not finite, and an unknown form.
+        For wrong types and shapes, empty sets, coordinates that are not finite, and an unknown
+        form.
 
     Examples
     --------
@@ -144,10 +149,11 @@ def chamfer_distance(
 
 @torch.no_grad()
 def f_score(points_a: Tensor, points_b: Tensor, threshold: float) -> Tensor:
-    """Share of points that are close to the other set: ``2 P R / (P + R)`` with precision P and recall R.
+    """Share of points that are close to the other set: ``2 P R / (P + R)`` with precision P and
+    recall R.
 
-    P is the share of the points a that are nearer than the threshold to some b, R the share of the points b that are
-    nearer than the threshold to some a (Tatarchenko et al. 2019).
+    P is the share of the points a that are nearer than the threshold to some b, R the share of
+    the points b that are nearer than the threshold to some a (Tatarchenko et al. 2019).
 
     Parameters
     ----------
@@ -164,7 +170,8 @@ def f_score(points_a: Tensor, points_b: Tensor, threshold: float) -> Tensor:
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, empty sets, coordinates that are not finite, and a threshold that is not above 0.
+        For wrong types and shapes, empty sets, coordinates that are not finite, and a threshold
+        that is not above 0.
 
     Examples
     --------
@@ -210,7 +217,8 @@ def voxel_iou(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def voxel_precision_recall(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Precision and recall of predicted grids: the share of A that is in B, and the share of B that is in A.
+    """Precision and recall of predicted grids: the share of A that is in B, and the share of B
+    that is in A.
 
     Shapes that are too full have a low precision, those that lack parts a low recall.
 
@@ -221,7 +229,8 @@ def voxel_precision_recall(prediction: Tensor, target: Tensor) -> tuple[Tensor, 
     Returns
     -------
     precision, recall : float64 Tensor [B] each
-        ``|A & B| / |A|`` and ``|A & B| / |B|`` of prediction A and target B; NaN if A, or B, is empty.
+        ``|A & B| / |A|`` and ``|A & B| / |B|`` of prediction A and target B; NaN if A, or B, is
+        empty.
 
     Raises
     ------
@@ -254,7 +263,9 @@ def _check_grids(prediction: Tensor, target: Tensor) -> None:
 
 
 def _count(grids: Tensor) -> Tensor:
-    """Number of set cells of each grid, float64 [B]. NumPy counts bytes fifty times as fast as torch."""
+    """Number of set cells of each grid, float64 [B]. NumPy counts bytes fifty times as fast as
+    torch.
+    """
     counts = [np.count_nonzero(grid) for grid in grids.flatten(1).cpu().numpy()]
     return torch.tensor(counts, dtype=torch.float64, device=grids.device)
 
@@ -288,7 +299,9 @@ def _check_points(a: object, b: object) -> tuple[Tensor, Tensor]:
 
 
 def _to_nearest(a: Tensor, b: Tensor) -> Tensor:
-    """Vectors from each point of a [B, N, 3] to its nearest point of b [B, M, 3]. Differentiable in both."""
+    """Vectors from each point of a [B, N, 3] to its nearest point of b [B, M, 3]. Differentiable
+    in both.
+    """
     return _gather(b, _nearest(a.detach(), b.detach())) - a
 
 

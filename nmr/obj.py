@@ -1,4 +1,6 @@
-"""Wavefront OBJ and MTL files, and polygons cut into triangles. Imports NumPy alone, for processes without torch."""
+"""Wavefront OBJ and MTL files, and polygons cut into triangles. Imports NumPy alone, for
+processes without torch.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def load(filename: str, with_uv: bool = True) -> Obj:
 
 
 def _open(filename: str) -> BinaryIO:
-    """Open an OBJ or MTL file. Raises ValueError for pipes (reading one would wait) and files above 1 GiB."""
+    """Open an OBJ or MTL file. Raises ValueError for pipes (reading one would wait) and files
+    above 1 GiB.
+    """
     if os.path.exists(filename) and not os.path.isfile(filename):
         raise ValueError(f"{filename} is not a regular file")
     if os.path.exists(filename) and os.path.getsize(filename) > _MOST_BYTES:
@@ -60,12 +64,13 @@ def _open(filename: str) -> BinaryIO:
 def read_obj(file: BinaryIO, with_uv: bool = True) -> Obj:
     """Read an OBJ file; `triangulate` cuts its polygons.
 
-    Points, lines, groups, normals and unknown lines are skipped. Lines may be indented, have comments, be continued by
-    a backslash, and end as on any system. A face needs texture coordinates at all corners to have any. If there is no
-    line `vt`, no face has any. It takes the memory of the result twice, and some megabytes.
+    Points, lines, groups, normals and unknown lines are skipped. Lines may be indented, have
+    comments, be continued by a backslash, and end as on any system. A face needs texture
+    coordinates at all corners to have any. If there is no line `vt`, no face has any. It takes
+    the memory of the result twice, and some megabytes.
 
-    with_uv: False skips texture coordinates. Raises ValueError, with the number of the line, if a line cannot be read
-    or a face refers to a missing element.
+    with_uv: False skips texture coordinates. Raises ValueError, with the number of the line, if a
+    line cannot be read or a face refers to a missing element.
     """
     lines, rest, number = _Lines(with_uv), b"", 1
     while True:
@@ -77,7 +82,8 @@ def read_obj(file: BinaryIO, with_uv: bool = True) -> Obj:
                 raise ValueError("it is UTF-16; save it as UTF-8")
         end = _last_line_end(text) if more else len(text)
         text, rest = text[:end], text[end:]
-        # Each replacement keeps the length. A vertical tab stands for the line end behind a backslash.
+        # Each replacement keeps the length. A vertical tab stands for the line end behind a
+        # backslash.
         if b"\r" in text:
             text = text.replace(b"\r\n", b" \n").replace(b"\r", b"\n")
         if b"\\" in text:
@@ -89,7 +95,9 @@ def read_obj(file: BinaryIO, with_uv: bool = True) -> Obj:
 
 
 def _last_line_end(text: bytes) -> int:
-    """The end of the last complete line, 0 if there is none. Lone carriage returns end lines if no other line ends."""
+    """The end of the last complete line, 0 if there is none. Lone carriage returns end lines if
+    no other line ends.
+    """
     end = text.rfind(b"\n") + 1 or text.rfind(b"\r", 0, len(text) - 1) + 1
     while text[max(end - 3, 0) : end].rstrip(b"\r\n").endswith(b"\\"):
         end = text.rfind(b"\n", 0, end - 1) + 1
@@ -115,7 +123,9 @@ class _Lines:
         }  # index of a corner, and its line
 
     def take(self, text: bytes, number: int) -> None:
-        """Add complete lines, which count from `number`. The first wrong one is found by bisection."""
+        """Add complete lines, which count from `number`. The first wrong one is found by
+        bisection.
+        """
         try:
             self._parse(text, number)
         except (ValueError, OverflowError) as error:
@@ -256,8 +266,8 @@ def _numbers(data: np.ndarray, dtype: type, count: int, wanted: str) -> np.ndarr
 def _table(data: np.ndarray, counts: np.ndarray, least: int, needed: int, width: int) -> np.ndarray:
     """The first numbers of each line, float64 [N, width].
 
-    A missing number is 0 in the first `needed` columns, else NaN. Raises ValueError for lines of fewer than `least`
-    numbers, and if one of the needed ones is not finite in float32.
+    A missing number is 0 in the first `needed` columns, else NaN. Raises ValueError for lines of
+    fewer than `least` numbers, and if one of the needed ones is not finite in float32.
     """
     wanted = f"{needed} numbers are needed, finite in float32"
     if not len(counts):
@@ -273,7 +283,9 @@ def _table(data: np.ndarray, counts: np.ndarray, least: int, needed: int, width:
 
 
 def _corners(data: np.ndarray, sizes: np.ndarray) -> list[np.ndarray]:
-    """The numbers of the vertices and of the texture coordinates (0 if missing) of all corners, int64 [N] each."""
+    """The numbers of the vertices and of the texture coordinates (0 if missing) of all corners,
+    int64 [N] each.
+    """
     wanted, count = "corners such as 1, 1/2, 1//3 or 1/2/3 are needed", int(sizes.sum())
     if len(sizes) and sizes.min() == 0:
         raise ValueError("a face needs corners")
@@ -293,7 +305,9 @@ def _corners(data: np.ndarray, sizes: np.ndarray) -> list[np.ndarray]:
 
 
 def _absolute(numbers: np.ndarray, before: np.ndarray, optional: bool) -> np.ndarray:
-    """Indices from 0; -1 for the number 0 if it is optional. Negative numbers count back from the elements before."""
+    """Indices from 0; -1 for the number 0 if it is optional. Negative numbers count back from the
+    elements before.
+    """
     indices = np.where(numbers > 0, numbers - 1, numbers + before)
     missing = numbers == 0
     indices[missing] = -1
@@ -306,8 +320,9 @@ def _absolute(numbers: np.ndarray, before: np.ndarray, optional: bool) -> np.nda
 def triangulate(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Cut simple polygons, convex or not, into triangles.
 
-    A polygon becomes the fan around its first corner whose triangles do not fold over: for convex polygons, corner 0.
-    If every fan around its first eight corners folds, the polygon is cut by its ears.
+    A polygon becomes the fan around its first corner whose triangles do not fold over: for convex
+    polygons, corner 0. If every fan around its first eight corners folds, the polygon is cut by
+    its ears.
 
     Parameters
     ----------
@@ -320,13 +335,14 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) ->
     Returns
     -------
     int32 [T, 3]
-        Indices in `corners`. Polygon i gives ``sizes[i] - 2`` consecutive rows, in the order of the polygons, with its
-        winding.
+        Indices in `corners`. Polygon i gives ``sizes[i] - 2`` consecutive rows, in the order of
+        the polygons, with its winding.
 
     Raises
     ------
     ValueError
-        If a corner is outside of the vertices, and for polygons of over 4096 corners that are no fan.
+        If a corner is outside of the vertices, and for polygons of over 4096 corners that are no
+        fan.
     """
     if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
         raise ValueError(f"a polygon refers to a missing vertex; there are {len(vertices)}")
@@ -371,7 +387,9 @@ def _cut(points: np.ndarray) -> np.ndarray:
 
 
 def _cut_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
-    """N - 2 triangles of a polygon [N, 3], by ear clipping in the coordinate plane of its largest projection."""
+    """N - 2 triangles of a polygon [N, 3], by ear clipping in the coordinate plane of its largest
+    projection.
+    """
     size = len(points)
     if size > _MOST_EARS:
         raise ValueError(
@@ -402,7 +420,8 @@ def _cut_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
     triangles, j, misses, crosses = [], 0, 0, False
     while len(triangles) < size - 2:
         left = size - len(triangles)
-        # Without an ear, corners without area go first. A polygon that crosses itself is cut anyhow.
+        # Without an ear, corners without area go first. A polygon that crosses itself is cut
+        # anyhow.
         crosses = crosses or misses > 2 * left
         if crosses or (misses > left and angle(j) == 0) or (angle(j) > 0 and is_ear(j)):
             triangles.append((before[j], j, after[j]))
@@ -429,7 +448,8 @@ def _without_comment(text: str) -> str:
 
 
 def read_mtl(filename: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Colours ``Kd`` float32 [3] and image names ``map_Kd`` (as written) of the materials of an MTL file.
+    """Colours ``Kd`` float32 [3] and image names ``map_Kd`` (as written) of the materials of an
+    MTL file.
 
     Raises ValueError, with the number of the line, for a colour that cannot be read.
     """
@@ -457,7 +477,9 @@ def read_mtl(filename: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def find_libraries(folder: str, lines: Iterable[str]) -> list[str]:
-    """The MTL files of lines ``mtllib``, each of one name with spaces, or of several. Missing ones are listed, too."""
+    """The MTL files of lines ``mtllib``, each of one name with spaces, or of several. Missing
+    ones are listed, too.
+    """
     found = []
     for line in lines:
         whole = [path for name in (line, _without_comment(line)) if (path := _find(folder, name))]
@@ -481,8 +503,8 @@ def find_image(folder: str, line: str) -> str:
 def _find(folder: str, name: str) -> str | None:
     """The file `name` below a folder, or None.
 
-    Backslashes and another case of the letters are accepted. Of a path that does not exist the last part counts: it may
-    be one of another machine.
+    Backslashes and another case of the letters are accepted. Of a path that does not exist the
+    last part counts: it may be one of another machine.
     """
     name = name.strip().strip("\"'").replace("\\", "/")
     if os.path.isfile(path := os.path.join(folder, name)):
@@ -501,7 +523,8 @@ def _find(folder: str, name: str) -> str | None:
 def match_materials(
     names: list[str], face_material: np.ndarray, known: Collection[str], filename: str
 ) -> list[str]:
-    """The material of each name of a line `usemtl`: itself, or its first word (as published); "" if neither is known.
+    """The material of each name of a line `usemtl`: itself, or its first word (as published); ""
+    if neither is known.
 
     Warns of faces without a known material.
     """

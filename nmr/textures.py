@@ -1,4 +1,5 @@
-"""Colours of meshes: per vertex, per face, cubes of texels, images with uv coordinates, or a class of your own.
+"""Colours of meshes: per vertex, per face, cubes of texels, images with uv coordinates, or a
+class of your own.
 
 Any object with ``sample(fragments) -> [B, H, W, C]`` can be used as colours: see :class:`Colors`.
 """
@@ -112,10 +113,11 @@ class FaceColors:
 class TextureCubes:
     """A cube of texels per face, as in the Neural Mesh Renderer.
 
-    The point with barycentric weights (b0, b1, b2) has the colour at ``(ts - 1) (b0, b1, b2)`` in the cube of its face,
-    interpolated between the eight nearest texels. Texel [ts - 1, 0, 0] is the colour of the face's first vertex. As in
-    the published renderer, colours do not move vertices through the weights, even with ``interpolation_gradient``, and
-    the place in the cube ends at ts - 1 - ``eps`` of the render function: a large eps changes colours at the vertices.
+    The point with barycentric weights (b0, b1, b2) has the colour at ``(ts - 1) (b0, b1, b2)`` in
+    the cube of its face, interpolated between the eight nearest texels. Texel [ts - 1, 0, 0] is
+    the colour of the face's first vertex. As in the published renderer, colours do not move
+    vertices through the weights, even with ``interpolation_gradient``, and the place in the cube
+    ends at ts - 1 - ``eps`` of the render function: a large eps changes colours at the vertices.
 
     Parameters
     ----------
@@ -174,26 +176,29 @@ class UVTexture:
     image : float Tensor [H, W, C] or [B, H, W, C]; for a list of meshes a list of [H_b, W_b, C]
         Row 0 is the top; any number of channels. Differentiable.
     uv : float Tensor [T, 2] or [B, T, 2]; for a list of meshes a list of [T_b, 2]
-        (0, 0) is the bottom left corner of the image, (1, 1) its top right one; texel centres are at half texels.
-        Differentiable. Coordinates that are not finite, or larger than 1e6, count as 0.
+        (0, 0) is the bottom left corner of the image, (1, 1) its top right one; texel centres are
+        at half texels. Differentiable. Coordinates that are not finite, or larger than 1e6, count
+        as 0.
     uv_faces : integer Tensor [F, 3] or [B, F, 3], or a list; optional
-        Row of uv at each corner of each face. Without it there is one uv per vertex. At a seam, faces that share a
-        vertex have different rows.
+        Row of uv at each corner of each face. Without it there is one uv per vertex. At a seam,
+        faces that share a vertex have different rows.
     wrap : "repeat", "clamp" or "mirror"
         How the image continues outside [0, 1].
     filter : "bilinear" or "mipmap"
-        "bilinear": interpolated between the four nearest texels. If the image is drawn smaller than it is, most
-        texels are skipped: pictures flicker, and those texels get no gradient. "mipmap" takes such colours from
-        smaller copies of the image, linearly between the two that fit best (trilinear), so that each pixel shows the
-        mean of about the texels that it covers, and every texel gets a gradient.
+        "bilinear": interpolated between the four nearest texels. If the image is drawn smaller
+        than it is, most texels are skipped: pictures flicker, and those texels get no gradient.
+        "mipmap" takes such colours from smaller copies of the image, linearly between the two
+        that fit best (trilinear), so that each pixel shows the mean of about the texels that it
+        covers, and every texel gets a gradient.
 
     Notes
     -----
-    Mipmaps: each level has half the height and half the width of the one before, rounded down, until one texel is left;
-    a texel is the mean of the area that it covers. The level of a pixel is OpenGL's,
-    ``log2(max(|d(x, y)/dX|, |d(x, y)/dY|))``, where (x, y) is the position in texels of the full image and (X, Y) that
-    in pixels of the raster, clamped to the levels that there are. The derivatives are those of the pixel's face, not
-    differences of neighbours. The level counts as a constant in gradients: it chooses a resolution, not a place.
+    Mipmaps: each level has half the height and half the width of the one before, rounded down,
+    until one texel is left; a texel is the mean of the area that it covers. The level of a pixel
+    is OpenGL's, ``log2(max(|d(x, y)/dX|, |d(x, y)/dY|))``, where (x, y) is the position in texels
+    of the full image and (X, Y) that in pixels of the raster, clamped to the levels that there
+    are. The derivatives are those of the pixel's face, not differences of neighbours. The level
+    counts as a constant in gradients: it chooses a resolution, not a place.
 
     Raises
     ------
@@ -263,7 +268,9 @@ class UVTexture:
         return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(self.wrap))
 
     def _texels(self, fragments: Fragments) -> tuple[Tensor, Tensor, int]:
-        """All texels ``[., C]``, the place of each level of each image among them, and the number of texels."""
+        """All texels ``[., C]``, the place of each level of each image among them, and the number
+        of texels.
+        """
         image = check_values(self.image, "image", "H, W, C")
         batch = fragments.mesh.batch
         if len(image) not in (1, batch):
@@ -296,11 +303,12 @@ def sample_texture(
     image : float Tensor [h, w, C] or [B, h, w, C]
         Row 0 is the top; any number of channels. Differentiable.
     uv : float Tensor [B, H, W, 2]
-        (0, 0) is the bottom left corner of the image, (1, 1) its top right one. Differentiable. Coordinates that are
-        not finite, or larger than 1e6, count as 0.
+        (0, 0) is the bottom left corner of the image, (1, 1) its top right one. Differentiable.
+        Coordinates that are not finite, or larger than 1e6, count as 0.
     derivatives : float Tensor [B, H, W, 4], optional
-        (du/dX, du/dY, dv/dX, dv/dY) per pixel: colours then come from mipmaps, as those of :class:`UVTexture` with
-        ``filter="mipmap"``. Without gradient. By default, colours are bilinear.
+        (du/dX, du/dY, dv/dX, dv/dY) per pixel: colours then come from mipmaps, as those of
+        :class:`UVTexture` with ``filter="mipmap"``. Without gradient. By default, colours are
+        bilinear.
     wrap : "repeat", "clamp" or "mirror"
         How the image continues outside [0, 1].
 
@@ -355,9 +363,11 @@ def sample_texture(
 
 
 def _once(image: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
-    """One image [1, H, W, C] instead of its copies if it was expanded over the batch; other images as they are.
+    """One image [1, H, W, C] instead of its copies if it was expanded over the batch; other
+    images as they are.
 
-    The gradient then goes to the tensor that was expanded, which is ``_base`` unless that has more texels.
+    The gradient then goes to the tensor that was expanded, which is ``_base`` unless that has
+    more texels.
     """
     if is_list(image) or len(image) < 2 or image.stride(0) != 0 or torch.compiler.is_compiling():
         return image
@@ -376,7 +386,9 @@ def _once(image: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
 
 
 def level_grids(sizes: list[tuple[int, int]], levels: int) -> tuple[Tensor, int]:
-    """Places of the levels of images (height, width), as :mod:`nmr.ops` has them, and the number of their texels."""
+    """Places of the levels of images (height, width), as :mod:`nmr.ops` has them, and the number
+    of their texels.
+    """
     grids, first = [], 0
     for height, width in sizes:
         for _ in range(levels):
@@ -404,12 +416,14 @@ def sample_places(
 
 
 class NormalMap(UVTexture):
-    """Normals from an image in tangent space, for ``Lights(normals=...)``; the arguments are those of UVTexture.
+    """Normals from an image in tangent space, for ``Lights(normals=...)``; the arguments are
+    those of UVTexture.
 
-    A texel (x, y, z) means the direction ``x T + y B + z N``, normalised. N is the interpolated normal of the vertices,
-    outward for faces that are counter-clockwise from outside. T is the direction in which u grows on the face, made
-    orthogonal to N, and B completes the two to the side in which v grows. Image files hold (texel + 1) / 2: pass ``2 *
-    image - 1``. Frames belong to faces: unlike MikkTSpace's, T and B are not interpolated between them.
+    A texel (x, y, z) means the direction ``x T + y B + z N``, normalised. N is the interpolated
+    normal of the vertices, outward for faces that are counter-clockwise from outside. T is the
+    direction in which u grows on the face, made orthogonal to N, and B completes the two to the
+    side in which v grows. Image files hold (texel + 1) / 2: pass ``2 * image - 1``. Frames belong
+    to faces: unlike MikkTSpace's, T and B are not interpolated between them.
 
     Differentiable in the image, the uv coordinates and the vertices.
 

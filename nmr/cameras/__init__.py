@@ -1,4 +1,5 @@
-"""Cameras: from world space to renderer space (x right, y up, both in [-1, 1] across the image; z = depth).
+"""Cameras: from world space to renderer space (x right, y up, both in [-1, 1] across the image;
+z = depth).
 
 ``docs/conventions.md`` has the table of conventions and which of them mirror the world.
 """

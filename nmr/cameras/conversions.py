@@ -1,11 +1,13 @@
-"""Converts cameras from and to the conventions of OpenCV, OpenGL and PyTorch3D. Differentiable; results are float64.
+"""Converts cameras from and to the conventions of OpenCV, OpenGL and PyTorch3D. Differentiable;
+results are float64.
 
-The worlds of these libraries are right-handed. Their cameras, converted to nmr, show the same picture.
-:class:`nmr.LookAt`, :class:`nmr.Look` and :class:`nmr.Orthographic` treat the world as left-handed, as the published
-renderer does, and show a mirror image of it; with ``right_handed=True`` they are ordinary right-handed cameras.
-Converted to another library, both put every vertex on the same pixel. The rotation of a left-handed one then has
-determinant -1. If you need a proper rotation for it, give the other renderer mirrored vertices
-``v * (1, 1, -1)`` and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
+The worlds of these libraries are right-handed. Their cameras, converted to nmr, show the same
+picture. :class:`nmr.LookAt`, :class:`nmr.Look` and :class:`nmr.Orthographic` treat the world as
+left-handed, as the published renderer does, and show a mirror image of it; with
+``right_handed=True`` they are ordinary right-handed cameras. Converted to another library, both
+put every vertex on the same pixel. The rotation of a left-handed one then has determinant -1. If
+you need a proper rotation for it, give the other renderer mirrored vertices ``v * (1, 1, -1)``
+and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from .projection import (
     height_and_width,
 )
 
-# Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer; PyTorch3D: left, up, away.
+# Camera axes here: x right, y down, z away (OpenCV). OpenGL: right, up, towards the viewer;
+# PyTorch3D: left, up, away.
 _HOST = {
     "dtype": torch.float64,
     "device": "cpu",
@@ -86,7 +89,8 @@ def from_opencv(
     pixel_center: float = 0.0,
     fisheye: bool = False,
 ) -> Pinhole:
-    """A camera of OpenCV: ``c = R v + t``, distorted, ``(u, v) = K (c_x / c_z, c_y / c_z, 1)`` in pixels.
+    """A camera of OpenCV: ``c = R v + t``, distorted, ``(u, v) = K (c_x / c_z, c_y / c_z, 1)`` in
+    pixels.
 
     Parameters
     ----------
@@ -94,25 +98,28 @@ def from_opencv(
         For a rotation vector use ``cv2.Rodrigues`` first.
     t : [3], [3, 1], [B, 3] or [B, 3, 1]
     dist_coeffs : [4], [5] or [8], or [B, 4] and so on, also as a column, optional
-        k1, k2, p1, p2, then k3, then k4, k5, k6. Beyond the reach of the formula the image goes on straight, as
-        :class:`nmr.Pinhole` says.
+        k1, k2, p1, p2, then k3, then k4, k5, k6. Beyond the reach of the formula the image goes
+        on straight, as :class:`nmr.Pinhole` says.
     height, width : number
-        The image that K belongs to. The rendered image shows all of it, stretched if it has another shape.
+        The image that K belongs to. The rendered image shows all of it, stretched if it has
+        another shape.
     pixel_center : float
-        Coordinate of the centre of the first pixel: 0 in OpenCV, 0.5 if pixel coordinates begin at its corner
-        (COLMAP; :class:`nmr.Pinhole` itself).
+        Coordinate of the centre of the first pixel: 0 in OpenCV, 0.5 if pixel coordinates begin
+        at its corner (COLMAP; :class:`nmr.Pinhole` itself).
     fisheye : bool
         dist_coeffs are the k1, k2, k3, k4 of ``cv2.fisheye``.
 
     Returns
     -------
     Pinhole
-        At ``image_size=(height, width)``, a vertex that OpenCV projects to (u, v) is drawn in row v, column u.
+        At ``image_size=(height, width)``, a vertex that OpenCV projects to (u, v) is drawn in row
+        v, column u.
 
     Raises
     ------
     TypeError, ValueError
-        For values that are not numbers, and wrong shapes, including those of OpenCV's longer distortion models.
+        For values that are not numbers, and wrong shapes, including those of OpenCV's longer
+        distortion models.
 
     Examples
     --------
@@ -156,11 +163,11 @@ def from_opencv(
 def to_opencv(
     camera: ProjectingCamera, *, height: float, width: float, pixel_center: float = 0.0
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """``K [B, 3, 3]``, ``R [B, 3, 3]``, ``t [B, 3]`` and ``dist_coeffs [B, 5]`` ([B, 8]; [B, 4] of a fisheye)
-    or None, as :func:`from_opencv` takes.
+    """``K [B, 3, 3]``, ``R [B, 3, 3]``, ``t [B, 3]`` and ``dist_coeffs [B, 5]`` ([B, 8]; [B, 4]
+    of a fisheye) or None, as :func:`from_opencv` takes.
 
-    A vertex keeps its pixel in images of ``image_size=(height, width)``.
-    The determinant of R is -1 for the cameras of a left-handed world (see above). An orthographic camera raises a
+    A vertex keeps its pixel in images of ``image_size=(height, width)``. The determinant of R is
+    -1 for the cameras of a left-handed world (see above). An orthographic camera raises a
     ValueError.
 
     Examples
@@ -194,14 +201,16 @@ def from_opengl(view: Numbers, projection: Numbers) -> Projection:
     Parameters
     ----------
     view, projection : [4, 4] or [B, 4, 4]
-        For column vectors, as in the specification (a flat array in OpenGL's memory order is the transpose). The last
-        row of ``projection`` is (0, 0, -1, 0) for a perspective and (0, 0, 0, 1) for an orthographic camera.
+        For column vectors, as in the specification (a flat array in OpenGL's memory order is the
+        transpose). The last row of ``projection`` is (0, 0, -1, 0) for a perspective and (0, 0,
+        0, 1) for an orthographic camera.
 
     Returns
     -------
     Projection
-        x and y are OpenGL's normalized device coordinates. z is the distance ``-z_eye`` from the plane of the eye, and
-        not OpenGL's depth: near and far of ``projection`` are arguments of the rendering functions here.
+        x and y are OpenGL's normalized device coordinates. z is the distance ``-z_eye`` from the
+        plane of the eye, and not OpenGL's depth: near and far of ``projection`` are arguments of
+        the rendering functions here.
 
     Raises
     ------
@@ -245,11 +254,13 @@ def to_opengl(
     far: float,
     image_size: tuple[float, float] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """``view`` and ``projection``, ``[B, 4, 4]``, as :func:`from_opengl` takes them; near and far map to -1 and 1 in z.
+    """``view`` and ``projection``, ``[B, 4, 4]``, as :func:`from_opengl` takes them; near and far
+    map to -1 and 1 in z.
 
-    ``image_size`` (height, width) is that of the images to come; it must be given if they are not square.
-    The determinant of ``view`` is -1 for the cameras of a left-handed world (see above); the winding of a face on the
-    screen is the same as here. A distorted camera raises a ValueError.
+    ``image_size`` (height, width) is that of the images to come; it must be given if they are not
+    square. The determinant of ``view`` is -1 for the cameras of a left-handed world (see above);
+    the winding of a face on the screen is the same as here. A distorted camera raises a
+    ValueError.
 
     Examples
     --------
@@ -303,9 +314,9 @@ def from_pytorch3d(
 ) -> Projection:
     """A ``PerspectiveCameras`` or ``OrthographicCameras`` of PyTorch3D.
 
-    There ``(X, Y, Z) = v R + T`` with row vectors and X left, Y up, Z away; ``x_ndc = fx X / Z + px`` (``fx X + px``
-    if orthographic), y likewise; +1 is the left and the upper border of a square image, and of
-    the shorter side of any other.
+    There ``(X, Y, Z) = v R + T`` with row vectors and X left, Y up, Z away;
+    ``x_ndc = fx X / Z + px`` (``fx X + px`` if orthographic), y likewise; +1 is the left and the
+    upper border of a square image, and of the shorter side of any other.
 
     Parameters
     ----------
@@ -315,8 +326,9 @@ def from_pytorch3d(
     in_ndc : bool
         False: in pixels from the upper left corner of the image; ``image_size`` is then needed.
     image_size : (height, width), optional
-        The image of these numbers. The rendered image shows all of it, stretched if it has another shape. Without it,
-        they are taken for those of the rendered image, whatever its shape.
+        The image of these numbers. The rendered image shows all of it, stretched if it has
+        another shape. Without it, they are taken for those of the rendered image, whatever its
+        shape.
     orthographic : bool
 
     Returns
@@ -345,7 +357,8 @@ def from_pytorch3d(
     if not in_ndc:
         focal, centre = focal * (2 / shorter), -(centre - size / 2) * (2 / shorter)
     focal, centre = focal * (shorter / size), centre * (shorter / size)
-    # x = -x_ndc, and X of the camera axes also changes its sign: only the principal point needs a minus.
+    # x = -x_ndc, and X of the camera axes also changes its sign: only the principal point needs a
+    # minus.
     intrinsics = torch.stack(
         [_row(focal[:, 0], 0, -centre[:, 0]), _row(0, -focal[:, 1], centre[:, 1])], dim=1
     )
@@ -366,10 +379,11 @@ def from_pytorch3d_fov(
     degrees: bool = True,
     image_size: tuple[float, float] | None = None,
 ) -> Projection:
-    """A ``FoVPerspectiveCameras`` of PyTorch3D: ``fov``, a number or [B], is the WHOLE vertical field of view.
+    """A ``FoVPerspectiveCameras`` of PyTorch3D: ``fov``, a number or [B], is the WHOLE vertical
+    field of view.
 
-    Its focal lengths are ``1 / (aspect_ratio tan(fov / 2))`` and ``1 / tan(fov / 2)``; the rest is
-    :func:`from_pytorch3d`.
+    Its focal lengths are ``1 / (aspect_ratio tan(fov / 2))`` and ``1 / tan(fov / 2)``; the rest
+    is :func:`from_pytorch3d`.
 
     Examples
     --------
@@ -387,16 +401,19 @@ def from_pytorch3d_fov(
 def to_pytorch3d(
     camera: ProjectingCamera, *, image_size: tuple[float, float] | None = None, in_ndc: bool = True
 ) -> dict[str, Tensor | bool]:
-    """Arguments of ``PerspectiveCameras(**...)``, or of ``OrthographicCameras`` for an orthographic camera.
+    """Arguments of ``PerspectiveCameras(**...)``, or of ``OrthographicCameras`` for an
+    orthographic camera.
 
-    ``R [B, 3, 3]``, ``T [B, 3]``, ``focal_length [B, 2]``, ``principal_point [B, 2]``, ``in_ndc``, and ``image_size
-    [1, 2]`` (height, width) if given: it must be, for an image that is not square, and with ``in_ndc=False``. The
-    determinant of R is -1 for the cameras of a left-handed world (see above).
+    ``R [B, 3, 3]``, ``T [B, 3]``, ``focal_length [B, 2]``, ``principal_point [B, 2]``,
+    ``in_ndc``, and ``image_size [1, 2]`` (height, width) if given: it must be, for an image that
+    is not square, and with ``in_ndc=False``. The determinant of R is -1 for the cameras of a
+    left-handed world (see above).
 
     Raises
     ------
     TypeError, ValueError
-        For anything but a camera of nmr, a camera with distortion or skew, or a missing or impossible image_size.
+        For anything but a camera of nmr, a camera with distortion or skew, or a missing or
+        impossible image_size.
 
     Examples
     --------

@@ -29,10 +29,12 @@ _NARROWEST_DEG = 1e-9  # float32 can still represent 1 / tan of this angle
 
 
 def points_from_angles(distance: Scalars, elevation_deg: Scalars, azimuth_deg: Scalars) -> Tensor:
-    """Points on a sphere around the origin: ``(d cos e sin a, d sin e, -d cos e cos a)``, ``[3]`` or ``[B, 3]``.
+    """Points on a sphere around the origin: ``(d cos e sin a, d sin e, -d cos e cos a)``, ``[3]``
+    or ``[B, 3]``.
 
-    Single numbers and sequences or tensors of one length broadcast; different lengths raise a ValueError, values that
-    are not numbers a TypeError. At azimuth 0 and elevation 0 the point is ``(0, 0, -d)``.
+    Single numbers and sequences or tensors of one length broadcast; different lengths raise a
+    ValueError, values that are not numbers a TypeError. At azimuth 0 and elevation 0 the point is
+    ``(0, 0, -d)``.
 
     Examples
     --------
@@ -72,7 +74,9 @@ def _scalar(value: Scalars, name: str, low: float, high: float, wanted: str) -> 
 
 
 class _Placed(SquarePixels):
-    """Base class of cameras given by an eye, a target or direction, an up vector and a field of view or scale."""
+    """Base class of cameras given by an eye, a target or direction, an up vector and a field of
+    view or scale.
+    """
 
     eye: Tensor
     up: Tensor
@@ -106,7 +110,8 @@ class _Placed(SquarePixels):
         self._warn_if_it_sees_nothing(*names)
 
     def _warn_if_it_sees_nothing(self, *names: str) -> None:
-        """Warns of a pose that is not finite, and of cameras that look along their up vector or at their own place.
+        """Warns of a pose that is not finite, and of cameras that look along their up vector or
+        at their own place.
 
         Not when compiled, traced or on a GPU.
         """
@@ -152,27 +157,31 @@ _FOV = _NARROWEST_DEG, 90.0, "between 0 and 90 degrees"
 class LookAt(_Placed):
     """A perspective camera at ``eye`` that looks at ``at``.
 
-    A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
-    ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5). An eye straight above or below ``at``
-    gives x = y = 0, as published: an empty image, and a UserWarning that asks for another ``up``. The world
-    is left-handed (x right, y up, z away), as in the published renderer, and mesh files appear mirrored.
+    A vertex v maps to ``u = R (v - eye)`` with rows of R
+    ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
+    ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5). An eye straight
+    above or below ``at`` gives x = y = 0, as published: an empty image, and a UserWarning that
+    asks for another ``up``. The world is left-handed (x right, y up, z away), as in the published
+    renderer, and mesh files appear mirrored.
 
     Parameters
     ----------
     eye, at, up : [3] or [B, 3], tensors or sequences, world units
         A camera whose pose is not finite, or farther away than 1e15, sees nothing.
     half_fov_deg : float, or Tensor [] or [B]
-        a: half of the field of view across the shorter side of the image, in degrees (the published ``viewing_angle``).
+        a: half of the field of view across the shorter side of the image, in degrees (the
+        published ``viewing_angle``).
     right_handed : bool
-        The world is right-handed, as that of mesh files: ``x = n(z x up)``. Nothing is mirrored then, and the outside
-        of counter-clockwise faces is their front.
+        The world is right-handed, as that of mesh files: ``x = n(z x up)``. Nothing is mirrored
+        then, and the outside of counter-clockwise faces is their front.
 
     Differentiable in every parameter that is given as a tensor.
 
     Raises
     ------
     TypeError, ValueError
-        For values that are not numbers, wrong shapes, different batch sizes, or half_fov_deg outside (0, 90).
+        For values that are not numbers, wrong shapes, different batch sizes, or half_fov_deg
+        outside (0, 90).
 
     Examples
     --------
@@ -201,7 +210,9 @@ class LookAt(_Placed):
         half_fov_deg: Scalars = 30.0,
         right_handed: bool = False,
     ) -> LookAt:
-        """The camera that looks at the origin from :func:`points_from_angles`; straight down needs another ``up``."""
+        """The camera that looks at the origin from :func:`points_from_angles`; straight down
+        needs another ``up``.
+        """
         eye = points_from_angles(distance, elevation_deg, azimuth_deg)
         return cls(eye=eye, up=up, half_fov_deg=half_fov_deg, right_handed=right_handed)
 
@@ -240,14 +251,16 @@ class Look(_Placed):
 class Orthographic(_Placed):
     """A camera without perspective, posed as :class:`LookAt`: ``(scale u_x, scale u_y, u_z)``.
 
-    ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the extent of the view across the shorter
-    side of the image, in world units. The published renderer's ``perspective=False`` has scale 1. Differentiable in
-    every parameter given as a tensor. ``right_handed`` as in :class:`LookAt`.
+    ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the extent of the view
+    across the shorter side of the image, in world units. The published renderer's
+    ``perspective=False`` has scale 1. Differentiable in every parameter given as a tensor.
+    ``right_handed`` as in :class:`LookAt`.
 
     Raises
     ------
     TypeError, ValueError
-        For values that are not numbers, wrong shapes, different batch sizes, or a scale not positive and finite.
+        For values that are not numbers, wrong shapes, different batch sizes, or a scale not
+        positive and finite.
 
     Examples
     --------

@@ -22,11 +22,12 @@ Numbers = float | Sequence | np.ndarray | Tensor
 class Camera(Protocol):
     """The interface of cameras: any object that takes vertices to renderer space, differentiably.
 
-    For batches ``[B, V, 3]``, a camera of your own needs only ``transform(vertices)``. For lists of meshes of different
-    sizes, ``transform`` must also take ``starts``. It may have the attributes ``perspective``, whether x and y were
-    divided by the depth (default: True; False: depth, colours and weights are linear on the screen), and, for normals
-    and light, ``right_handed``, whether the world is right-handed (default: False). Highlights need ``eye``, ``[3]`` or
-    ``[B, 3]``.
+    For batches ``[B, V, 3]``, a camera of your own needs only ``transform(vertices)``. For lists
+    of meshes of different sizes, ``transform`` must also take ``starts``. It may have the
+    attributes ``perspective``, whether x and y were divided by the depth (default: True; False:
+    depth, colours and weights are linear on the screen), and, for normals and light,
+    ``right_handed``, whether the world is right-handed (default: False). Highlights need ``eye``,
+    ``[3]`` or ``[B, 3]``.
 
     Examples
     --------
@@ -40,9 +41,11 @@ class Camera(Protocol):
     """
 
     def transform(self, vertices: Tensor, starts: Tensor | None = None) -> Tensor:
-        """World to renderer coordinates: ``[B, V, 3]`` to the same; a B of 1 grows to the camera's batch.
+        """World to renderer coordinates: ``[B, V, 3]`` to the same; a B of 1 grows to the
+        camera's batch.
 
-        Packed vertices ``[N, 3]`` come with ``starts [B + 1, 2]``, with the first vertex of each mesh in column 0.
+        Packed vertices ``[N, 3]`` come with ``starts [B + 1, 2]``, with the first vertex of each
+        mesh in column 0.
         """
         ...
 
@@ -53,18 +56,23 @@ class ProjectingCamera:
     perspective = True
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        """The camera in its general form, computed in ``dtype`` in host memory; differentiable in its parameters."""
+        """The camera in its general form, computed in ``dtype`` in host memory; differentiable in
+        its parameters.
+        """
         raise NotImplementedError
 
     def _rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None, bool]:
-        """For :func:`nmr.ops.project`, in host memory: camera ``[B, 22]``, distortion, and whether in perspective."""
+        """For :func:`nmr.ops.project`, in host memory: camera ``[B, 22]``, distortion, and
+        whether in perspective.
+        """
         return self.projection(dtype)._rows(dtype)
 
     def for_image(self, height: int, width: int) -> ProjectingCamera:
         """The camera for an image of height x width pixels.
 
-        Cameras with a field of view (LookAt, Look, Orthographic) have square pixels: the field of view belongs to the
-        shorter side of the image, and more is seen along the longer one. Others stretch theirs over the whole image.
+        Cameras with a field of view (LookAt, Look, Orthographic) have square pixels: the field of
+        view belongs to the shorter side of the image, and more is seen along the longer one.
+        Others stretch theirs over the whole image.
         """
         return self
 
@@ -80,15 +88,16 @@ class ProjectingCamera:
         Returns
         -------
         Tensor [B, V, 3], or [N, 3] if packed
-            ``x, y`` are in [-1, 1] across the image (x right, y up), z is the depth. One mesh and B poses give B
-            meshes. A vertex that has no finite image (not finite itself, or in the plane of the eye, or seen by a
-            camera that is not finite) gets x = y = inf, so that its faces are not drawn, and no gradient.
+            ``x, y`` are in [-1, 1] across the image (x right, y up), z is the depth. One mesh and
+            B poses give B meshes. A vertex that has no finite image (not finite itself, or in the
+            plane of the eye, or seen by a camera that is not finite) gets x = y = inf, so that
+            its faces are not drawn, and no gradient.
 
         Notes
         -----
-        Differentiable in the vertices and in the camera's parameters; there are no second derivatives. Results do not
-        depend on the number of threads or on the batch. Gradients are NaN only where the upstream gradient is not
-        finite.
+        Differentiable in the vertices and in the camera's parameters; there are no second
+        derivatives. Results do not depend on the number of threads or on the batch. Gradients are
+        NaN only where the upstream gradient is not finite.
 
         Raises
         ------
@@ -112,24 +121,27 @@ class ProjectingCamera:
 class Projection(ProjectingCamera):
     """The general camera; every other camera is computed as one of these.
 
-    ``u = A (v - origin) + t``; ``p = (u_x, u_y) / u_z``, distorted; ``(x, y) = intrinsics (p / extent, 1)``; the depth
-    is ``u_z``. The camera axes are OpenCV's: x right, y down, z away from the viewer. A batch of 1 serves every image;
-    the parameters may mix 1 and B.
+    ``u = A (v - origin) + t``; ``p = (u_x, u_y) / u_z``, distorted;
+    ``(x, y) = intrinsics (p / extent, 1)``; the depth is ``u_z``. The camera axes are OpenCV's: x
+    right, y down, z away from the viewer. A batch of 1 serves every image; the parameters may mix
+    1 and B.
 
     Parameters
     ----------
     matrix : Tensor [B, 3, 4]
         ``[A | t]``, world to camera axes.
     intrinsics : Tensor [B, 2, 3]
-        Maps p / extent to renderer space. Its second row usually changes the sign of y: in renderer space y is up.
+        Maps p / extent to renderer space. Its second row usually changes the sign of y: in
+        renderer space y is up.
     distortion : Tensor [B, 4], [B, 5] or [B, 8], optional
-        OpenCV's k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of a fisheye. Not used without
-        perspective. See :class:`nmr.Pinhole` about points beyond the reach of the formula.
+        OpenCV's k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of a
+        fisheye. Not used without perspective. See :class:`nmr.Pinhole` about points beyond the
+        reach of the formula.
     perspective : bool
         False: ``p = (u_x, u_y)``.
     origin : Tensor [B, 3], optional
-        Position of the camera; 0 by default. It could be part of t, and ``extent`` part of the intrinsics. They are
-        separate so that look-at cameras round as the published ones do.
+        Position of the camera; 0 by default. It could be part of t, and ``extent`` part of the
+        intrinsics. They are separate so that look-at cameras round as the published ones do.
     extent : Tensor [B], optional
         Half the width of the image at depth 1; 1 by default.
 
@@ -235,8 +247,9 @@ class Projection(ProjectingCamera):
     def viewer(self) -> Tensor:
         """Where an image is seen from: float64 ``[B, 5]`` in host memory, without gradient.
 
-        Three numbers and 1: the place of the eye; or three numbers and 0: the direction towards the viewer. Then -1 if
-        the camera sees a right-handed world, else 1. In single operations, which round alike on every processor.
+        Three numbers and 1: the place of the eye; or three numbers and 0: the direction towards
+        the viewer. Then -1 if the camera sees a right-handed world, else 1. In single operations,
+        which round alike on every processor.
         """
         matrix, intrinsics, _, origin, _ = (
             None if x is None else x.detach().to("cpu", torch.float64) for x in self.parameters()
@@ -267,7 +280,9 @@ class SquarePixels(ProjectingCamera):
 
 @dataclass(frozen=True, eq=False)
 class _Shaped(ProjectingCamera):
-    """A camera with square pixels in an image that is not square: x and y count from -1 to 1 across its sides."""
+    """A camera with square pixels in an image that is not square: x and y count from -1 to 1
+    across its sides.
+    """
 
     camera: ProjectingCamera
     height: int
@@ -302,7 +317,9 @@ def _sum_of_three(terms: Tensor) -> Tensor:
 
 
 def has_perspective(camera: Camera | None) -> bool:
-    """Whether x and y are divided by the depth (as without a camera), so that 1 / depth is linear on the screen."""
+    """Whether x and y are divided by the depth (as without a camera), so that 1 / depth is linear
+    on the screen.
+    """
     return bool(getattr(camera, "perspective", True))
 
 
@@ -324,7 +341,9 @@ def _check_batch(vertices: object, starts: object) -> tuple[Tensor, int]:
 
 
 def common_batch(**parameters: Tensor | None) -> int:
-    """The batch size that all parameters ``[B or 1, ...]`` share; a ValueError names those that differ."""
+    """The batch size that all parameters ``[B or 1, ...]`` share; a ValueError names those that
+    differ.
+    """
     sizes = {x.shape[0] for x in parameters.values() if x is not None} - {1}
     if len(sizes) > 1:
         shapes = ", ".join(
@@ -337,7 +356,9 @@ def common_batch(**parameters: Tensor | None) -> int:
 
 
 def warn_if_not_finite(camera: ProjectingCamera, *names: str) -> None:
-    """Warns of cameras with an infinite or missing number, whose image is empty; not if compiled or on a GPU."""
+    """Warns of cameras with an infinite or missing number, whose image is empty; not if compiled
+    or on a GPU.
+    """
     for name in names:
         value = getattr(camera, name)
         if isinstance(value, Tensor) and not holds_for_all(value.detach().isfinite()):
@@ -348,7 +369,9 @@ def warn_if_not_finite(camera: ProjectingCamera, *names: str) -> None:
 
 
 def as_parameter(value: Numbers, name: str, *shape: int) -> Tensor:
-    """``value`` as a float tensor ``[*shape]`` or ``[B, *shape]``; numbers that are not tensors become float64."""
+    """``value`` as a float tensor ``[*shape]`` or ``[B, *shape]``; numbers that are not tensors
+    become float64.
+    """
     one, many = (", ".join([*first, *map(str, shape)]) for first in ([], ["B"]))
     tensor = as_numbers(value, name, f"numbers of shape [{one}] or [{many}]")
     if (

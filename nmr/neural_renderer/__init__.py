@@ -1,9 +1,11 @@
-"""The interface of neural_renderer_pytorch 1.1.3, on the CPU: ``import nmr.neural_renderer as nr``.
+"""The interface of neural_renderer_pytorch 1.1.3, on the CPU:
+``import nmr.neural_renderer as nr``.
 
-Names, arguments, their order and defaults are the published ones. So are images and gradients, except for defects that
-are corrected here (``docs/migrating/neural_renderer.md`` lists them). The operators of :mod:`nmr` do the work. Images
-are ``[B, 3, h, w]`` and ``[B, h, w]`` with row 0 at the top; vertices ``[B, V, 3]``, faces ``[B, F, 3]``, textures
-``[B, F, ts, ts, ts, 3]``. :func:`install_as` lets other people's ``import neural_renderer`` find this package.
+Names, arguments, their order and defaults are the published ones. So are images and gradients,
+except for defects that are corrected here (``docs/migrating/neural_renderer.md`` lists them). The
+operators of :mod:`nmr` do the work. Images are ``[B, 3, h, w]`` and ``[B, h, w]`` with row 0 at
+the top; vertices ``[B, V, 3]``, faces ``[B, F, 3]``, textures ``[B, F, ts, ts, ts, 3]``.
+:func:`install_as` lets other people's ``import neural_renderer`` find this package.
 """
 
 import sys
@@ -55,7 +57,9 @@ name = "neural_renderer_pytorch"
 
 
 class _Package(ModuleType):
-    """Functions here have the names of their modules, and stay functions if a module is imported under another name."""
+    """Functions here have the names of their modules, and stay functions if a module is imported
+    under another name.
+    """
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (isinstance(value, ModuleType) and callable(self.__dict__.get(name))):

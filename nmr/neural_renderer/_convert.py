@@ -15,7 +15,9 @@ Numbers = float | Sequence | np.ndarray | Tensor
 
 
 def like(value: object, name: str, reference: Tensor) -> Tensor:
-    """A number, list, tuple, array or tensor with the dtype and device of ``reference``; gradients reach tensors."""
+    """A number, list, tuple, array or tensor with the dtype and device of ``reference``;
+    gradients reach tensors.
+    """
     value = (
         value
         if isinstance(value, Tensor)
@@ -35,7 +37,9 @@ def check_batch(vertices: object) -> Tensor:
 
 
 def height_and_width(image_size: object) -> tuple[int, int]:
-    """Pixels of an image: from a pair, or from one number, which may be a whole float or an array without axes."""
+    """Pixels of an image: from a pair, or from one number, which may be a whole float or an array
+    without axes.
+    """
     if isinstance(image_size, (np.generic, np.ndarray, Tensor)) and image_size.ndim == 0:
         image_size = image_size.item()
     if isinstance(image_size, float) and image_size.is_integer():

@@ -17,7 +17,9 @@ _MOST_PIXELS = 2**26  # 8192 x 8192; reading takes about 30 bytes per pixel
 
 
 def read_image(filename: str) -> np.ndarray:
-    """Colours ``[H, W, 3]`` float32 in [0, 1], row 0 = top: grey becomes RGB, alpha is dropped, 16 bits are kept."""
+    """Colours ``[H, W, 3]`` float32 in [0, 1], row 0 = top: grey becomes RGB, alpha is dropped,
+    16 bits are kept.
+    """
     try:
         from PIL import Image
     except ImportError as error:

@@ -15,10 +15,12 @@ from nmr.neural_renderer._convert import Numbers
 def get_points_from_angles(
     distance: Numbers, elevation: Numbers, azimuth: Numbers, degrees: bool = True
 ) -> tuple[float, float, float] | Tensor:
-    """Points ``(d cos e sin a, d sin e, -d cos e cos a)``: see :func:`nmr.cameras.points_from_angles`.
+    """Points ``(d cos e sin a, d sin e, -d cos e cos a)``: see
+    :func:`nmr.cameras.points_from_angles`.
 
-    Three numbers give a tuple of three floats. If any argument is a tensor, list or array, the result is a tensor
-    ``[B, 3]``, and gradients reach the tensors. ``degrees=False`` takes the angles in radians.
+    Three numbers give a tuple of three floats. If any argument is a tensor, list or array, the
+    result is a tensor ``[B, 3]``, and gradients reach the tensors. ``degrees=False`` takes the
+    angles in radians.
 
     >>> renderer.eye = nr.get_points_from_angles(2.732, 30, 45)
     """

@@ -17,9 +17,11 @@ def face_light(
     color_directional: Numbers,
     direction: Numbers,
 ) -> Tensor:
-    """Light ``[B, F, 3]`` on faces with corners ``[B, F, 3, 3]``: ``ia ca + id cd max(0, n . direction)``.
+    """Light ``[B, F, 3]`` on faces with corners ``[B, F, 3, 3]``:
+    ``ia ca + id cd max(0, n . direction)``.
 
-    ``n = (v0 - v1) x (v2 - v1)``, scaled to length 1; a face without area gets only the ambient light.
+    ``n = (v0 - v1) x (v2 - v1)``, scaled to length 1; a face without area gets only the ambient
+    light.
     """
     ambient, directional, direction = (
         _per_image(value, name, faces)
@@ -79,8 +81,8 @@ def lighting(
     Returns
     -------
     Tensor [B, F, ts, ts, ts, 3]
-        ``textures * (ia ca + id cd max(0, n . direction))`` with the unit normal ``n`` along ``(v0 - v1) x (v2 - v1)``.
-        Differentiable in everything that is a tensor.
+        ``textures * (ia ca + id cd max(0, n . direction))`` with the unit normal ``n`` along
+        ``(v0 - v1) x (v2 - v1)``. Differentiable in everything that is a tensor.
 
     Raises
     ------

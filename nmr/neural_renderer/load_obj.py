@@ -31,16 +31,17 @@ def load_obj(
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Read a mesh; polygons become fans of triangles.
 
-    Unlike the published function, a polygon that its fan would overfill (a concave one) is cut along its own diagonals.
-    As published, faces of fewer than three corners add nothing, and texture coordinates are read only with
-    ``load_texture``. A ``vt`` with one number has v = 0. :func:`nmr.load_obj` keeps texture coordinates and images.
+    Unlike the published function, a polygon that its fan would overfill (a concave one) is cut
+    along its own diagonals. As published, faces of fewer than three corners add nothing, and
+    texture coordinates are read only with ``load_texture``. A ``vt`` with one number has v = 0.
+    :func:`nmr.load_obj` keeps texture coordinates and images.
 
     Parameters
     ----------
     filename_obj : str or path
     normalization : bool
-        Move and scale the mesh so that its box is centred on the origin with longest side 2. It is computed in
-        float64, so that large coordinates (UTM) lose nothing.
+        Move and scale the mesh so that its box is centred on the origin with longest side 2. It
+        is computed in float64, so that large coordinates (UTM) lose nothing.
     texture_size : int
         ts, texels along each axis of a texture cube.
     load_texture : bool
@@ -55,14 +56,15 @@ def load_obj(
     vertices : float32 Tensor [V, 3]
     faces : int32 Tensor [F, 3]
     textures : float32 Tensor [F, ts, ts, ts, 3]
-        Only with ``load_texture``: the image of a material, or else its colour ``Kd``, or else grey. A warning counts
-        the faces without a known material.
+        Only with ``load_texture``: the image of a material, or else its colour ``Kd``, or else
+        grey. A warning counts the faces without a known material.
 
     Raises
     ------
     ValueError
-        For a file without vertices or faces, for a line that cannot be read or that refers to missing elements (the
-        message gives file and line), for another wrapping, and with ``load_texture`` for a file that names no .mtl.
+        For a file without vertices or faces, for a line that cannot be read or that refers to
+        missing elements (the message gives file and line), for another wrapping, and with
+        ``load_texture`` for a file that names no .mtl.
     FileNotFoundError
         For a missing .obj, .mtl or image.
     ImportError
@@ -103,7 +105,8 @@ def load_textures(
     texture_wrapping: str = "REPEAT",
     use_bilinear: bool = True,
 ) -> Tensor:
-    """The textures ``[F, ts, ts, ts, 3]`` of a mesh, with the materials of ``filename_mtl``: see :func:`load_obj`.
+    """The textures ``[F, ts, ts, ts, 3]`` of a mesh, with the materials of ``filename_mtl``: see
+    :func:`load_obj`.
 
     >>> textures = nr.load_obj("chair.obj", load_texture=True)[2]  # with the materials that the file names
     """
@@ -161,15 +164,18 @@ def _textures(
 def bake_textures(
     image: np.ndarray, uv: np.ndarray, texture_size: int, wrapping: str, bilinear: bool
 ) -> np.ndarray:
-    """Texture cubes ``[F, ts, ts, ts, 3]`` of faces with texture coordinates ``uv [F, 3, 2]`` in ``image [H, W, 3]``.
+    """Texture cubes ``[F, ts, ts, ts, 3]`` of faces with texture coordinates ``uv [F, 3, 2]`` in
+    ``image [H, W, 3]``.
 
-    Texel (i, j, k) is the image at ``(i uv0 + j uv1 + k uv2) / (i + j + k)``, texel (0, 0, 0) at (0, 0); (0, 0) is the
-    centre of the pixel at the lower left, (1, 1) of that at the upper right. float32.
+    Texel (i, j, k) is the image at ``(i uv0 + j uv1 + k uv2) / (i + j + k)``, texel (0, 0, 0) at
+    (0, 0); (0, 0) is the centre of the pixel at the lower left, (1, 1) of that at the upper
+    right. float32.
 
-    As in the published renderer the *corners* of a face are wrapped: a face over a seam of the image is drawn
-    backwards across it (split such faces, or use :class:`nmr.UVTexture`, which wraps at each pixel), and
-    "CLAMP_TO_BORDER" is black everywhere. Faces within one copy of the image keep their exact coordinates, 0 and 1
-    included (the published kernel wraps them again in each thread and exchanges 0 and 1 at random).
+    As in the published renderer the *corners* of a face are wrapped: a face over a seam of the
+    image is drawn backwards across it (split such faces, or use :class:`nmr.UVTexture`, which
+    wraps at each pixel), and "CLAMP_TO_BORDER" is black everywhere. Faces within one copy of the
+    image keep their exact coordinates, 0 and 1 included (the published kernel wraps them again in
+    each thread and exchanges 0 and 1 at random).
     """
     ts = texture_size
     if wrapping == "CLAMP_TO_BORDER":
@@ -198,7 +204,8 @@ def _wrap(uv: np.ndarray, wrapping: str) -> np.ndarray:
         return uv.clip(0, 1)
     if wrapping == "MIRRORED_REPEAT":
         return 1 - np.abs(np.mod(uv, 2) - 1)
-    # If one copy of the image holds the whole face, use that copy; else wrap each corner by itself.
+    # If one copy of the image holds the whole face, use that copy; else wrap each corner by
+    # itself.
     low, high = uv.min(1, keepdims=True), uv.max(1, keepdims=True)
     copy = np.minimum(np.floor(low), np.maximum(np.ceil(high) - 1, 0))
     return np.where(high <= copy + 1, uv - copy, np.mod(uv, 1))

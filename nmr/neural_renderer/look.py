@@ -21,10 +21,12 @@ def orthographic_look(eye: Numbers, direction: Numbers, up: Numbers) -> Orthogra
 def look(
     vertices: Tensor, eye: Numbers, direction: Numbers = (0, 1, 0), up: Numbers | None = None
 ) -> Tensor:
-    """Vertices in the axes of a camera at ``eye`` that looks along ``direction``: x right, y up, z forward.
+    """Vertices in the axes of a camera at ``eye`` that looks along ``direction``: x right, y up,
+    z forward.
 
-    As :func:`look_at`, with ``z = n(direction)``. ``up`` is (0, 1, 0) unless given. The default direction is the
-    published one; it equals ``up`` and gives x = y = 0, so pass another direction.
+    As :func:`look_at`, with ``z = n(direction)``. ``up`` is (0, 1, 0) unless given. The default
+    direction is the published one; it equals ``up`` and gives x = y = 0, so pass another
+    direction.
 
     >>> nr.perspective(nr.look(vertices, [0, 0, -3], [0, 0, 1]))
     """

@@ -13,10 +13,11 @@ def look_at(
 ) -> Tensor:
     """Vertices in the axes of a camera at ``eye`` that looks at ``at``: x right, y up, z forward.
 
-    ``out = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)`` and ``n(v) = v / max(|v|,
-    1e-5)``. ``vertices [B, V, 3]``; eye, at and up are ``[3]`` or ``[B, 3]``: lists, tuples, arrays or tensors. One
-    mesh and B cameras give B meshes. Differentiable in everything that is a tensor. An eye above or below ``at`` gives
-    x = y = 0, as published; give another ``up`` then. :class:`nmr.LookAt` is this with :func:`perspective`.
+    ``out = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at - eye)`` and
+    ``n(v) = v / max(|v|, 1e-5)``. ``vertices [B, V, 3]``; eye, at and up are ``[3]`` or
+    ``[B, 3]``: lists, tuples, arrays or tensors. One mesh and B cameras give B meshes.
+    Differentiable in everything that is a tensor. An eye above or below ``at`` gives x = y = 0,
+    as published; give another ``up`` then. :class:`nmr.LookAt` is this with :func:`perspective`.
 
     Raises
     ------

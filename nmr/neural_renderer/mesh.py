@@ -46,6 +46,8 @@ class Mesh:
         return cls(*loaded, texture_size=texture_size)
 
     def get_batch(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
-        """``batch_size`` copies of vertices, faces and the sigmoid of the textures, as in the Chainer class."""
+        """``batch_size`` copies of vertices, faces and the sigmoid of the textures, as in the
+        Chainer class.
+        """
         tensors = (self.vertices, self.faces, torch.sigmoid(self.textures))
         return tuple(x.expand(batch_size, *x.shape) for x in tensors)

@@ -11,8 +11,9 @@ from nmr.neural_renderer._convert import check_batch
 def perspective(vertices: Tensor, angle: float | Tensor = 30.0) -> Tensor:
     """``(x / (z tan a), y / (z tan a), z)`` of vertices ``[B, V, 3]`` in camera axes.
 
-    ``angle`` is *half* the field of view in degrees, between 0 and 90: a number, or a tensor ``[]`` or ``[B]``.
-    Differentiable in both. A vertex in the plane of the eye gets x = y = inf, so that its faces are not drawn.
+    ``angle`` is *half* the field of view in degrees, between 0 and 90: a number, or a tensor
+    ``[]`` or ``[B]``. Differentiable in both. A vertex in the plane of the eye gets x = y = inf,
+    so that its faces are not drawn.
 
     Raises
     ------

@@ -47,8 +47,8 @@ class _Cubes:
             raise ValueError(
                 f"light has three colours: textures must have 1 or 3 channels, got {colors.shape[-1]}"
             )
-        # Faces seen from behind have numbers and lights of their own. For this operator they are further faces; the
-        # three corners of a face have the same value.
+        # Faces seen from behind have numbers and lights of their own. For this operator they are
+        # further faces; the three corners of a face have the same value.
         corners = torch.arange(self.light.shape[1], device=face_index.device)[:, None].expand(-1, 3)
         return colors * ops.interpolate(self.light, corners, face_index, weights, None)
 
@@ -68,7 +68,9 @@ def draw(
     fill_back: bool = False,
     light: Tensor | None = None,
 ) -> dict[str, Tensor | None]:
-    """Draws ``outputs`` out of "rgb", "alpha", "depth" of meshes in renderer space; the others are None."""
+    """Draws ``outputs`` out of "rgb", "alpha", "depth" of meshes in renderer space; the others
+    are None.
+    """
     images = render(
         vertices,
         faces,
@@ -124,8 +126,8 @@ def rasterize_rgbad(
     Parameters
     ----------
     faces : Tensor [B, F, 3, 3], float32 or float64
-        Corners (see :func:`vertices_to_faces`): x right, y up, both in [-1, 1] across the image; z = depth. Only faces
-        that are counter-clockwise on the screen are drawn.
+        Corners (see :func:`vertices_to_faces`): x right, y up, both in [-1, 1] across the image;
+        z = depth. Only faces that are counter-clockwise on the screen are drawn.
     textures : Tensor [B, F, ts, ts, ts, 3]
         Axis k of a cube belongs to corner k; [1, F, ...] serves all images. Needed for RGB.
     image_size : int or (height, width)
@@ -135,7 +137,8 @@ def rasterize_rgbad(
     near, far : float
         A pixel is covered only if near < depth < far; depth is ``far`` elsewhere.
     eps : float
-        Added to distances in the gradient; texture coordinates are clamped to at most ts - 1 - eps.
+        Added to distances in the gradient; texture coordinates are clamped to at most
+        ts - 1 - eps.
     background_color : [3] or [B, 3]
         List, tuple, array or tensor.
     return_rgb, return_alpha, return_depth : bool
@@ -143,12 +146,14 @@ def rasterize_rgbad(
     Returns
     -------
     dict
-        "rgb" ``[B, 3, h, w]``, "alpha" ``[B, h, w]``, "depth" ``[B, h, w]``, row 0 = top, or None if not requested.
+        "rgb" ``[B, 3, h, w]``, "alpha" ``[B, h, w]``, "depth" ``[B, h, w]``, row 0 = top, or None
+        if not requested.
 
     Notes
     -----
-    rgb and alpha have NMR's gradient in x and y of the corners, summed over the returned channels. depth has its true
-    derivative in x, y and z at fixed coverage. Textures (and a background that is a tensor) have true derivatives.
+    rgb and alpha have NMR's gradient in x and y of the corners, summed over the returned
+    channels. depth has its true derivative in x, y and z at fixed coverage. Textures (and a
+    background that is a tensor) have true derivatives.
 
     Raises
     ------
@@ -207,10 +212,11 @@ def rasterize_depth(
 
 
 class Rasterize(torch.nn.Module):
-    """:func:`rasterize_rgbad` as a module, one level lower: no averaging, channels last, row 0 = bottom.
+    """:func:`rasterize_rgbad` as a module, one level lower: no averaging, channels last, row
+    0 = bottom.
 
-    ``forward(faces, textures)`` returns ``(rgb [B, h, w, 3], alpha [B, h, w], depth [B, h, w])``; an image that is not
-    wanted is an empty tensor.
+    ``forward(faces, textures)`` returns ``(rgb [B, h, w, 3], alpha [B, h, w], depth [B, h, w])``;
+    an image that is not wanted is an empty tensor.
     """
 
     def __init__(

@@ -25,21 +25,24 @@ class Renderer(torch.nn.Module):
     Parameters
     ----------
     image_size : int or (height, width)
-        Pixels, h and w; one number means a square. "look_at" and "look" have square pixels: their field of view belongs
-        to the shorter side. "projection" stretches an image of ``orig_size`` over the whole one.
+        Pixels, h and w; one number means a square. "look_at" and "look" have square pixels: their
+        field of view belongs to the shorter side. "projection" stretches an image of
+        ``orig_size`` over the whole one.
     anti_aliasing : bool
         Average 2x2 pixels of a raster of 2h x 2w.
     background_color : [3] or [B, 3]
-        Background of RGB images. Colours and vectors, here and below, are lists, tuples, arrays or tensors; gradients
-        reach tensors.
+        Background of RGB images. Colours and vectors, here and below, are lists, tuples, arrays
+        or tensors; gradients reach tensors.
     fill_back : bool
         Also draw faces that are seen from behind.
     camera_mode : {"projection", "look_at", "look", "none"}
-        The function of that name takes vertices to renderer space. "none" (also "None", None): vertices are already
-        in renderer space. "projection" without K, R and t means "look_at", as in the Chainer version.
+        The function of that name takes vertices to renderer space. "none" (also "None", None):
+        vertices are already in renderer space. "projection" without K, R and t means "look_at",
+        as in the Chainer version.
     K, R, t, dist_coeffs, orig_size
-        Camera of "projection": see :func:`projection`. The methods take others for one call. As published, arrays
-        become float32 tensors, and dist_coeffs are zeros ``[1, 5]`` if not given.
+        Camera of "projection": see :func:`projection`. The methods take others for one call. As
+        published, arrays become float32 tensors, and dist_coeffs are zeros ``[1, 5]`` if not
+        given.
     perspective : bool
         With "look_at" and "look": divide by the depth.
     viewing_angle : float
@@ -47,19 +50,23 @@ class Renderer(torch.nn.Module):
     camera_direction : [3] or [B, 3]
         With "look".
     near, far : float
-        A pixel of an RGB image is covered only if near < depth < far. As published, :meth:`render_silhouettes` and
-        :meth:`render_depth` always take 0.1, 100 and eps 1e-4; :meth:`render` and :meth:`render_rgb` take near, far and
-        ``rasterizer_eps`` of the renderer.
-    light_intensity_ambient, light_intensity_directional, light_color_ambient, light_color_directional, light_direction
+        A pixel of an RGB image is covered only if near < depth < far. As published,
+        :meth:`render_silhouettes` and :meth:`render_depth` always take 0.1, 100 and eps 1e-4;
+        :meth:`render` and :meth:`render_rgb` take near, far and ``rasterizer_eps`` of the
+        renderer.
+    light_intensity_ambient, light_intensity_directional
+        See :func:`lighting`.
+    light_color_ambient, light_color_directional, light_direction
         See :func:`lighting`.
 
     Attributes
     ----------
     eye : [3] or [B, 3]
-        Position of the camera of "look_at" and "look"; (0, 0, -(1 / tan(viewing_angle) + 1)) by default.
+        Position of the camera of "look_at" and "look"; (0, 0, -(1 / tan(viewing_angle) + 1)) by
+        default.
     camera_up : [3] or [B, 3]
-        Up in the image of "look_at" and "look"; (0, 1, 0) by default, as published. (The published class has no such
-        attribute; some of its forks do.)
+        Up in the image of "look_at" and "look"; (0, 1, 0) by default, as published. (The
+        published class has no such attribute; some of its forks do.)
     rasterizer_eps : float
         1e-3 by default.
 
@@ -130,7 +137,8 @@ class Renderer(torch.nn.Module):
         self.rasterizer_eps = 1e-3
 
     def __setattr__(self, name: str, value: object) -> None:
-        # An attribute that was a Parameter may be set to a list; torch itself would require a Parameter.
+        # An attribute that was a Parameter may be set to a list; torch itself would require a
+        # Parameter.
         self.__dict__.get("_parameters", {}).pop(name, None)
         super().__setattr__(name, value)
 
@@ -146,7 +154,9 @@ class Renderer(torch.nn.Module):
         dist_coeffs=None,
         orig_size=None,
     ):
-        """:meth:`render` for ``mode=None``, else the method that ``mode`` names: "rgb", "silhouettes" or "depth"."""
+        """:meth:`render` for ``mode=None``, else the method that ``mode`` names: "rgb",
+        "silhouettes" or "depth".
+        """
         camera = (K, R, t, dist_coeffs, orig_size)
         if mode is None:
             return self.render(vertices, faces, textures, *camera)
@@ -163,8 +173,9 @@ class Renderer(torch.nn.Module):
     ) -> Tensor:
         """Coverage ``[B, h, w]``, row 0 = top.
 
-        ``vertices [B, V, 3]`` float32 or float64; ``faces [B, F, 3]`` (``[1, F, 3]`` or ``[F, 3]`` for all meshes). One
-        mesh and a camera with B poses give B images. Raises TypeError or ValueError for wrong types, shapes and ranges.
+        ``vertices [B, V, 3]`` float32 or float64; ``faces [B, F, 3]`` (``[1, F, 3]`` or
+        ``[F, 3]`` for all meshes). One mesh and a camera with B poses give B images. Raises
+        TypeError or ValueError for wrong types, shapes and ranges.
         """
         return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("alpha",))[
             "alpha"
@@ -173,7 +184,9 @@ class Renderer(torch.nn.Module):
     def render_depth(
         self, vertices, faces, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
     ) -> Tensor:
-        """Depth ``[B, h, w]``, row 0 = top, 100 on background; arguments as :meth:`render_silhouettes`."""
+        """Depth ``[B, h, w]``, row 0 = top, 100 on background; arguments as
+        :meth:`render_silhouettes`.
+        """
         return self._draw(vertices, faces, None, (K, R, t, dist_coeffs, orig_size), ("depth",))[
             "depth"
         ]
@@ -181,7 +194,9 @@ class Renderer(torch.nn.Module):
     def render_rgb(
         self, vertices, faces, textures, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
     ) -> Tensor:
-        """Lit colours ``[B, 3, h, w]``, row 0 = top; ``textures [B or 1, F, ts, ts, ts, 3]`` in [0, 1]."""
+        """Lit colours ``[B, 3, h, w]``, row 0 = top; ``textures [B or 1, F, ts, ts, ts, 3]`` in
+        [0, 1].
+        """
         return self._draw(vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb",))[
             "rgb"
         ]
@@ -189,7 +204,9 @@ class Renderer(torch.nn.Module):
     def render(
         self, vertices, faces, textures, K=None, R=None, t=None, dist_coeffs=None, orig_size=None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """``(rgb [B, 3, h, w], depth [B, h, w], alpha [B, h, w])``, in one pass; arguments as :meth:`render_rgb`."""
+        """``(rgb [B, 3, h, w], depth [B, h, w], alpha [B, h, w])``, in one pass; arguments as
+        :meth:`render_rgb`.
+        """
         images = self._draw(
             vertices, faces, textures, (K, R, t, dist_coeffs, orig_size), ("rgb", "alpha", "depth")
         )
@@ -214,7 +231,9 @@ class Renderer(torch.nn.Module):
         )
 
     def _light(self, vertices: Tensor, faces: Tensor) -> Tensor:
-        """``[B, F, 3]``, or with fill_back ``[B, 2F, 3]``: of the faces seen from the front, then from behind."""
+        """``[B, F, 3]``, or with fill_back ``[B, 2F, 3]``: of the faces seen from the front, then
+        from behind.
+        """
         corners = vertices_to_faces(vertices, faces)
         if self.fill_back:
             corners = torch.cat([corners, corners.flip(2)], dim=1)

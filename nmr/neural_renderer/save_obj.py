@@ -17,7 +17,8 @@ _EPS = 1e-5  # keeps texture coordinates below the last texel
 def create_texture_image(
     textures: Tensor, texture_size_out: int = 16
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One image that holds the texture cubes of all faces, and the texture coordinates that find them there.
+    """One image that holds the texture cubes of all faces, and the texture coordinates that find
+    them there.
 
     Parameters
     ----------
@@ -28,9 +29,11 @@ def create_texture_image(
     Returns
     -------
     image : float32 array [H, W, 3]
-        Row 0 = top; the tiles of faces 0, 1, ... run from left to right, rows of tiles from the bottom to the top.
+        Row 0 = top; the tiles of faces 0, 1, ... run from left to right, rows of tiles from the
+        bottom to the top.
     uv : float32 array [F, 3, 2]
-        Texture coordinates of each face's corners; (0, 0) is the pixel at the lower left, (1, 1) at the upper right.
+        Texture coordinates of each face's corners; (0, 0) is the pixel at the lower left, (1, 1)
+        at the upper right.
     """
     textures = _one_mesh(textures)
     if texture_size_out < 2:
@@ -41,13 +44,15 @@ def create_texture_image(
     columns = int((num_faces - 1) ** 0.5) + 1
     rows = (num_faces - 1) // columns + 1
 
-    # Corners of a tile are at its pixels (0, 0), (0, T - 1), (T - 1, T - 1). x and y run from 0 to 1 over the tile.
+    # Corners of a tile are at its pixels (0, 0), (0, T - 1), (T - 1, T - 1). x and y run from 0
+    # to 1 over the tile.
     y, x = np.mgrid[:size, :size] / (size - 1)
     weights = np.stack([1 - y, y - x, x], axis=-1) / (1 + _EPS)
     texels = _blend(textures.detach().cpu().float().numpy(), weights.reshape(-1, 3))
     tiles = np.zeros((rows * columns, size, size, 3), dtype=np.float32)
     tiles[:num_faces] = texels.reshape(num_faces, size, size, 3)
-    # The pixels next to the diagonal repeat it, so that interpolation at this edge mixes in no other colour.
+    # The pixels next to the diagonal repeat it, so that interpolation at this edge mixes in no
+    # other colour.
     rim = np.arange(size - 1)
     tiles[:, rim, rim + 1] = tiles[:, rim, rim]
     image = (
@@ -67,7 +72,9 @@ def create_texture_image(
 
 
 def _blend(textures: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Trilinear samples ``[F, N, C]`` of cubes ``[F, ts, ts, ts, C]`` at barycentric ``weights [N, 3]``."""
+    """Trilinear samples ``[F, N, C]`` of cubes ``[F, ts, ts, ts, C]`` at barycentric
+    ``weights [N, 3]``.
+    """
     ts = textures.shape[1]
     position = np.clip(weights * (ts - 1), 0, ts - 1 - _EPS)
     low = np.floor(position).astype(np.int64)
@@ -92,7 +99,8 @@ def _one_mesh(textures: Tensor) -> Tensor:
 def save_obj(
     filename: str | os.PathLike, vertices: Tensor, faces: Tensor, textures: Tensor | None = None
 ) -> None:
-    """Writes a mesh; with textures also ``name.mtl`` and the image ``name.png``, in the folder of ``name.obj``.
+    """Writes a mesh; with textures also ``name.mtl`` and the image ``name.png``, in the folder of
+    ``name.obj``.
 
     Parameters
     ----------

@@ -11,8 +11,9 @@ from nmr.neural_renderer._convert import check_batch, integer_faces
 def vertices_to_faces(vertices: Tensor, faces: Tensor) -> Tensor:
     """Corners ``[B, F, 3, 3]``: ``corners[b, f, k] = vertices[b, faces[b, f, k]]``.
 
-    ``vertices [B, V, 3]``; ``faces [B, F, 3]`` (or ``[1, F, 3]``, ``[F, 3]`` for all meshes), whole numbers of any
-    type. Differentiable in ``vertices``. :class:`Renderer` uses it for light only: the kernels read vertices and faces.
+    ``vertices [B, V, 3]``; ``faces [B, F, 3]`` (or ``[1, F, 3]``, ``[F, 3]`` for all meshes),
+    whole numbers of any type. Differentiable in ``vertices``. :class:`Renderer` uses it for light
+    only: the kernels read vertices and faces.
 
     Raises
     ------

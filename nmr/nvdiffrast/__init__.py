@@ -1,8 +1,9 @@
 """The interface of nvdiffrast's torch module on the CPU: ``import nmr.nvdiffrast.torch as dr``.
 
-Names, arguments, shapes and conventions are nvdiffrast's: clip-space positions, images with row 0 at the bottom. The
-operators of :mod:`nmr` do the work. :func:`install_as` lets other people's ``import nvdiffrast.torch as dr`` find this
-package. ``docs/migrating/nvdiffrast.md`` lists the differences.
+Names, arguments, shapes and conventions are nvdiffrast's: clip-space positions, images with row 0
+at the bottom. The operators of :mod:`nmr` do the work. :func:`install_as` lets other people's
+``import nvdiffrast.torch as dr`` find this package. ``docs/migrating/nvdiffrast.md`` lists the
+differences.
 """
 
 from nmr.nvdiffrast import torch

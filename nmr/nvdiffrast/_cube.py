@@ -1,4 +1,6 @@
-"""Cube maps: from directions to places on the six faces, and faces with borders from their neighbours."""
+"""Cube maps: from directions to places on the six faces, and faces with borders from their
+neighbours.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,8 @@ def places(directions: Tensor, derivatives: Tensor | None) -> Places:
 
 
 def with_borders(image: Tensor) -> Tensor:
-    """Faces ``[B, 6, n, n, C]`` one below the other, each with a border from its neighbours: ``[B, 6 (n+2), n+2, C]``.
+    """Faces ``[B, 6, n, n, C]`` one below the other, each with a border from its neighbours:
+    ``[B, 6 (n+2), n+2, C]``.
 
     A corner of the border is the mean of the three texels that meet at the cube's corner.
     """
@@ -60,7 +63,9 @@ def with_borders(image: Tensor) -> Tensor:
 
 @lru_cache(maxsize=32)
 def _neighbours(size: int) -> tuple[Tensor, Tensor]:
-    """Texels at the places of faces with borders ``[6 (n+2) (n+2)]``, and those that meet at corners ``[24, 3]``."""
+    """Texels at the places of faces with borders ``[6 (n+2) (n+2)]``, and those that meet at
+    corners ``[24, 3]``.
+    """
     centres = (2 * torch.arange(-1, size + 1, dtype=torch.float64) + 1 - size) / size
     row, column = torch.meshgrid(centres, centres, indexing="ij")
     columns, rows = torch.tensor(_COLUMNS).double(), torch.tensor(_ROWS).double()

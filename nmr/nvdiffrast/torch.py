@@ -1,7 +1,7 @@
 """nvdiffrast's torch module on the CPU. Images are ``[B, H, W, C]`` with row 0 at the bottom.
 
-float32 and float64, any integer dtype and device are accepted. Every run gives the same bits. The conventions are those
-of https://nvlabs.github.io/nvdiffrast/.
+float32 and float64, any integer dtype and device are accepted. Every run gives the same bits. The
+conventions are those of https://nvlabs.github.io/nvdiffrast/.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ def set_log_level(level: int) -> None:
 
 
 class RasterizeCudaContext:
-    """Accepted in place of a context; its arguments have no effect. It knows the depth peeler that is active."""
+    """Accepted in place of a context; its arguments have no effect. It knows the depth peeler
+    that is active.
+    """
 
     def __init__(self, *args: object, **kwargs: object) -> None:
         self.active_depth_peeler = None
@@ -72,14 +74,16 @@ def rasterize(
     ranges: Tensor | None = None,
     grad_db: bool = True,
 ) -> tuple[Tensor, Tensor]:
-    """The nearest face at each pixel centre: rast and rast_db, both ``[B, H, W, 4]``, 0 on background.
+    """The nearest face at each pixel centre: rast and rast_db, both ``[B, H, W, 4]``, 0 on
+    background.
 
-    ``pos [B, V, 4]`` (or ``[V, 4]`` with integer ``ranges [B, 2]``: first face and number of faces of each image) are
-    clip-space positions, ``tri`` integers ``[F, 3]``, ``resolution`` is (height, width). Points with z / w outside
-    [-1, 1] are not drawn. rast is (u, v, z / w, face + 1); u and v are the weights of the face's vertices 0 and
-    1; rast_db is (du/dX, du/dY, dv/dX, dv/dY) per pixel. u, v and (with ``grad_db``) rast_db are differentiable in pos
-    at fixed faces per pixel. Raises TypeError and ValueError for wrong types and shapes, and RuntimeError inside of a
-    :class:`DepthPeeler` of the same context.
+    ``pos [B, V, 4]`` (or ``[V, 4]`` with integer ``ranges [B, 2]``: first face and number of
+    faces of each image) are clip-space positions, ``tri`` integers ``[F, 3]``, ``resolution`` is
+    (height, width). Points with z / w outside [-1, 1] are not drawn. rast is (u, v, z / w,
+    face + 1); u and v are the weights of the face's vertices 0 and 1; rast_db is (du/dX, du/dY,
+    dv/dX, dv/dY) per pixel. u, v and (with ``grad_db``) rast_db are differentiable in pos at
+    fixed faces per pixel. Raises TypeError and ValueError for wrong types and shapes, and
+    RuntimeError inside of a :class:`DepthPeeler` of the same context.
 
     >>> pos = torch.tensor([[[-0.8, -0.8, 0, 1], [0.8, -0.8, 0, 1], [-0.8, 0.8, 0, 1]]])
     >>> rast, _ = dr.rasterize(dr.RasterizeCudaContext(), pos, torch.tensor([[0, 1, 2]]), (8, 8))
@@ -93,7 +97,8 @@ def rasterize(
 
 
 class DepthPeeler:
-    """One surface after the other at each pixel: ``with DepthPeeler(...) as peeler: peeler.rasterize_next_layer()``.
+    """One surface after the other at each pixel: ``with DepthPeeler(...) as peeler:
+    peeler.rasterize_next_layer()``.
 
     The arguments are those of :func:`rasterize`.
     """
@@ -169,7 +174,9 @@ class _Scene(NamedTuple):
         return _Scene(pos.unsqueeze(0), tri, size, ranges)
 
     def face_index(self, layers: int | None) -> Tensor:
-        """Face index maps ``[B, H, W]``, or the nearest ``[B, H, W, layers]``; reversed copies count as the face."""
+        """Face index maps ``[B, H, W]``, or the nearest ``[B, H, W, layers]``; reversed copies
+        count as the face.
+        """
         if self.ranges is None:
             return _face_index(self.pos.detach(), self.tri, self.size, layers)
         images = []
@@ -215,7 +222,9 @@ def _face_index(pos: Tensor, tri: Tensor, size: tuple[int, int], layers: int | N
 
 
 def _in_front(pos: Tensor, tri: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
-    """Cuts the faces that cross the plane of the eye: packed positions and faces, the face each is part of, starts."""
+    """Cuts the faces that cross the plane of the eye: packed positions and faces, the face each
+    is part of, starts.
+    """
     depths = pos[..., [0, 1, 3]].contiguous()
     w = depths[..., 2]
     largest = float(w[w.isfinite()].abs().max()) if bool(w.isfinite().any()) else 0.0
@@ -246,11 +255,13 @@ def interpolate(
     rast_db: Tensor | None = None,
     diff_attrs: str | list[int] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Attributes ``[B, H, W, C]`` at each pixel, and their derivatives on the screen, ``[B, H, W, 2 D]``.
+    """Attributes ``[B, H, W, C]`` at each pixel, and their derivatives on the screen,
+    ``[B, H, W, 2 D]``.
 
-    ``attr [B or 1, N, C]`` or ``[N, C]``, ``tri [F, 3]`` rows of attr at the corners of each face. ``diff_attrs`` are
-    D channels or "all", and need ``rast_db``; the derivatives are (dA/dX, dA/dY) for each of them. 0 on background.
-    Differentiable in attr, u and v of rast, and rast_db.
+    ``attr [B or 1, N, C]`` or ``[N, C]``, ``tri [F, 3]`` rows of attr at the corners of each
+    face. ``diff_attrs`` are D channels or "all", and need ``rast_db``; the derivatives are
+    (dA/dX, dA/dY) for each of them. 0 on background. Differentiable in attr, u and v of rast, and
+    rast_db.
     """
     rast = _pixels(rast, "rast", 4)
     attr = _floats(attr, "attr", "[B, N, C] or [N, C]", (2, 3)).to(rast)
@@ -280,7 +291,9 @@ def interpolate(
 
 
 class _Mip(NamedTuple):
-    """A texture and its mipmaps: levels ``[B, h, w, C]``, those of a cube map ``[B, 6, h, h, C]``."""
+    """A texture and its mipmaps: levels ``[B, h, w, C]``, those of a cube map
+    ``[B, 6, h, h, C]``.
+    """
 
     levels: list[Tensor]
     packed: tuple[Tensor, Tensor] | None  # all texels and grids, as nmr.ops has them
@@ -304,7 +317,8 @@ def texture_construct_mip(
 ) -> _Mip:
     """The mipmaps of a texture for the argument ``mip`` of :func:`texture`.
 
-    If tex requires a gradient, :func:`texture` makes them anew, so that the gradient passes through them.
+    If tex requires a gradient, :func:`texture` makes them anew, so that the gradient passes
+    through them.
     """
     tex = _texture_of(tex, cube_mode)
     sizes = tuple(tex.shape[-3:-1])
@@ -340,13 +354,14 @@ def texture(
 ) -> Tensor:
     """Colours ``[B, H, W, C]`` of a texture image or a cube map at coordinates of each pixel.
 
-    ``tex [B or 1, h, w, C]`` has row 0 at v = 0. Cube maps are ``[B or 1, 6, h, h, C]`` with OpenGL's faces (+x, -x,
-    +y, -y, +z, -z), sampled at directions ``uv [B, H, W, 3]`` and 0 if these are 0 or not finite. ``uv_da`` are the
-    derivatives of uv from :func:`interpolate`: the mipmap level is log2 of the longer half axis of the ellipse of
-    texels that a pixel covers. ``mip_level_bias [B, H, W]`` is added, or without uv_da is the level. ``mip`` is from
-    :func:`texture_construct_mip`, or a list of tensors like tex, each with half the sides of the one before, rounded
-    down, and with a gradient of its own. Differentiable in tex; in uv unless filter_mode is "nearest"; in uv_da and
-    mip_level_bias if it is "linear-mipmap-linear".
+    ``tex [B or 1, h, w, C]`` has row 0 at v = 0. Cube maps are ``[B or 1, 6, h, h, C]`` with
+    OpenGL's faces (+x, -x, +y, -y, +z, -z), sampled at directions ``uv [B, H, W, 3]`` and 0 if
+    these are 0 or not finite. ``uv_da`` are the derivatives of uv from :func:`interpolate`: the
+    mipmap level is log2 of the longer half axis of the ellipse of texels that a pixel covers.
+    ``mip_level_bias [B, H, W]`` is added, or without uv_da is the level. ``mip`` is from
+    :func:`texture_construct_mip`, or a list of tensors like tex, each with half the sides of the
+    one before, rounded down, and with a gradient of its own. Differentiable in tex; in uv unless
+    filter_mode is "nearest"; in uv_da and mip_level_bias if it is "linear-mipmap-linear".
     """
     modes = ("auto", "nearest", "linear", "linear-mipmap-nearest", "linear-mipmap-linear")
     check_choice(filter_mode, "filter_mode", modes)
@@ -499,7 +514,9 @@ class _Topology(NamedTuple):
 
 
 def antialias_construct_topology_hash(tri: Tensor) -> _Topology:
-    """What :func:`antialias` needs to know of faces that stay the same, for its argument ``topology_hash``."""
+    """What :func:`antialias` needs to know of faces that stay the same, for its argument
+    ``topology_hash``.
+    """
     tri = check_faces(tri, 1, tri.device if isinstance(tri, Tensor) else torch.device("cpu"), "tri")
     ends = (
         torch.stack([tri.roll(-1, dims=1), tri.roll(-2, dims=1)], dim=-1)
@@ -527,14 +544,17 @@ def antialias(
     topology_hash: _Topology | None = None,
     pos_gradient_boost: float = 1.0,
 ) -> Tensor:
-    """An image ``[B, H, W, C]`` with smooth silhouettes: neighbours are blended by the place of the edge between them.
+    """An image ``[B, H, W, C]`` with smooth silhouettes: neighbours are blended by the place of
+    the edge between them.
 
-    Two neighbours with different faces are blended if a silhouette edge of the nearer one's face crosses the line
-    between their centres: an edge with one face, or with faces on one side of it on the screen. Mostly vertical edges
-    count for neighbours in a row, the others for those in a column. With the edge at the distance d from the nearer
-    one's centre, in pixels, the other gets the share d - 1/2 of its colour if d > 1/2, else it gets the share 1/2 - d
-    of the other's (Laine et al. 2020). Faces that share an edge must name the same vertices there. Differentiable in
-    color and pos at fixed faces per pixel; ``pos_gradient_boost`` multiplies the gradient in pos.
+    Two neighbours with different faces are blended if a silhouette edge of the nearer one's face
+    crosses the line between their centres: an edge with one face, or with faces on one side of it
+    on the screen. Mostly vertical edges count for neighbours in a row, the others for those in a
+    column. With the edge at the distance d from the nearer one's centre, in pixels, the other
+    gets the share d - 1/2 of its colour if d > 1/2, else it gets the share 1/2 - d of the other's
+    (Laine et al. 2020). Faces that share an edge must name the same vertices there.
+    Differentiable in color and pos at fixed faces per pixel; ``pos_gradient_boost`` multiplies
+    the gradient in pos.
     """
     rast = _pixels(rast, "rast", 4).detach()
     color = _pixels(color, "color", None).to(rast)

@@ -1,14 +1,17 @@
-"""The torch operators behind the public functions: each is declared once, by ``@kernel`` (``_kernel.py``).
+"""The torch operators behind the public functions: each is declared once, by ``@kernel``
+(``_kernel.py``).
 
-Kernels read and write the memory of tensors on the CPU. Tensors on other devices are copied to the CPU, and
-the results are copied back. Arguments are checked in the public functions; kernels check shapes and indices again.
+Kernels read and write the memory of tensors on the CPU. Tensors on other devices are copied to
+the CPU, and the results are copied back. Arguments are checked in the public functions; kernels
+check shapes and indices again.
 
-A batch of meshes is ``vertices [B, V, 3]`` with ``faces [F, 3]`` or ``[B, F, 3]`` and ``starts=None``, or packed:
-``vertices [N, 3]``, ``faces [M, 3]`` (vertex numbers count from the mesh's own first vertex) and ``starts`` int64
-``[B + 1, 2]`` in host memory: first vertex and first face of each mesh, then N and M. faces are int64.
+A batch of meshes is ``vertices [B, V, 3]`` with ``faces [F, 3]`` or ``[B, F, 3]`` and
+``starts=None``, or packed: ``vertices [N, 3]``, ``faces [M, 3]`` (vertex numbers count from the
+mesh's own first vertex) and ``starts`` int64 ``[B + 1, 2]`` in host memory: first vertex and
+first face of each mesh, then N and M. faces are int64.
 
-Images are ``[B, h, w]``; rasters are ``[B, H, W]``, twice as fine when anti-aliased, else the same; row 0 = top. A
-face index map is int32:
+Images are ``[B, h, w]``; rasters are ``[B, H, W]``, twice as fine when anti-aliased, else the
+same; row 0 = top. A face index map is int32:
 -1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
 """
 

@@ -1,9 +1,11 @@
-"""Makes operators of the compiled kernels: ``@kernel`` turns the shapes of a kernel's results into an operator.
+"""Makes operators of the compiled kernels: ``@kernel`` turns the shapes of a kernel's results
+into an operator.
 
-An operator is a function of tensors and numbers, given by position, without default values (torch would leave out
-arguments equal to them). Calls with plain tensors reach the kernel through a ``torch.autograd.Function``, or directly
-if no gradient is wanted: for small meshes the dispatcher takes longer than the kernel. Everything else (torch.compile,
-torch.export, fake tensors) reaches it through ``torch.ops.nmr``.
+An operator is a function of tensors and numbers, given by position, without default values (torch
+would leave out arguments equal to them). Calls with plain tensors reach the kernel through a
+``torch.autograd.Function``, or directly if no gradient is wanted: for small meshes the dispatcher
+takes longer than the kernel. Everything else (torch.compile, torch.export, fake tensors) reaches
+it through ``torch.ops.nmr``.
 """
 
 from __future__ import annotations
@@ -49,16 +51,18 @@ def kernel(
     used_by: str = "",
     twice=None,
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a function that allocates the results of a kernel, given its arguments: the operator ``nmr::<name>``.
+    """Decorates a function that allocates the results of a kernel, given its arguments: the
+    operator ``nmr::<name>``.
 
     Parameters
     ----------
     results : str
-        Names of the results in ``nmr._C``, where the kernel has the name of the function. Its arguments have their own.
+        Names of the results in ``nmr._C``, where the kernel has the name of the function. Its
+        arguments have their own.
     gradients : str
-        Names of the differentiable arguments. Their gradients come from ``<name>_backward`` of ``nmr._C``: its
-        arguments are those of the kernel, the results in ``keep`` and ``constant``, and ``grad_<result>`` of the
-        results that have a gradient.
+        Names of the differentiable arguments. Their gradients come from ``<name>_backward`` of
+        ``nmr._C``: its arguments are those of the kernel, the results in ``keep`` and
+        ``constant``, and ``grad_<result>`` of the results that have a gradient.
     keep, constant : str
         Results that the backward pass needs; ``constant``: they have no gradient.
     used_by : str
@@ -69,9 +73,9 @@ def kernel(
     Returns
     -------
     function
-        Calls the operator. Its attribute ``op`` is torch's, for ``opcheck``; ``backward`` is the operator of the
-        gradients: arguments as above, then ``wanted``, a flag for each differentiable argument. A gradient that is not
-        wanted is empty.
+        Calls the operator. Its attribute ``op`` is torch's, for ``opcheck``; ``backward`` is the
+        operator of the gradients: arguments as above, then ``wanted``, a flag for each
+        differentiable argument. A gradient that is not wanted is empty.
     """
 
     def decorate(allocate: Callable[P, R]) -> Callable[P, R]:
@@ -267,8 +271,8 @@ def _register_autograd(operator: Callable, backward: Callable, set_up: Callable)
         parts = {part: staticmethod(code) for part, code in parts.items()}
         return type(name, (torch.autograd.Function,), parts).apply
 
-    # torch binds the arguments of a Function with setup_context by its signature, which takes longer than the kernel of
-    # a small mesh. Only torch.func needs that form.
+    # torch binds the arguments of a Function with setup_context by its signature, which takes
+    # longer than the kernel of a small mesh. Only torch.func needs that form.
     operator.direct = function(forward=forward_with_context, backward=backward, jvp=jvp)
     operator.transformed = function(
         forward=forward, setup_context=set_up, backward=backward, jvp=jvp, vmap=operator.vmap

@@ -20,10 +20,11 @@ def look_at(
     perspective: bool,
     double: bool,
 ) -> Tensor:
-    """Cameras ``[B or 1, 22]``, float64 or float32, at ``eye``, float64 ``[3]`` or ``[B, 3]`` as ``at`` and ``up``.
+    """Cameras ``[B or 1, 22]``, float64 or float32, at ``eye``, float64 ``[3]`` or ``[B, 3]`` as
+    ``at`` and ``up``.
 
-    They look at the point ``at`` or, with ``along``, in that direction. view ``[]`` or ``[B]`` is half of the field of
-    view in degrees or, without perspective, the scale.
+    They look at the point ``at`` or, with ``along``, in that direction. view ``[]`` or ``[B]`` is
+    half of the field of view in degrees or, without perspective, the scale.
     """
     sizes = [x.shape[0] for x, axes in ((eye, 2), (at, 2), (up, 2), (view, 1)) if x.ndim == axes]
     batch = next((size for size in sizes if size != 1), 1)
@@ -38,11 +39,12 @@ def project(
     starts: Tensor | None,
     perspective: bool,
 ) -> Tensor:
-    """Vertices ``[B or 1, V, 3]`` or packed ``[N, 3]`` in renderer space, ``[B, V, 3]`` or ``[N, 3]``.
+    """Vertices ``[B or 1, V, 3]`` or packed ``[N, 3]`` in renderer space, ``[B, V, 3]`` or
+    ``[N, 3]``.
 
-    For a camera ``[B or 1, 22]``: ``u = A (v - origin) + t``; ``p = (u_x, u_y)``, if perspective divided by u_z and
-    distorted by ``distortion`` ``[B or 1, 4, 5 or 8]`` or None; x and y are K times ``(p_x, p_y) / extent`` and 1, z is
-    u_z.
+    For a camera ``[B or 1, 22]``: ``u = A (v - origin) + t``; ``p = (u_x, u_y)``, if perspective
+    divided by u_z and distorted by ``distortion`` ``[B or 1, 4, 5 or 8]`` or None; x and y are K
+    times ``(p_x, p_y) / extent`` and 1, z is u_z.
     """
     if starts is not None:
         return vertices.new_empty(vertices.shape)

@@ -1,7 +1,8 @@
-"""Operators: meshes in clip space. Barycentric weights with their derivatives on the screen, and silhouette edges.
+"""Operators: meshes in clip space. Barycentric weights with their derivatives on the screen, and
+silhouette edges.
 
-``positions [B or 1, V, 4]`` are (x, y, z, w), ``faces [F, 3]`` int64, face index maps int32 ``[B, H, W]``. Row 0 of all
-images is the bottom.
+``positions [B or 1, V, 4]`` are (x, y, z, w), ``faces [F, 3]`` int64, face index maps int32
+``[B, H, W]``. Row 0 of all images is the bottom.
 """
 
 from torch import Tensor
@@ -11,7 +12,8 @@ from ._kernel import kernel
 
 @kernel("rast slopes", gradients="positions", used_by="rasterize")
 def clip_weights(positions: Tensor, faces: Tensor, face_index: Tensor) -> tuple[Tensor, Tensor]:
-    """``[B, H, W, 4]`` (b_0, b_1, z / w, face + 1), and (db_0/dX, db_0/dY, db_1/dX, db_1/dY) in pixels.
+    """``[B, H, W, 4]`` (b_0, b_1, z / w, face + 1), and (db_0/dX, db_0/dY, db_1/dX, db_1/dY) in
+    pixels.
 
     0 on background. z / w has no gradient.
     """
@@ -30,8 +32,8 @@ def antialias(
 ) -> Tensor:
     """Colours ``[B, H, W, C]`` blended between neighbours that a silhouette edge separates.
 
-    ``rast`` is that of :func:`clip_weights`. ``twins [F, 3]`` int64: the edge opposite to corner k of face f is
-    numbered 3 f + k; its entry is the next edge with the same two vertices, cyclically, or itself. Differentiable in
-    colors and positions.
+    ``rast`` is that of :func:`clip_weights`. ``twins [F, 3]`` int64: the edge opposite to corner
+    k of face f is numbered 3 f + k; its entry is the next edge with the same two vertices,
+    cyclically, or itself. Differentiable in colors and positions.
     """
     return colors.new_empty(colors.shape)

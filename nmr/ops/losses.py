@@ -30,8 +30,10 @@ def _gradients(
     twice=_gradients,
 )
 def soft_iou_loss(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """``1 - mean_b I / U`` ``[]`` of pairs ``[B, ...]`` with ``I = sum p t`` and ``U = sum (p + t - p t)``.
+    """``1 - mean_b I / U`` ``[]`` of pairs ``[B, ...]`` with ``I = sum p t`` and
+    ``U = sum (p + t - p t)``.
 
-    If U = 0, I / U counts as 1. The second result is I and U, float64 ``[B, 2]``, for the gradient; 0 if U = 0.
+    If U = 0, I / U counts as 1. The second result is I and U, float64 ``[B, 2]``, for the
+    gradient; 0 if U = 0.
     """
     return prediction.new_empty(()), prediction.new_empty((len(prediction), 2), dtype=torch.float64)

@@ -1,4 +1,6 @@
-"""Operators: faces cut at the near plane, the nearest face at each pixel, silhouettes with their gradients."""
+"""Operators: faces cut at the near plane, the nearest face at each pixel, silhouettes with their
+gradients.
+"""
 
 from typing import NamedTuple
 
@@ -33,7 +35,9 @@ def batch_size(vertices: Tensor, starts: Tensor | None) -> int:
 
 @kernel("counts")
 def clip_count(vertices: Tensor, faces: Tensor, starts: Tensor | None, near: float) -> Tensor:
-    """Room that the clipped meshes need: int64 ``[B, 2]``, new vertices and drawn faces; -1 if nothing is cut."""
+    """Room that the clipped meshes need: int64 ``[B, 2]``, new vertices and drawn faces; -1 if
+    nothing is cut.
+    """
     return vertices.new_empty((batch_size(vertices, starts), 2), dtype=torch.int64)
 
 
@@ -47,14 +51,16 @@ def clip_faces(
     num_new: int,
     num_drawn: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The faces to draw, packed: ``faces [M, 3]``, ``source [M]`` (int32), ``corners [M, 3]``, ``ends [P, 4]`` (int64).
+    """The faces to draw, packed: ``faces [M, 3]``, ``source [M]`` (int32), ``corners [M, 3]``,
+    ``ends [P, 4]`` (int64).
 
-    Only the topology; no gradients pass through here. ``new_starts [B + 1, 2]`` in host memory are first new vertex and
-    first drawn face of each mesh, then P = num_new and M = num_drawn. New vertices are numbered after the V of their
-    mesh. ``source`` is the face that a drawn face is part of; ``corners`` says which of its corners are those of the
-    source (0, 1, 2) or new vertices (3 + number); ``ends`` are the two rows of ``vertices.reshape(-1, 3)`` that a new
-    vertex is between, and which corners of the source these are. Room that is left over is filled with faces without
-    area.
+    Only the topology; no gradients pass through here. ``new_starts [B + 1, 2]`` in host memory
+    are first new vertex and first drawn face of each mesh, then P = num_new and M = num_drawn.
+    New vertices are numbered after the V of their mesh. ``source`` is the face that a drawn face
+    is part of; ``corners`` says which of its corners are those of the source (0, 1, 2) or new
+    vertices (3 + number); ``ends`` are the two rows of ``vertices.reshape(-1, 3)`` that a new
+    vertex is between, and which corners of the source these are. Room that is left over is filled
+    with faces without area.
     """
     shapes = (num_drawn, 3), (num_drawn,), (num_drawn, 3), (num_new, 4)
     types = torch.int64, torch.int32, torch.int64, torch.int64
@@ -92,7 +98,9 @@ def rasterize_layers(
     far: float,
     perspective: bool,
 ) -> Tensor:
-    """Face indices of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest first, then -1."""
+    """Face indices of the nearest surfaces at each pixel, ``[B, height, width, layers]``, nearest
+    first, then -1.
+    """
     return vertices.new_empty(
         (batch_size(vertices, starts), height, width, layers), dtype=torch.int32
     )
@@ -115,9 +123,11 @@ def silhouette(
     perspective: bool,
     local: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Silhouettes ``alpha [B, height, width]`` and the face index map ``[B, H, W]`` of meshes in renderer space.
+    """Silhouettes ``alpha [B, height, width]`` and the face index map ``[B, H, W]`` of meshes in
+    renderer space.
 
-    The gradient is NMR's silhouette gradient or, if ``local``, Kato and Harada's, which reaches one pixel. Zero in z.
+    The gradient is NMR's silhouette gradient or, if ``local``, Kato and Harada's, which reaches
+    one pixel. Zero in z.
     """
     batch, scale = batch_size(vertices, starts), 2 if anti_aliasing else 1
     alpha = vertices.new_empty((batch, height, width))

@@ -1,4 +1,6 @@
-"""Operators: colours from texture cubes, values given at the corners of faces, normals, and lit colours."""
+"""Operators: colours from texture cubes, values given at the corners of faces, normals, and lit
+colours.
+"""
 
 from torch import Tensor
 
@@ -15,9 +17,9 @@ def texture_cubes(
 ) -> Tensor:
     """Colours ``[B, H, W, C]`` from texture cubes; 0 on background.
 
-    textures are ``[B or 1, F, ts, ts, ts, C]``, packed ``[M, ts, ts, ts, C]``.
-    Axis k of a cube is the weight of the face's vertex k: sampled trilinearly at ``weights * (ts - 1)``, clamped to
-    ``[0, ts - 1 - eps]``. Differentiable in ``textures`` only, as published.
+    textures are ``[B or 1, F, ts, ts, ts, C]``, packed ``[M, ts, ts, ts, C]``. Axis k of a cube
+    is the weight of the face's vertex k: sampled trilinearly at ``weights * (ts - 1)``, clamped
+    to ``[0, ts - 1 - eps]``. Differentiable in ``textures`` only, as published.
     """
     return textures.new_empty((*face_index.shape, textures.shape[-1]))
 
@@ -30,19 +32,23 @@ def interpolate(
     weights: Tensor,
     starts: Tensor | None,
 ) -> Tensor:
-    """``values[b, y, x] = sum_k weights[b, y, x, k] attributes[b, corners[f, k]]`` ``[B, H, W, C]``; 0 on background.
+    """``values[b, y, x] = sum_k weights[b, y, x, k] attributes[b, corners[f, k]]``
+    ``[B, H, W, C]``; 0 on background.
 
-    attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or packed ``[M, 3]`` are
-    rows of them, counted from the first of the mesh; ``starts`` (packed) are first row and first face of each mesh.
+    attributes are ``[B or 1, N, C]``, packed ``[N, C]``; corners ``[F, 3]``, ``[B, F, 3]`` or
+    packed ``[M, 3]`` are rows of them, counted from the first of the mesh; ``starts`` (packed)
+    are first row and first face of each mesh.
     """
     return attributes.new_empty((*face_index.shape, attributes.shape[-1]))
 
 
 @kernel("normals", gradients="vertices", used_by="render_normals")
 def normals(vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool) -> Tensor:
-    """Unit normals ``n((v0 - v1) x (v2 - v1))`` of faces, ``[B or 1, F, 3]`` or packed ``[M, 3]``.
+    """Unit normals ``n((v0 - v1) x (v2 - v1))`` of faces, ``[B or 1, F, 3]`` or packed
+    ``[M, 3]``.
 
-    smooth: normals of vertices, like ``vertices``: the direction of the sum of these products. 0 without an area.
+    smooth: normals of vertices, like ``vertices``: the direction of the sum of these products. 0
+    without an area.
     """
     return vertices.new_empty(
         vertices.shape if smooth else (*vertices.shape[:-2], *faces.shape[-2:])
@@ -67,9 +73,10 @@ def lit(
 ) -> Tensor:
     """Lit colours ``[B, H, W, 3]``; 0 on background. Without parameters, the normals.
 
-    colors are ``[B, H, W, 1 or 3]``, None is white; normals those of :func:`normals`; parameters ``[P]`` all values of
-    lights, and layout int64 ``[11, 3]`` the place of each: first value, rows (1 or B), lights; viewer ``[B, 5]``: the
-    place of the eye and 1, or the direction towards the viewer and 0, then -1 if the camera sees a right-handed world,
-    else 1; vertices and faces the meshes in world space.
+    colors are ``[B, H, W, 1 or 3]``, None is white; normals those of :func:`normals`; parameters
+    ``[P]`` all values of lights, and layout int64 ``[11, 3]`` the place of each: first value,
+    rows (1 or B), lights; viewer ``[B, 5]``: the place of the eye and 1, or the direction towards
+    the viewer and 0, then -1 if the camera sees a right-handed world, else 1; vertices and faces
+    the meshes in world space.
     """
     return weights.new_empty((*face_index.shape, 3))

@@ -25,7 +25,8 @@ def soft_silhouette(
     far: float,
     reach_per_sigma: float,
 ) -> Tensor:
-    """``1 - alpha`` at each raster pixel, ``[B, height, width]``: the product of 1 - D over all faces.
+    """``1 - alpha`` at each raster pixel, ``[B, height, width]``: the product of 1 - D over all
+    faces.
 
     sigma is float64 ``[]``. The gradient in vertices is zero in z.
     """
@@ -47,7 +48,8 @@ def soft_layers(
     perspective: bool,
     reach_per_sigma: float,
 ) -> Tensor:
-    """Face indices ``[B, height, width, layers]`` of the nearest faces within reach, nearest first, then -1.
+    """Face indices ``[B, height, width, layers]`` of the nearest faces within reach, nearest
+    first, then -1.
 
     Each face counts once: f if it is seen from its front, else F + f. sigma is float64 ``[]``.
     """
@@ -65,10 +67,12 @@ def soft_fragments(
     far: float,
     perspective: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights ``[B, H, W, K, 3]``, depth and distances ``[B, H, W, K]`` of a table of faces ``[B, H, W, K]``.
+    """Weights ``[B, H, W, K, 3]``, depth and distances ``[B, H, W, K]`` of a table of faces
+    ``[B, H, W, K]``.
 
-    Distances are those of pixels outside to the border of the face, squared, and minus those of pixels inside. A pixel
-    outside has the weights on the screen that are clamped to [0, 1] and divided by their sum. All are differentiable.
+    Distances are those of pixels outside to the border of the face, squared, and minus those of
+    pixels inside. A pixel outside has the weights on the screen that are clamped to [0, 1] and
+    divided by their sum. All are differentiable.
     """
     sizes = (*face_index.shape, 3), face_index.shape, face_index.shape
     return tuple(vertices.new_empty(size) for size in sizes)
