@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scenes import double
+from torch.testing import assert_close
 
 import nmr
 import nmr.neural_renderer as nr
@@ -97,12 +99,6 @@ def test_utf16_is_refused() -> None:
         read_obj(io.BytesIO(SQUARE.encode("utf-16")))
 
 
-def area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Twice the area vectors of the faces."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
-
-
 OUTLINES = {
     "arrow": [[0, 0], [4, 0], [1, 1], [0, 4]],
     "L": [[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]],
@@ -121,18 +117,17 @@ OUTLINES = {
 @pytest.mark.parametrize("name", OUTLINES)
 def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -> None:
     outline = np.array(OUTLINES[name])[:: -1 if turned else 1]
-    for start in range(len(outline)):
+    count = len(outline)
+    for start in range(count):
         flat = np.roll(outline, start, axis=0)
         # in a slanted plane, at UTM coordinates
-        vertices = np.column_stack([flat, flat[:, 0]]) + [
-            4.5e6,
-            5e5,
-            100,
-        ]
-        faces = triangulate(vertices, np.arange(len(flat)), np.array([len(flat)]))
-        whole = np.cross(vertices - vertices[0], np.roll(vertices - vertices[0], -1, axis=0)).sum(0)
-        parts = area(vertices, faces)
-        assert len(faces) == len(flat) - 2
+        vertices = np.column_stack([flat, flat[:, 0]]) + [4.5e6, 5e5, 100]
+        faces = triangulate(vertices, np.arange(count), np.array([count]))
+        outwards = vertices - vertices[0]
+        whole = np.cross(outwards, np.roll(outwards, -1, axis=0)).sum(0)
+        a, b, c = np.moveaxis(vertices[faces], 1, 0)
+        parts = np.cross(b - a, c - a)
+        assert len(faces) == count - 2
         np.testing.assert_allclose(np.linalg.norm(parts, axis=1).sum(), np.linalg.norm(whole))
         assert (parts @ whole >= -1e-9).all()
 
@@ -140,16 +135,17 @@ def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -
 def test_polygons_stay_in_order_and_convex_ones_are_fans() -> None:
     vertices = np.random.default_rng(0).normal(size=(9, 3))
     vertices[:5] = [[0, 0, 0], [2, 0, 0], [3, 1, 0], [2, 2, 0], [0, 2, 0]]
-    corners = np.array([5, 6, 7, 0, 1, 2, 3, 4, 8, 7, 0, 8, 0, 1, 2, 3])
-    sizes = np.array([3, 5, 2, 1, 1, 4])
-    faces = corners[triangulate(vertices, corners, sizes)]
+    polygons = [[5, 6, 7], [0, 1, 2, 3, 4], [8, 7], [0], [8], [0, 1, 2, 3]]
+    corners = np.concatenate(polygons)
+    faces = corners[triangulate(vertices, corners, np.array([len(p) for p in polygons]))]
     assert faces[:4].tolist() == [[5, 6, 7], [0, 1, 2], [0, 2, 3], [0, 3, 4]] and len(faces) == 6
     with pytest.raises(ValueError, match="missing vertex; there are 9"):
         triangulate(vertices, np.array([0, 1, 9]), np.array([3]))
-    zigzag = np.stack([np.arange(5000.0), np.arange(5000) % 2, np.zeros(5000)], axis=1)
+    many = np.arange(5000)
+    zigzag = np.column_stack([many, many % 2, 0 * many]).astype(float)
     zigzag[-1] = [0, 5, 0]
     with pytest.raises(ValueError, match="polygon of 5000 corners is not convex"):
-        triangulate(zigzag, np.arange(5000), np.array([5000]))
+        triangulate(zigzag, many, np.array([5000]))
 
 
 TEXTURED = "mtllib {library}\n" + CORNERS + "vt 0 0\nvt 1 0\nvt 1 1\n{used}\nf 1/1 2/2 3/3\n"
@@ -174,21 +170,17 @@ def test_images_of_materials_are_found(tmp_path: Path, case: str) -> None:
     line, image = FOUND[case]
     (tmp_path / "maps").mkdir()
     image_module.new("RGB", (4, 4), (255, 51, 0)).save(tmp_path / image)
-    (tmp_path / "A b.mtl").write_bytes(
-        b"\xef\xbb\xbfNEWMTL red\nkd 1 0 0.5\n" + line.encode() + b"\n"
-    )
+    library = f"\ufeffNEWMTL red\nkd 1 0 0.5\n{line}\n"
+    (tmp_path / "A b.mtl").write_text(library, encoding="utf-8")
     path = tmp_path / "a.obj"
     path.write_text(TEXTURED.format(library="a b.MTL", used="usemtl red"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         textures = nr.load_obj(path, load_texture=True)[2]
         (material,) = nmr.load_obj(path).materials
-    torch.testing.assert_close(textures[0, 1, 1, 1], torch.tensor([1, 0.2, 0]))
-    assert (
-        material.name == "red"
-        and material.color == (1, 0, 0.5)
-        and Path(material.image).samefile(tmp_path / image)
-    )
+    assert_close(textures[0, 1, 1, 1], torch.tensor([1, 0.2, 0]))
+    assert material.name == "red" and material.color == (1, 0, 0.5)
+    assert Path(material.image).samefile(tmp_path / image)
 
 
 @pytest.mark.parametrize(
@@ -216,18 +208,11 @@ def test_tensors_of_an_obj_file(tmp_path: Path) -> None:
     mesh = nmr.load_obj(path, dtype=torch.float64)
     moved = (mesh.vertices - mesh.vertices[0]).tolist()
     assert moved == [[0, 0, 0], [1, 0, 0], [0, 1, 0.5]] and mesh.faces.dtype == torch.int64
-    torch.testing.assert_close(
-        mesh.colors[:2], torch.tensor([[1, 0, 0.2], [0.5] * 3], dtype=torch.float64)
-    )
-    assert (
-        mesh.uv.tolist() == [[0.5, 1]]
-        and mesh.uv_faces.tolist() == [[0, 0, 0]]
-        and mesh.materials == ()
-    )
-    vertices, _ = nr.load_obj(path)
-    torch.testing.assert_close(
-        vertices, torch.tensor([[-1, -1, -0.5], [1, -1, -0.5], [-1, 1, 0.5]])
-    )
+    assert_close(mesh.colors[:2], double([[1, 0, 0.2], [0.5] * 3]))
+    assert mesh.uv.tolist() == [[0.5, 1]] and mesh.uv_faces.tolist() == [[0, 0, 0]]
+    assert mesh.materials == ()
+    normalized = torch.tensor([[-1, -1, -0.5], [1, -1, -0.5], [-1, 1, 0.5]])
+    assert_close(nr.load_obj(path)[0], normalized)
+    path.write_text(CORNERS)
     with pytest.raises(ValueError, match=r"a\.obj has no faces"):
-        path.write_text(CORNERS)
         nmr.load_obj(path)

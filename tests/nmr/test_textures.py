@@ -1,41 +1,33 @@
 """Colours of meshes: read back what was painted, against slow definitions; gradients; bad input."""
 
+import itertools
 import math
 from dataclasses import replace
 
 import pytest
 import torch
+from scenes import bumpy_sphere, double, leaf_of, square, uniform, value_and_gradients
+from torch.autograd import gradcheck
+from torch.testing import assert_close
 
 import nmr
 
-
-def screen(depth=(1.0, 1.0, 1.0, 1.0), half=1.0):
-    """Two float64 triangles that fill the screen, corners: bottom left, bottom right, top right, top left."""
-    xy = [(-half, -half), (half, -half), (half, half), (-half, half)]
-    vertices = torch.tensor(
-        [[x, y, z] for (x, y), z in zip(xy, depth, strict=True)], dtype=torch.float64
-    )
-    return vertices, torch.tensor([[0, 1, 2], [0, 2, 3]])
+TILTED = square(depth=(1.0, 2.0, 4.0, 3.0))  # fills the screen, as `square()` does
 
 
-CORNERS = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=torch.float64)
+CORNERS = double([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
-def uniform(*shape, seed=0, dtype=torch.float64):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
-def draw(colors, mesh=None, size=8, **kwargs):
-    return nmr.render_rgb(
-        *(mesh or screen()), colors=colors, image_size=size, anti_aliasing=False, **kwargs
-    )
+def draw(colors, mesh=None, size=8, **how):
+    how |= dict(image_size=size, anti_aliasing=False)
+    return nmr.render_rgb(*(mesh or square()), colors=colors, **how)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
 def test_an_image_on_the_screen_is_read_back(channels):
     """Texel centres meet pixel centres: row 0 of the image is the top, uv (0, 0) its bottom left corner."""
     image = uniform(8, 8, channels)
-    torch.testing.assert_close(draw(nmr.UVTexture(image, CORNERS))[0], image)
+    assert_close(draw(nmr.UVTexture(image, CORNERS))[0], image)
 
 
 # The same in plain torch operations. `level` is a constant.
@@ -54,17 +46,14 @@ def slow_bilinear(image, uv, wrap):
     """[H, W, C] at uv [..., 2]."""
     height, width = image.shape[:2]
     uv = torch.where(uv.detach().abs() < 1e6, uv, torch.zeros_like(uv))
-    x, y = uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5
+    x, y = uv[..., :1] * width - 0.5, (1 - uv[..., 1:]) * height - 0.5
     column, row = x.detach().floor(), y.detach().floor()
-    right, down = (x - column).unsqueeze(-1), (y - row).unsqueeze(-1)
     colors = 0
-    for dy, share_y in ((0, 1 - down), (1, down)):
+    for dy, dx in itertools.product((0, 1), repeat=2):
+        share = (1 - (x - column - dx).abs()) * (1 - (y - row - dy).abs())
         line = slow_wrapped(row.long() + dy, height, wrap)
-        for dx, share_x in ((0, 1 - right), (1, right)):
-            colors = (
-                colors
-                + share_y * share_x * image[line, slow_wrapped(column.long() + dx, width, wrap)]
-            )
+        place = slow_wrapped(column.long() + dx, width, wrap)
+        colors = colors + share * image[line, place].squeeze(-2)
     return colors
 
 
@@ -85,169 +74,139 @@ def slow_half(image):
 def slow_uv(image, uv, level, wrap):
     """[B, H, W, C]; level None is bilinear."""
     colors = []
-    for b in range(len(uv)):
+    for b, places in enumerate(uv):
         mip = image[b % len(image)]
-        if level is None:
-            colors.append(slow_bilinear(mip, uv[b], wrap))
-            continue
-        color, n = 0, 0
-        while n == 0 or max(mip.shape[:2]) > 1 or n <= level.max():
-            mip = slow_half(mip) if n else mip
-            color = color + (1 - (level[b] - n).abs()).clamp_min(0).unsqueeze(-1) * slow_bilinear(
-                mip, uv[b], wrap
-            )
-            n += 1
+        color = slow_bilinear(mip, places, wrap) * (1 if level is None else share_of(0, level[b]))
+        for n in range(1, 1 if level is None else 4):
+            mip = slow_half(mip)
+            color = color + share_of(n, level[b]) * slow_bilinear(mip, places, wrap)
         colors.append(color)
     return torch.stack(colors)
 
 
-def textured_fragments(dtype=torch.float64, image_size=24, per_image=False, grad=False):
-    """Two views of a bumpy sphere, its weights as leaves; an image, and uv that exceed [0, 1]."""
-    vertices, faces = nmr.icosphere(1)
-    vertices = vertices.to(dtype) * (0.8 + 0.2 * uniform(42, 1, dtype=dtype))
+def share_of(n, level):
+    """Of mipmap n in the mixture of two."""
+    return (1 - (level - n).abs()).clamp_min(0).unsqueeze(-1)
+
+
+def textured_fragments(per_image):
+    """Two views of a bumpy sphere; an image, and uv that exceed [0, 1]."""
+    vertices, faces = bumpy_sphere(1, least=0.8)
     camera = nmr.LookAt.from_angles(2.4, 20.0, [0.0, 130.0])
-    fragments = nmr.render_fragments(vertices, faces, camera, image_size=image_size)
-    fragments = replace(fragments, weights=fragments.weights.clone().requires_grad_(grad))
     batch = (2,) if per_image else ()
-    image = uniform(*batch, 7, 12, 3, seed=2, dtype=dtype)
-    noise = uniform(*batch, 42, 2, seed=3, dtype=dtype)
-    uv = 0.8 * vertices[:, :2] + 0.3 * noise
-    return fragments, image.requires_grad_(grad), uv.requires_grad_(grad)
+    uv = 0.8 * vertices[:, :2] + 0.3 * uniform(*batch, 42, 2, seed=3)
+    fragments = nmr.render_fragments(vertices, faces, camera, image_size=24)
+    return fragments, uniform(*batch, 7, 12, 3, seed=2), uv
 
 
 @pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
 @pytest.mark.parametrize("per_image", [False, True])
 @pytest.mark.parametrize("filter", ["bilinear", "mipmap"])
 def test_values_and_gradients_equal_torch_operations(wrap, per_image, filter):
-    fragments, image, uv = textured_fragments(per_image=per_image, grad=True)
-    colors = nmr.UVTexture(image, uv, wrap=wrap, filter=filter)
-    sampled = colors.sample(fragments)
+    fragments, image, uv = textured_fragments(per_image)
     level = None
     if filter == "mipmap":
-        level = slow_level(fragments, uv.detach().expand(2, -1, -1), (7, 12), 3)
-    images = image if per_image else image.unsqueeze(0)
-    slow = slow_uv(images, fragments.interpolate(uv), level, wrap)
-    slow = torch.where(fragments.covered.unsqueeze(-1), slow, 0.0)
-    torch.testing.assert_close(sampled, slow, rtol=1e-9, atol=1e-9)
-    upstream, leaves = uniform(*slow.shape, seed=5) - 0.5, (image, uv, fragments.weights)
-    fast, slow = (torch.autograd.grad(x, leaves, upstream) for x in (sampled, slow))
-    for a, b in zip(fast, slow, strict=True):
-        assert b.any()
-        torch.testing.assert_close(a, b, rtol=1e-7, atol=1e-9)
+        level = slow_level(fragments, uv.expand(2, -1, -1), (7, 12), 3)
+
+    def fast(image, uv, weights):
+        colors = nmr.UVTexture(image, uv, wrap=wrap, filter=filter)
+        return colors.sample(replace(fragments, weights=weights))
+
+    def slow(image, uv, weights):
+        places = replace(fragments, weights=weights).interpolate(uv)
+        images = image if per_image else image.unsqueeze(0)
+        colors = slow_uv(images, places, level, wrap)
+        return torch.where(fragments.covered.unsqueeze(-1), colors, 0.0)
+
+    (color, *grads), (wanted, *slow_grads) = (
+        value_and_gradients(function, image, uv, fragments.weights) for function in (fast, slow)
+    )
+    assert all(x.any() for x in slow_grads)
+    assert_close(color, wanted, rtol=1e-9, atol=1e-9)
+    assert_close(grads, slow_grads, rtol=1e-7, atol=1e-9)
 
 
 def slow_level(fragments, uv, size, most):
     """OpenGL's level from differences: the same face, seen a hundred-thousandth of a pixel further on."""
-    height, width = fragments.sided_face_index.shape[1:]
-    step, images = 1e-5, []
-    for b in range(len(uv)):
-        corners = fragments.faces[fragments.face_index[b].clamp_min(0).long()]
-        at = fragments.vertices[b][corners]  # [H, W, 3, 3]
-        row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    height, width = fragments.face_index.shape[1:]
+    corners = fragments.faces[fragments.face_index.clamp_min(0).long()]  # [B, H, W, 3]
+    image = torch.arange(len(uv)).view(-1, 1, 1, 1)
+    x, y, z = fragments.vertices[image, corners].unbind(-1)
+    planes = torch.stack([x * z, y * z, z], dim=-2)
+    row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
 
-        def uv_at(x, y, at=at, corners=corners, b=b):
-            point = torch.stack(
-                [2 * (x + 0.5) / width - 1, 1 - 2 * (y + 0.5) / height, torch.ones_like(x)], -1
-            )
-            columns = torch.stack(
-                [at[..., 0] * at[..., 2], at[..., 1] * at[..., 2], at[..., 2]], dim=-2
-            )
-            weights = torch.linalg.solve(columns, point)
-            weights = weights / weights.sum(-1, keepdim=True)
-            return (weights.unsqueeze(-1) * uv[b][corners]).sum(-2) * torch.tensor(
-                [size[1], size[0]]
-            )
+    def texel_at(dx, dy):
+        x = 2 * (column.double() + dx + 0.5) / width - 1
+        y = 1 - 2 * (row.double() + dy + 0.5) / height
+        point = torch.stack([x, y, torch.ones_like(x)], -1)
+        weights = torch.linalg.solve(planes, point.unsqueeze(-1)).squeeze(-1)
+        weights = weights / weights.sum(-1, keepdim=True)
+        return (weights.unsqueeze(-1) * uv[image, corners]).sum(-2) * torch.tensor(size[::-1])
 
-        x, y = column.double(), row.double()
-        lengths = [
-            ((uv_at(x + dx, y + dy) - uv_at(x - dx, y - dy)) / (2 * step)).norm(dim=-1)
-            for dx, dy in ((step, 0), (0, step))
-        ]
-        images.append(torch.maximum(*lengths).log2().clamp(0, most))
-    return torch.where(fragments.covered, torch.stack(images), 0.0)
+    lengths = [
+        ((texel_at(dx, dy) - texel_at(-dx, -dy)) / 2e-5).norm(dim=-1)
+        for dx, dy in ((1e-5, 0), (0, 1e-5))
+    ]
+    return torch.where(fragments.covered, torch.maximum(*lengths).log2().clamp(0, most), 0.0)
 
 
 def test_a_mipmap_shows_the_mean_of_what_a_pixel_covers():
     """A picture of noise, drawn eight times smaller: its 8 x 8 means, where bilinear sampling shows single texels."""
     noise = uniform(64, 64, 1)
     means = noise.view(8, 8, 8, 8, 1).mean((1, 3))
-    mipmapped = draw(nmr.UVTexture(noise, CORNERS, filter="mipmap"))[0]
-    torch.testing.assert_close(mipmapped, means, rtol=1e-9, atol=1e-9)
+    mipmapped, grad = value_and_gradients(
+        lambda x: draw(nmr.UVTexture(x, CORNERS, filter="mipmap"))[0],
+        noise,
+        upstream=torch.ones_like(means),
+    )
+    assert_close(mipmapped, means, rtol=1e-9, atol=1e-9)
     assert (draw(nmr.UVTexture(noise, CORNERS))[0] - means).abs().max() > 0.2
-    leaf = noise.clone().requires_grad_()
-    draw(nmr.UVTexture(leaf, CORNERS, filter="mipmap")).sum().backward()
-    torch.testing.assert_close(leaf.grad, torch.full_like(noise, 1 / 64))
+    assert_close(grad, torch.full_like(noise, 1 / 64))
 
 
-def test_mipmaps_keep_the_mean_whatever_the_size():
-    for size in ((1, 1), (5, 3), (6, 1), (7, 16)):
-        image = uniform(*size, 2)
-        colors = nmr.UVTexture(image, 1000 * CORNERS, filter="mipmap")  # the last level
-        torch.testing.assert_close(draw(colors)[0, 3, 3], image.mean((0, 1)))
+@pytest.mark.parametrize("size", [(1, 1), (5, 3), (6, 1), (7, 16)])
+def test_mipmaps_keep_the_mean_whatever_the_size(size):
+    image = uniform(*size, 2)
+    colors = nmr.UVTexture(image, 1000 * CORNERS, filter="mipmap")  # the last level
+    assert_close(draw(colors)[0, 3, 3], image.mean((0, 1)))
 
 
 def test_seams():
     """Both faces show the whole width of the image: the shared vertices 0 and 2 have two uv each."""
-    image = torch.arange(8.0, dtype=torch.float64).view(1, 8, 1)
-    uv = torch.tensor(
-        [[0.0, 0.5], [1.0, 0.5], [1.0, 0.5], [1.0, 0.5], [1.0, 0.5], [0.0, 0.5]],
-        dtype=torch.float64,
-    )
-    colors = nmr.UVTexture(image, uv, torch.tensor([[0, 1, 2], [3, 4, 5]]), wrap="clamp")
-    fragments = nmr.render_fragments(*screen(), image_size=9)
+    image, uv = torch.arange(8.0).double().view(1, 8, 1), double([[0.0, 0.5], [1.0, 0.5]])
+    corners = torch.tensor([[0, 1, 1], [1, 1, 0]])
+    colors = nmr.UVTexture(image, uv, corners, wrap="clamp")
+    fragments = nmr.render_fragments(*square(), image_size=9)
     rgb, b = draw(colors, size=9)[0, ..., 0], fragments.weights[0]
     u = torch.where(fragments.face_index[0] == 0, b[..., 1] + b[..., 2], b[..., 0] + b[..., 1])
-    torch.testing.assert_close(rgb, (8 * u - 0.5).clamp(0, 7))
+    assert_close(rgb, (8 * u - 0.5).clamp(0, 7))
 
 
-def test_uv_that_are_not_numbers_spoil_nothing():
+@pytest.mark.parametrize("filter", ["bilinear", "mipmap"])
+@pytest.mark.parametrize("moving", [False, True])
+def test_uv_that_are_not_numbers_spoil_nothing(filter, moving):
+    vertices, faces = TILTED
     uv = CORNERS.clone()
     uv[3, 0] = math.nan
-    image = uniform(4, 4, 3).requires_grad_()
-    rgb = draw(nmr.UVTexture(image, uv))
-    rgb.sum().backward()
-    assert rgb.isfinite().all() and image.grad.isfinite().all() and image.grad.any()
-    vertices, faces = screen((1.0, 2.0, 4.0, 3.0))
-    leaf = vertices.clone().requires_grad_()
-    for filter in ("bilinear", "mipmap"):
-        rgb = draw(
-            nmr.UVTexture(image, uv.requires_grad_(), filter=filter),
-            (leaf, faces),
-            interpolation_gradient=True,
-        )
-        rgb.square().sum().backward()
-        assert (
-            rgb.isfinite().all()
-            and leaf.grad.isfinite().all()
-            and uv.grad.isfinite().all()
-            and leaf.grad.any()
-        )
+
+    def rgb(image, uv, vertices):
+        colors = nmr.UVTexture(image, uv, filter=filter)
+        return draw(colors, (vertices, faces), interpolation_gradient=moving)
+
+    results = value_and_gradients(rgb, uniform(4, 4, 3), uv, vertices)
+    assert all(x.isfinite().all() for x in results) and results[1].any()
+    assert bool(results[3][:, 2].any()) == moving  # edges move x and y in any case
 
 
-def test_vertex_colours_in_perspective():
-    """A colour equal to the camera-space position shows the position seen at each pixel."""
-    mesh = screen((1.0, 2.0, 4.0, 3.0))
-    position = torch.cat([mesh[0][:, :2] * mesh[0][:, 2:], mesh[0][:, 2:]], dim=1)
-    rgb = draw(nmr.VertexColors(position), mesh)[0]
-    centre = (2 * torch.arange(8, dtype=torch.float64) + 1 - 8) / 8
-    torch.testing.assert_close(rgb[..., 0], centre.expand(8, 8) * rgb[..., 2])
-    torch.testing.assert_close(rgb[..., 1], -centre.view(-1, 1) * rgb[..., 2])
-    torch.testing.assert_close(
-        rgb[..., 2], nmr.render_depth(*mesh, image_size=8, anti_aliasing=False)[0]
-    )
-
-
-def test_face_colours_are_exact():
-    vertices, faces = nmr.icosphere(1)
-    camera = nmr.LookAt.from_angles(3.0, 10.0, [0.0, 90.0])
-    colors = uniform(80, 4, dtype=torch.float32)
-    for values in (colors, torch.stack([colors, colors.flip(0)])):
-        rgb = draw(nmr.FaceColors(values), (vertices, faces), 16, camera=camera)
-        index = nmr.render_face_index(vertices, faces, camera, image_size=16).long()
-        for b in range(2):
-            expected = values[b] if values.ndim == 3 else values
-            assert torch.equal(rgb[b][index[b] >= 0], expected[index[b][index[b] >= 0]])
-            assert not rgb[b][index[b] < 0].any()
+@pytest.mark.parametrize("per_image", [False, True])
+def test_face_colours_are_exact(per_image):
+    mesh, camera = nmr.icosphere(1), nmr.LookAt.from_angles(3.0, 10.0, [0.0, 90.0])
+    colors = uniform(2 if per_image else 1, 80, 4, dtype=torch.float32)
+    given = colors if per_image else colors[0]
+    rgb = draw(nmr.FaceColors(given), mesh, 16, camera=camera)
+    index = nmr.render_face_index(*mesh, camera, image_size=16).long()
+    for image, faces, own in zip(rgb, index, colors.expand(2, -1, -1), strict=True):
+        assert torch.equal(image, own[faces.clamp_min(0)] * (faces >= 0)[..., None])
 
 
 MAKERS = {
@@ -263,13 +222,10 @@ MAKERS = {
 @pytest.mark.parametrize("kind", MAKERS)
 def test_colours_have_true_derivatives(kind):
     make, shape = MAKERS[kind]
-    vertices, faces = screen((1.0, 2.0, 4.0, 3.0), half=0.83)
-    vertices = vertices.expand(2, -1, -1)
-    values = uniform(*shape).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda x: nmr.render_rgb(vertices, faces, colors=make(x), background=0.2, image_size=3),
-        values,
-        atol=1e-6,
+    vertices, faces = square(-0.83, -0.83, 0.83, 0.83, depth=(1.0, 2.0, 4.0, 3.0))
+    mesh, how = (vertices.expand(2, -1, -1), faces), dict(background=0.2, image_size=3)
+    gradcheck(
+        lambda x: nmr.render_rgb(*mesh, colors=make(x), **how), leaf_of(uniform(*shape)), atol=1e-6
     )
 
 
@@ -278,21 +234,19 @@ def test_colours_have_true_derivatives(kind):
 def test_an_image_that_was_expanded_over_the_batch_counts_once(kind, filter):
     """The picture and the gradient are those of copies; only plain expansions are not copied."""
     image = uniform(*((2,) if kind == "slice" else ()), 6, 6, 3).requires_grad_()
-    expanded = {"turned": lambda: image.transpose(0, 1), "slice": lambda: image[1]}.get(
-        kind, lambda: image
-    )()
-    expanded = expanded.expand(4, -1, -1, -1)
+    view = {"turned": lambda: image.transpose(0, 1), "slice": lambda: image[1]}
+    expanded = view.get(kind, lambda: image)().expand(4, -1, -1, -1)
     if kind == "retained":
         expanded.retain_grad()
-    vertices, faces = screen((1.0, 2.0, 4.0, 3.0))
+    mesh = TILTED[0].expand(4, -1, -1), TILTED[1]
     grads, pictures = [], []
     for each in (expanded, expanded.clone()):
-        rgb = draw(nmr.UVTexture(each, CORNERS, filter=filter), (vertices.expand(4, -1, -1), faces))
+        rgb = draw(nmr.UVTexture(each, CORNERS, filter=filter), mesh)
         weight = uniform(*rgb.shape, seed=1)
-        grads.append(torch.autograd.grad((weight * rgb).sum(), image, retain_graph=True)[0])
+        grads += torch.autograd.grad((weight * rgb).sum(), image, retain_graph=True)
         pictures.append(rgb)
     assert torch.equal(*pictures)
-    torch.testing.assert_close(*grads)
+    assert_close(*grads)
     assert len(nmr.textures._once(expanded)) == (1 if kind == "whole" else 4)
     assert len(nmr.textures._once(expanded.detach())) == 1
 
@@ -302,6 +256,5 @@ def test_write_your_own():
         def sample(self, fragments):
             return (6 * fragments.depth.unsqueeze(-1)).sin()
 
-    mesh = screen((1.0, 2.0, 4.0, 3.0))
-    depth = nmr.render_depth(*mesh, image_size=8, anti_aliasing=False)
-    torch.testing.assert_close(draw(Stripes(), mesh)[..., 0], (6 * depth).sin())
+    depth = nmr.render_depth(*TILTED, image_size=8, anti_aliasing=False)
+    assert_close(draw(Stripes(), TILTED)[..., 0], (6 * depth).sin())

@@ -6,7 +6,9 @@ import sys
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from reader_checks import at_most
+from torch.testing import assert_close
 from vectors import load_vector, vector_names
 
 import nmr
@@ -34,22 +36,18 @@ def test_vertices_and_faces(tmp_path):
     path = write(tmp_path, a_obj=str(v["text"]))
     vertices, faces = nr.load_obj(path, normalization=False)
     assert vertices.dtype == torch.float32 and faces.dtype == torch.int32
-    assert np.array_equal(vertices.numpy(), v["vertices_raw"]) and np.array_equal(
-        faces.numpy(), v["faces"]
-    )
-    vertices, _ = nr.load_obj(path)
-    np.testing.assert_allclose(vertices.numpy(), v["vertices_normalized"], atol=1e-6)
+    assert np.array_equal(vertices, v["vertices_raw"]) and np.array_equal(faces, v["faces"])
+    assert_allclose(nr.load_obj(path)[0], v["vertices_normalized"], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", vector_names("texload_*"))
 def test_bake_textures(name):
     v = load_vector(name)
     # The vectors' image starts at the bottom, as the kernel gets it.
-    baked = bake_textures(
-        v["image"][::-1], v["uv"], int(v["texture_size"]), str(v["wrapping"]), bool(v["bilinear"])
-    )
+    how = int(v["texture_size"]), str(v["wrapping"]), bool(v["bilinear"])
+    baked = bake_textures(v["image"][::-1], v["uv"], *how)
     chosen = v["is_update"] == 1
-    np.testing.assert_allclose(baked[chosen], v["textures"][chosen], atol=1e-5)
+    assert_allclose(baked[chosen], v["textures"][chosen], atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (4, 1)])
@@ -58,9 +56,8 @@ def test_bake_images_of_one_row_or_column(shape, bilinear):
     image = np.random.default_rng(0).random((*shape, 3), dtype=np.float32)
     corner = np.array([[[0, 0], [1, 0], [1, 1]]], dtype=np.float32)
     baked = bake_textures(image, corner, 3, "REPEAT", bilinear)
-    expected = image[-1, 0], image[-1, -1], image[0, -1]
-    for k, color in enumerate(expected):
-        np.testing.assert_allclose(baked[(0, *(2 * (np.arange(3) == k)))], color, atol=1e-6)
+    for k, color in enumerate((image[-1, 0], image[-1, -1], image[0, -1])):
+        assert_allclose(baked[(0, *(2 * (np.arange(3) == k)))], color, atol=1e-6)
 
 
 LINES = {
@@ -77,26 +74,16 @@ def test_lines_that_the_published_function_accepts(tmp_path, lines):
     assert faces.tolist() == [[0, 1, 2]] and vertices.shape == (4, 3)
 
 
+# What a line may not say is in test_obj.py.
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "has no vertices"),
         (TRIANGLE, "has no faces"),
         (TRIANGLE + "f 1 2 4\n", "refers to vertex 4, but there are 3"),
-        (TRIANGLE + "f 1 2 0\n", "line 4: 'f 1 2 0' cannot be read: there is no element 0"),
-        (TRIANGLE + "f 1 2 -4\n", "there is no element -4"),
-        (TRIANGLE + "f\n", "a face needs corners"),
-        (TRIANGLE + "f a b c\n", "line 4.*cannot be read"),
         (TRIANGLE + "f 1 1 " + "9" * 400 + "\n", "cannot be read"),
-        (
-            TRIANGLE + "vt 0 0\nf 1/1 2/1 3/3\n",
-            "line 5: .* refers to texture coordinate 3, but there are 1",
-        ),
-        ((TRIANGLE + "f 1 2 3\n").encode("utf-16").decode("latin-1"), "UTF-16"),
         (TRIANGLE + "vt\nf 1 2 3\n", "line 4.*2 numbers are needed"),
         (TRIANGLE + "f 1 2 3\n", "names no .mtl file"),
-        ("v 1 2\n", "line 1.*3 numbers are needed"),
-        ("v 0 0 nan\n", "3 numbers are needed, finite in float32"),
         ("v 0 0 1e39\n", "finite in float32"),
         ("v 1 1 1\n" * 3 + "f 1 2 3\n", "finite in float32"),
     ],
@@ -121,107 +108,89 @@ def materials(tmp_path):
 def test_textures_of_materials(tmp_path):
     path, pixels = materials(tmp_path)
     _, faces, textures = nr.load_obj(path, texture_size=2, load_texture=True)
-    assert (
-        faces.shape == (4, 3)
-        and textures.shape == (4, 2, 2, 2, 3)
-        and textures.dtype == torch.float32
-    )
-    assert torch.all(textures[0] == 0.5)
-    assert torch.all(textures[1] == torch.tensor([1, 0, 0.25]))
-    for index, pixel in zip(
-        [(1, 0, 0), (0, 1, 0), (0, 0, 1)], [(7, 0), (7, 7), (0, 7)], strict=True
-    ):
-        np.testing.assert_allclose(textures[2][index].numpy(), pixels[pixel] / 255, atol=1e-5)
-    assert torch.all(textures[3] == torch.tensor([0, 0, 1.0]))
+    assert faces.shape == (4, 3) and textures.dtype == torch.float32
+    assert textures.shape == (4, 2, 2, 2, 3)
+    for face, color in ((0, [0.5, 0.5, 0.5]), (1, [1, 0, 0.25]), (3, [0, 0, 1.0])):
+        assert torch.all(textures[face] == torch.tensor(color))
+    for texel, pixel in (((1, 0, 0), (7, 0)), ((0, 1, 0), (7, 7)), ((0, 0, 1), (0, 7))):
+        assert_allclose(textures[2][texel], pixels[pixel] / 255, atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("library", "used", "made", "image", "mode"),
+    ("library", "used", "made", "options", "image", "color"),
     [
-        ("a.mtl # materials", "red # the roof", "red", "wood.png # oak", "RGB"),
-        ("a.mtl", "red", "red # the roof", "wood #1.png", "L"),
-        ("none.mtl a.mtl", "red roof", "red", "-s 1 1 1 wood.png", "RGBA"),
+        ("a.mtl # materials", "red # the roof", "red", " # oak", "wood.png", (51, 51, 51)),
+        ("a.mtl", "red", "red # the roof", "", "wood #1.png", 51),
+        ("none.mtl a.mtl", "red roof", "red", "-s 1 1 1 ", "wood.png", (51, 51, 51, 0)),
     ],
 )
-def test_names_options_and_comments(tmp_path, monkeypatch, library, used, made, image, mode):
+def test_names_options_and_comments(
+    tmp_path, monkeypatch, library, used, made, options, image, color
+):
     """Without a material of the whole name, the first word is the name, as published. Alpha is dropped."""
     image_module = pytest.importorskip("PIL.Image")
-    color = {"RGB": (51, 51, 51), "RGBA": (51, 51, 51, 0), "L": 51}[mode]
-    image_module.new(mode, (2, 2), color).save(
-        tmp_path / ("wood #1.png" if "#1" in image else "wood.png")
-    )
+    mode = {1: "L", 3: "RGB", 4: "RGBA"}[np.size(color)]
+    image_module.new(mode, (2, 2), color).save(tmp_path / image)
+    words = options + image if options.endswith(" ") else image + options
     obj = f"mtllib {library}\n{TRIANGLE}vt 0.5\nusemtl {used}\nf 1/1 2/1 3/1\n"
-    mtl = f"newmtl blue\nKd 0 0 1\n\nnewmtl {made}\nKd 1 0 0 # red\nmap_Kd {image}\n"
-    write(tmp_path, a_obj=obj, a_mtl=mtl)
-    (tmp_path / "none.mtl").write_text("# nothing")
+    mtl = f"newmtl blue\nKd 0 0 1\n\nnewmtl {made}\nKd 1 0 0 # red\nmap_Kd {words}\n"
+    write(tmp_path, a_obj=obj, a_mtl=mtl, none_mtl="# nothing")
     monkeypatch.chdir(tmp_path.parent)
     textures = nr.load_obj(f"{tmp_path.name}/a.obj", load_texture=True)[2]
-    torch.testing.assert_close(textures, torch.full_like(textures, 0.2))
+    assert_close(textures, torch.full_like(textures, 0.2))
 
 
 def test_images_of_16_bits(tmp_path):
     image_module = pytest.importorskip("PIL.Image")
     image_module.fromarray(np.full((2, 2), 13107, dtype=np.uint16)).save(tmp_path / "deep.png")
-    np.testing.assert_allclose(
-        read_image(str(tmp_path / "deep.png")), np.full((2, 2, 3), 0.2), atol=1e-6
-    )
+    assert_allclose(read_image(str(tmp_path / "deep.png")), np.full((2, 2, 3), 0.2), atol=1e-6)
 
 
 def test_textures_of_another_material_file(tmp_path):
     path, _ = materials(tmp_path)
     textures = nr.load_obj(path, texture_size=2, load_texture=True)[2]
     assert torch.equal(load_textures(path, tmp_path / "a.mtl", 2), textures)
-    (tmp_path / "b.mtl").write_text("newmtl red\nKd 0 1 0\n")
-    assert torch.all(
-        load_textures(path, tmp_path / "b.mtl", 2, use_bilinear=False)[1]
-        == torch.tensor([0, 1.0, 0])
-    )
-    assert texture_wrapping_dict == {
-        "REPEAT": 0,
-        "MIRRORED_REPEAT": 1,
-        "CLAMP_TO_EDGE": 2,
-        "CLAMP_TO_BORDER": 3,
-    }
-    (tmp_path / "b.mtl").write_text("newmtl x\nKd 1 1\n")
+    other = tmp_path / "b.mtl"
+    other.write_text("newmtl red\nKd 0 1 0\n")
+    green = load_textures(path, other, 2, use_bilinear=False)[1]
+    assert torch.all(green == torch.tensor([0, 1.0, 0]))
+    modes = "REPEAT MIRRORED_REPEAT CLAMP_TO_EDGE CLAMP_TO_BORDER".split()
+    assert texture_wrapping_dict == {mode: number for number, mode in enumerate(modes)}
+    other.write_text("newmtl x\nKd 1 1\n")
     with pytest.raises(ValueError, match=r"b.mtl, line 2.*3 numbers are needed"):
-        load_mtl(tmp_path / "b.mtl")
+        load_mtl(other)
 
 
 def test_images_without_pillow(tmp_path, monkeypatch):
     path, _ = materials(tmp_path)
     monkeypatch.setitem(sys.modules, "PIL", None)  # importing it fails
     assert len(nr.load_obj(path)) == 2
-    with pytest.raises(ImportError, match=r"pip install pillow"):
-        nr.load_obj(path, load_texture=True)
-    with pytest.raises(ImportError, match=r"pip install pillow"):
-        nr.save_obj(
-            tmp_path / "b.obj",
-            torch.rand(3, 3),
-            torch.tensor([[0, 1, 2]]),
-            torch.rand(1, 2, 2, 2, 3),
-        )
+    textured = torch.rand(3, 3), torch.tensor([[0, 1, 2]]), torch.rand(1, 2, 2, 2, 3)
+    for use in (
+        lambda: nr.load_obj(path, load_texture=True),
+        lambda: nr.save_obj(tmp_path / "b.obj", *textured),
+    ):
+        with pytest.raises(ImportError, match=r"pip install pillow"):
+            use()
 
 
 def test_hostile_materials_and_images(tmp_path, monkeypatch):
-    from PIL import Image
-
-    triangle = (
-        "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
-    )
-    write(tmp_path, **{"a_obj": triangle, "a_mtl": "newmtl m\nmap_Kd t.png\n"})
+    image_module = pytest.importorskip("PIL.Image")
+    obj = f"mtllib a.mtl\n{TRIANGLE}vt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    path = write(tmp_path, a_obj=obj, a_mtl="newmtl m\nmap_Kd t.png\n")
 
     def refused(message, kind=ValueError):
         with pytest.raises(kind, match=message):
-            nr.load_obj(tmp_path / "a.obj", load_texture=True)
+            nr.load_obj(path, load_texture=True)
 
-    (tmp_path / "t.png").write_bytes(b"no image")
+    write(tmp_path, t_png="no image")
     refused(r"the image .*t\.png cannot be read")
-    Image.new("RGB", (9, 9)).save(tmp_path / "t.png")
+    image_module.new("RGB", (9, 9)).save(tmp_path / "t.png")
     monkeypatch.setattr("nmr.neural_renderer._images._MOST_PIXELS", 80)
     refused("9x9 pixels, at most 80 are read")
     (tmp_path / "t.png").unlink()
     refused("t.png", FileNotFoundError)
-    write(tmp_path, **{"a_mtl": "newmtl m\nmap_Kd \n"})
+    write(tmp_path, a_mtl="newmtl m\nmap_Kd \n")
     refused("regular file|No such file", (ValueError, OSError))
     monkeypatch.setattr("nmr.obj._MOST_BYTES", 20)
     refused(r"a\.obj has \d+ bytes; at most 20 are read")
@@ -243,8 +212,8 @@ def test_long_lines_and_names_take_little_memory(tmp_path):
 def test_texture_image():
     v = load_vector("create_texture_image")
     image, uv = create_texture_image(torch.from_numpy(v["textures"]), int(v["texture_size_out"]))
-    np.testing.assert_allclose(image, v["image"], atol=1e-5)
-    np.testing.assert_allclose(uv, v["uv"], atol=1e-6)
+    assert_allclose(image, v["image"], atol=1e-5)
+    assert_allclose(uv, v["uv"], atol=1e-6)
 
 
 @pytest.mark.parametrize("num_faces", [1, 2, 3, 5, 7])
@@ -269,24 +238,15 @@ def test_mesh_comes_back_exactly(tmp_path):
 def test_textures_come_back(tmp_path, texture_size):
     pytest.importorskip("PIL")
     vertices, faces = nmr.icosphere(0)
-    corner_colors = torch.rand(len(faces), 3, 3)
-    if texture_size == 1:
-        corner_colors = corner_colors[:, :1].expand(-1, 3, -1)
     # A texture that is linear in the weights, in which any correct resampling finds the same colours.
-    grid = torch.stack(
-        torch.meshgrid(*[torch.linspace(0, 1, max(texture_size, 2))] * 3, indexing="ij"), -1
-    )
-    grid = grid / grid.sum(-1, keepdim=True).clamp_min(1e-9)
-    grid[0, 0, 0] = 1 / 3
-    textures = torch.einsum("ijkc,fcd->fijkd", grid, corner_colors)[:, : texture_size or 1]
-    textures = textures[:, :texture_size, :texture_size, :texture_size]
-    if texture_size == 1:
-        textures = corner_colors[:, 0].view(-1, 1, 1, 1, 3)
+    corners = torch.rand(len(faces), 1 if texture_size == 1 else 3, 3).expand(-1, 3, -1)
+    weights = torch.cartesian_prod(*[torch.linspace(0, 1, texture_size)] * 3).view(-1, 3)
+    weights[0] = 1
+    weights = weights / weights.sum(-1, keepdim=True)
+    textures = (weights @ corners).view(-1, *[texture_size] * 3, 3)
     nr.save_obj(tmp_path / "mesh.obj", vertices, faces, textures)
     assert sorted(os.listdir(tmp_path)) == ["mesh.mtl", "mesh.obj", "mesh.png"]
-    _, _, loaded = nr.load_obj(tmp_path / "mesh.obj", texture_size=4, load_texture=True)
+    loaded = nr.load_obj(tmp_path / "mesh.obj", texture_size=4, load_texture=True)[2]
     for k in range(3):
-        index = tuple(3 * (torch.arange(3) == k))
-        torch.testing.assert_close(
-            loaded[(slice(None), *index)], corner_colors[:, k], rtol=0, atol=0.03
-        )
+        texel = 3 * torch.eye(3, dtype=torch.int64)[k]
+        assert_close(loaded[(slice(None), *texel)], corners[:, k], rtol=0, atol=0.03)
