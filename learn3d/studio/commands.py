@@ -32,7 +32,7 @@ from learn3d.terminal import note, say
 
 
 class MakeDataset(Command):
-    """Render a data set from a folder of meshes, a mesh pack or procedural shapes, in the layout of a published one.
+    """Render a data set from meshes or procedural shapes, in the layout of a published one.
 
     Examples:
       learn3d make-dataset --output data --category chair --source my_chairs --augment 5
@@ -50,7 +50,7 @@ class MakeDataset(Command):
 
 
 class FetchDebianModels(Command):
-    """Extract airplanes, chairs, tables, cabinets, sofas and lamps from Debian packages into a folder of PLY meshes.
+    """Extract airplanes, chairs, tables, cabinets, sofas and lamps from Debian packages, as PLY.
 
     Example:
       learn3d fetch-debian-models --output models
@@ -59,7 +59,8 @@ class FetchDebianModels(Command):
     output: Path
     """Folder to write; it must not exist."""
     packages_dir: Path | None = None
-    """Folder for the .deb files; missing ones are downloaded into it. If not given: a temporary folder."""
+    """Folder for the .deb files; missing ones are downloaded into it. If not given: a temporary
+    folder."""
 
     def run(self) -> None:
         say(fetch_debian_models(self.output, self.packages_dir).summary())
@@ -67,7 +68,7 @@ class FetchDebianModels(Command):
 
 
 class EstimatePoses(Command):
-    """Estimate the pose of each image of a data set from the masks alone, for `learn3d train --poses`.
+    """Estimate the pose of each image of a data set from its mask, for `learn3d train --poses`.
 
     Examples:
       learn3d estimate-poses photos --layout photos --category mug --elevation 20 --output mug.npz
@@ -88,9 +89,11 @@ class EstimatePoses(Command):
     options: PoseOptions
     cameras: CameraOptions
     compare: bool = False
-    """Compare with the known azimuths, and turn the table into their frame, so that voxel IoU can be measured."""
+    """Compare with the known azimuths, and turn the table into their frame, so that voxel IoU can
+    be measured."""
     views_per_object: Count | None = None
-    """Number of training images of each object. If not given: the layout's protocol, one for kar, else all."""
+    """Number of training images of each object. If not given: the layout's protocol, one for kar,
+    else all."""
 
     def run(self) -> None:
         check_target(self.output, "--output")
@@ -98,9 +101,9 @@ class EstimatePoses(Command):
         views = estimate_views(datasets, self.cameras, self.options)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())
-        say(
-            f"{len(table.confidence)} images: mean confidence {table.confidence.mean():.2f}, below 0.5: {doubtful:.0%}"
-        )
+        mean = table.confidence.mean()
+        count = len(table.confidence)
+        say(f"{count} images: mean confidence {mean:.2f}, below 0.5: {doubtful:.0%}")
         if self.compare:
             comparison = compare(views)
             say(comparison.text())
@@ -111,12 +114,14 @@ class EstimatePoses(Command):
         table.write(self.output)
         sheet = self.output.with_suffix(".png")
         save_png(sheet, draw_pose_sheet(views, offset_deg))
-        rows = "first rows: renderings of the prototypes; other rows: images with that estimated azimuth"
-        say(f"written to {self.output}; sheet {sheet}: columns: azimuths; {rows}")
+        say(
+            f"written to {self.output}; sheet {sheet}: columns: azimuths; first rows: "
+            "renderings of the prototypes; other rows: images with that estimated azimuth"
+        )
 
 
 class Experiment(Request, Command):
-    """Make a table of the paper: train its runs, measure them, and report the paper's values beside ours.
+    """Make a table of the paper: train and measure its runs, and report them beside its values.
 
     Examples:
       learn3d experiment --list
@@ -152,7 +157,7 @@ class Reconstruct(OnDataset):
     """Turn images into meshes, each with a turntable animation and a strip of views.
 
     Examples:
-      learn3d reconstruct photo.png --output meshes    (transparent background; the small model of the package)
+      learn3d reconstruct photo.png --output meshes    (transparent background; the package's model)
       learn3d reconstruct a.jpg b.jpg c.jpg --same-object --output meshes
       learn3d reconstruct photo.jpg --masks mask.png --run runs/airplane --output meshes
       learn3d reconstruct --data DATA --indices 0 31 62 --run runs/airplane --output meshes
@@ -161,35 +166,43 @@ class Reconstruct(OnDataset):
     output: Path
     """Folder for the results: a mesh, a turntable GIF and a PNG strip of each image."""
     category: str | None = None
-    """Category of the object in the image files (default: recognized), or of the data set (default: the run's)."""
+    """Category of the object in the image files (default: recognized), or of the data set (default:
+    the run's)."""
     guesses: Count = 1
-    """Largest number of different shapes for each image file, the best first; a model without templates makes one."""
+    """Largest number of different shapes for each image file, the best first; a model without
+    templates makes one."""
     same_object: bool = False
-    """The image files, two to eight, show the same object from several sides, and become one mesh."""
+    """The image files, two to eight, show the same object from several sides, and become one
+    mesh."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
-    """Run folder (or checkpoint file) of the trained model. If not given: the small model of the package."""
+    """Run folder (or checkpoint file) of the trained model. If not given: the small model of the
+    package."""
     images: tyro.conf.Positional[
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]
     ] = ()
-    """Images of any size. If not given: images of --data. In those without transparency, --masks or --box the object is
-    searched: it is what differs from a plain background, or else is cut out of the middle (needs the extra photos)."""
+    """Images of any size. If not given: images of --data. In those without transparency, --masks or
+    --box the object is searched: it is what differs from a plain background, or else is cut out of
+    the middle (needs the extra photos)."""
     masks: tuple[Path, ...] = ()
-    """Mask images (white = object), one for each image. If not given: the transparency of the images."""
+    """Mask images (white = object), one for each image. If not given: the transparency of the
+    images."""
     box: tuple[int, int, int, int] | None = None
-    """Box around the object in a single photograph: X Y WIDTH HEIGHT in pixels, from the upper left. The object is cut
-    out of it (needs the extra photos)."""
+    """Box around the object in a single photograph: X Y WIDTH HEIGHT in pixels, from the upper
+    left. The object is cut out of it (needs the extra photos)."""
     crop: bool = True
-    """Centre and scale the object in each image as in the data set. --no-crop: images are framed like that already."""
+    """Centre and scale the object in each image as in the data set. --no-crop: images are framed
+    like that already."""
     data: Path | None = None
     """Data set from which images are taken. If not given: image files are given."""
     indices: tuple[int, ...] = (0,)
-    """Images of the data set: object * V + view, if each object has V views (Kato's: 24, Kar's: 20)."""
+    """Images of the data set: object * V + view, if each object has V views (Kato's: 24, Kar's:
+    20)."""
     refine: bool | None = None
-    """Fit the predicted shapes to the masks. The cameras are those of the data set; for image files cameras and colours
-    are estimated. If not given: yes for image files, no for --data."""
+    """Fit the predicted shapes to the masks. The cameras are those of the data set; for image files
+    cameras and colours are estimated. If not given: yes for image files, no for --data."""
     format: Literal["glb", "obj", "ply"] = "glb"
-    """Format of the mesh files. All have colours: glb in a texture image where there is one, obj and ply at the
-    vertices."""
+    """Format of the mesh files. All have colours: glb in a texture image where there is one, obj
+    and ply at the vertices."""
 
     def run(self) -> None:
         if bool(self.images) == (self.data is not None):
@@ -220,7 +233,7 @@ class Reconstruct(OnDataset):
 
 
 class Export(Command):
-    """Write the networks of a run into one small file: in half precision, without the parts for training alone.
+    """Write the networks of a run into one small file, in half precision, for use alone.
 
     Example:
       learn3d export --run runs/chair --output chair.safetensors
@@ -233,8 +246,8 @@ class Export(Command):
     which: Which = "last"
     """Checkpoint of a run: the last one, or the one with the best validation IoU."""
     others: Path | None = None
-    """Folder of PNG files with transparency that show other things, so that `reconstruct` warns of such pictures. If
-    not given: it warns of pictures that are far from all training images."""
+    """Folder of PNG files with transparency that show other things, so that `reconstruct` warns of
+    such pictures. If not given: it warns of pictures that are far from all training images."""
 
     def run(self) -> None:
         check_target(self.output, "--output")
@@ -273,7 +286,8 @@ class Figures(OnDataset):
     images: int | None = None
     """Number of images. If not given: 6 in a grid, 3 in an interpolation."""
     indices: tuple[int, ...] = ()
-    """Samples of the data set in a grid or an interpolation. If not given: --images of different objects and views."""
+    """Samples of the data set in a grid or an interpolation. If not given: --images of different
+    objects and views."""
     truth: bool = False
     """Show the ground-truth voxels in a grid as well."""
 
@@ -297,7 +311,7 @@ class Figures(OnDataset):
 
 
 class Report(OnDataset):
-    """Write one HTML file about trained runs: options, curves, test IoU, and shapes that one can turn.
+    """Write one HTML file about trained runs: options, curves, test IoU, and shapes to turn.
 
     Examples:
       learn3d report runs/plus runs/vanilla --output report.html
@@ -330,7 +344,8 @@ class Demo(Command):
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(name="run")] = ()
-    """Run folders (or checkpoint files) of trained models. If not given: the small model of the package."""
+    """Run folders (or checkpoint files) of trained models. If not given: the small model of the
+    package."""
     port: int = 7860
     """Port of the page's address, http://HOST:PORT."""
     host: str = "127.0.0.1"

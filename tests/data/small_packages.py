@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.studio.make_data.debian.models import Report, fetch_debian_models
+from learn3d.studio.make_data.debian.models import FetchReport, fetch_debian_models
 
 CATALOGUE = "PluginFurnitureCatalog.properties"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
@@ -120,6 +120,6 @@ def entry(name: str, stem: str, **more: str) -> dict:
     }
 
 
-def fetch(folder: Path, debs: Path | None) -> Report:
+def fetch(folder: Path, debs: Path | None) -> FetchReport:
     """The recipe on a folder of packages."""
     return fetch_debian_models(folder, debs)

@@ -24,7 +24,7 @@ from learn3d.tasks import ONE_WORKER, Workers
 MAX_FACES = 1_000_000
 _PACK = "an npz file with v0, f0, v1, f1, ... and no pickled objects"
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-Amount = Annotated[int, Field(ge=0)]
+WholeNumber = Annotated[int, Field(ge=0)]
 WITHOUT_EFFECT = {
     "output",
     "overwrite",
@@ -35,7 +35,10 @@ WITHOUT_EFFECT = {
 
 @checked
 class DatasetConfig:
-    """One category of a data set: its meshes, its layout and its splits. The same settings give the same bytes."""
+    """One category of a data set: its meshes, its layout and its splits.
+
+    The same settings give the same bytes.
+    """
 
     output: FilePath
     """Folder for the files. It may hold other categories, too."""
@@ -44,31 +47,35 @@ class DatasetConfig:
     layout: WrittenLayout = "kato"
     """Published data set whose file layout and viewpoints are used, see docs/data-sets.md."""
     views: Count | None = None
-    """Views of each object. If not given: 20 for kar, 8 for pascal3d, 12 for photos and around; kato always has 24."""
+    """Views of each object. If not given: 20 for kar, 8 for pascal3d, 12 for photos and around;
+    kato always has 24."""
     source: FilePath | None = None
-    """Folder of meshes, searched recursively, or a mesh pack .npz. If not given: shapes from --procedural."""
-    procedural: Amount = 0
-    """Number of shapes from the procedural generator, instead of meshes from files or together with them."""
+    """Folder of meshes, searched recursively, or a mesh pack .npz. If not given: shapes from
+    --procedural."""
+    procedural: WholeNumber = 0
+    """Number of shapes from the procedural generator, instead of meshes from files or together with
+    them."""
     test: Weight | None = None
-    """Share (below 1, at least 4 meshes) or number of the meshes for the test split. If not given: 0.2; pascal3d has no
-    test split."""
+    """Share (below 1, at least 4 meshes) or number of the meshes for the test split. If not given:
+    0.2; pascal3d has no test split."""
     val: Weight | None = None
-    """Share or number of the meshes for the validation split, 0 for none. If not given: 0.1, for pascal3d 0.2."""
-    augment: Amount = 0
-    """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75 .. 1.25. With --source,
-    shapes of --procedural get none."""
+    """Share or number of the meshes for the validation split, 0 for none. If not given: 0.1, for
+    pascal3d 0.2."""
+    augment: WholeNumber = 0
+    """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75 ..
+    1.25. With --source, shapes of --procedural get none."""
     up: Axis = "y"
     """Axis of the mesh files that points up."""
     front: Axis | None = None
-    """Axis of the mesh files that faces the camera of view 0. If not given: x, or y if x is up; z for procedural
-    shapes."""
-    seed: Amount = 0
+    """Axis of the mesh files that faces the camera of view 0. If not given: x, or y if x is up; z
+    for procedural shapes."""
+    seed: WholeNumber = 0
     """Seed of the splits, scales, colours, views and procedural shapes."""
     overwrite: bool = False
     """Replace files of this category that are already in the folder."""
     shards: bool = False
-    """Write shards, for data sets that exceed the memory (docs/scale.md). Only for the layouts kato and around. If the
-    command is interrupted, run it again: it continues."""
+    """Write shards, for data sets that exceed the memory (docs/scale.md). Only for the layouts kato
+    and around. If the command is interrupted, run it again: it continues."""
     workers: Workers = ONE_WORKER
 
     def __post_init__(self) -> None:
@@ -125,7 +132,10 @@ class Item:
 
 
 def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
-    """The meshes of each of the splits train, val and test. Raises ValueError if there are none to train on."""
+    """The meshes of each of the splits train, val and test.
+
+    Raises ValueError if there are none to train on.
+    """
     if config.procedural and config.category not in CATEGORIES:
         raise ValueError(
             f"the procedural generator makes {', '.join(CATEGORIES)}; got category {config.category!r}"
@@ -137,7 +147,7 @@ def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
             numbered_shape, config.category, config.seed, i
         )
     names, files = object_names(sources), list(sources)
-    numbers = split_objects(len(files), config.test, config.val, config.seed)
+    numbers = split_meshes(len(files), config.test, config.val, config.seed)
 
     def item(number: int, split: str) -> Item:
         copies = 1 + config.augment if split == "train" and number < augmented else 1
@@ -180,7 +190,7 @@ def _packed(path: Path, number: int) -> RawMesh:
     return RawMesh(vertices, faces)
 
 
-def split_objects(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
+def split_meshes(count: int, test: float, val: float, seed: int) -> dict[str, np.ndarray]:
     """Object numbers int64 of each split: a random permutation, cut into test, val and train.
 
     `test` and `val` are counts, or shares below 1. A share gives at least 4 objects, or an equal

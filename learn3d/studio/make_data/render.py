@@ -1,4 +1,7 @@
-"""Makes a data set from meshes: scales, colours and renders them. `writers` has cameras and files of each layout."""
+"""Makes a data set from meshes: scales, colours and renders them.
+
+`writers` has cameras and files of each layout.
+"""
 
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -263,7 +266,10 @@ def _parts(items: Sequence[Item]) -> list[list[Item]]:
 
 
 def _check_settings(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]]) -> None:
-    """Make the category's folder, and write its settings. Raises ValueError if it has shards of other settings."""
+    """Make the category's folder, and write its settings.
+
+    Raises ValueError if it has shards of other settings.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "settings.json"
     if config.overwrite:

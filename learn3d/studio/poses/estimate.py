@@ -67,7 +67,8 @@ class PoseOptions:
     repeats: Annotated[int, Field(ge=1, le=100)] = 3
     """Number of independent estimates that are averaged: more are more reliable and take longer."""
     prior: Literal["uniform", "free"] = "uniform"
-    """Prior over azimuths. uniform: all azimuths are about equally frequent in the data. free: no assumption."""
+    """Prior over azimuths. uniform: all azimuths are about equally frequent in the data. free: no
+    assumption."""
     steps: Annotated[int, Field(ge=1, le=100_000)] = 300
     """Optimisation steps of each mean shape and of each of the three stages of the prototypes."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
@@ -76,8 +77,11 @@ class PoseOptions:
     """Number of poses of each image with a probability above 0; each training step draws one."""
 
 
-class Candidates(NamedTuple):
-    """A x E candidate poses at one distance and field of view. Pose a * E + e has azimuth a and elevation e."""
+class CandidatePoses(NamedTuple):
+    """A x E candidate poses at one distance and field of view.
+
+    Pose a * E + e has azimuth a and elevation e.
+    """
 
     azimuth_deg: Tensor  # float32 [A]
     elevation_deg: Tensor  # float32 [E]
@@ -109,8 +113,12 @@ class Estimate:
     front_votes: float  # similar masks with equal azimuths, over those with equal or opposite ones; 1 if there are none
 
 
-def estimate(data: Masks, fitted: Tensor, candidates: Candidates, options: PoseOptions) -> Estimate:
-    """Estimate the poses of N masks, none of them empty. The same arguments and number of threads give the same bits.
+def estimate(
+    data: Masks, fitted: Tensor, candidates: CandidatePoses, options: PoseOptions
+) -> Estimate:
+    """Estimate the poses of N masks, none of them empty.
+
+    The same arguments and number of threads give the same bits.
 
     fitted: int64, rows of the masks that shapes are fitted to; of more than MAX_FITTED rows, a
     random part is used.
@@ -217,7 +225,7 @@ class Shapes:
     def __init__(
         self,
         data: Masks,
-        candidates: Candidates,
+        candidates: CandidatePoses,
         options: PoseOptions,
         rng: torch.Generator,
         bar: tqdm,
@@ -337,7 +345,10 @@ def distances(masks: Tensor, others: Tensor) -> Tensor:
 
 
 def _posteriors(logits: Tensor, prior: str) -> Tensor:
-    """Posterior [B, M, A, E] over shapes and poses. With the prior "uniform", all azimuths get about the same mass."""
+    """Posterior [B, M, A, E] over shapes and poses.
+
+    With the prior "uniform", all azimuths get about the same mass.
+    """
     bias = torch.zeros(logits.shape[2], dtype=torch.float64)
     if prior == "uniform":
         azimuth_logits = logits.logsumexp((1, 3)).double()

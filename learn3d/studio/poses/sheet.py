@@ -9,8 +9,8 @@ from learn3d.pictures.surfaces import Surface, draw_surface, orbit
 from learn3d.studio.poses.views import EstimatedViews
 
 COLUMNS = 12  # azimuths on the sheet, at most
-PROTOTYPES, ROWS = 6, 8  # rows of prototypes, and of images, at most
-TILE = 64  # side of a picture in pixels
+PROTOTYPES, IMAGE_ROWS = 6, 8  # rows of prototypes, and of images, at most
+PICTURE_SIZE = 64  # side of a picture in pixels
 
 
 def draw_pose_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarray:
@@ -28,7 +28,11 @@ def draw_pose_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarra
     )
     order = result.weights.argsort(descending=True)[:PROTOTYPES]
     rows = [
-        list(draw_surface(Surface(result.prototypes[m], result.faces), cameras, image_size=TILE))
+        list(
+            draw_surface(
+                Surface(result.prototypes[m], result.faces), cameras, image_size=PICTURE_SIZE
+            )
+        )
         for m in order
     ]
     places = [(dataset, i) for dataset in views.datasets for i in range(len(dataset))]
@@ -38,23 +42,23 @@ def draw_pose_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarra
         near = torch.nonzero(torch.remainder(found - azimuth + 180 / count, 360) < 360 / count)[
             :, 0
         ]
-        chosen = near[torch.linspace(0, len(near) - 1, min(ROWS, len(near))).long()]
+        chosen = near[torch.linspace(0, len(near) - 1, min(IMAGE_ROWS, len(near))).long()]
         pictures = []
         for row in views.shown[chosen].tolist():
             dataset, index = places[row]
             pictures.append(
                 natural_colors(dataset.images[np.array([index])], inverted=dataset.inverted)[0]
             )
-        columns.append(pictures + [None] * (ROWS - len(pictures)))
+        columns.append(pictures + [None] * (IMAGE_ROWS - len(pictures)))
     names = [f"prototype, {float(result.weights[m]):.0%}" for m in order] + [
         "images",
-        *[""] * (ROWS - 1),
+        *[""] * (IMAGE_ROWS - 1),
     ]
     titles = [f"{azimuth:g}°" for azimuth in azimuths.tolist()]
     return tile(
         [*rows, *map(list, zip(*columns, strict=True))],
         titles,
-        tile_size=TILE,
+        tile_size=PICTURE_SIZE,
         row_titles=names,
         rules=(len(rows),),
     )

@@ -22,7 +22,7 @@ from learn3d.methods.pose_updates import SIZE
 from learn3d.settings import checked
 from learn3d.studio.poses.estimate import (
     MIN_IMAGES,
-    Candidates,
+    CandidatePoses,
     Estimate,
     Masks,
     PoseOptions,
@@ -40,16 +40,20 @@ class CameraOptions:
     """Known values of the cameras."""
 
     elevation: str | None = None
-    """Elevation of all cameras in degrees, or a range LOW:HIGH. If not given: from the data set, or 30 if it has
-    none."""
+    """Elevation of all cameras in degrees, or a range LOW:HIGH. If not given: from the data set, or
+    30 if it has none."""
     distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])] | None = None
-    """Distance of all cameras, in units of the object's longest side. If not given: from the data set, or estimated
-    from the largest mask."""
+    """Distance of all cameras, in units of the object's longest side. If not given: from the data
+    set, or estimated from the largest mask."""
     fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None = None
-    """Full field of view of all cameras in degrees. If not given: from the data set, or 30 if it has none."""
+    """Full field of view of all cameras in degrees. If not given: from the data set, or 30 if it
+    has none."""
 
     def elevations(self) -> tuple[float, float] | None:
-        """The lowest and the highest elevation; None if no elevation is given. Raises ValueError for bad text."""
+        """The lowest and the highest elevation; None if no elevation is given.
+
+        Raises ValueError for bad text.
+        """
         if self.elevation is None:
             return None
         low, _, high = self.elevation.partition(":")
@@ -67,7 +71,7 @@ class EstimatedViews:
 
     datasets: tuple[ViewDataset, ...]
     shown: Tensor  # int64: rows of the images whose masks are not empty
-    candidates: Candidates
+    candidates: CandidatePoses
     result: Estimate  # for the rows `shown`
     table: PoseTable  # for all rows
 
@@ -108,7 +112,9 @@ def load_views(
 def estimate_views(
     datasets: Sequence[ViewDataset], cameras: CameraOptions, options: PoseOptions
 ) -> EstimatedViews:
-    """Estimate the poses of all images. Shapes are fitted to the images of the first data set, the training split.
+    """Estimate the poses of all images.
+
+    Shapes are fitted to the images of the first data set, the training split.
 
     The table holds up to MAX_CANDIDATES poses of each image, which a training can reweight.
     Raises ValueError if all training masks are empty, or if the data set's poses are rotations.
@@ -124,7 +130,7 @@ def estimate_views(
     span = cameras.elevations() or (float(elevation.min()), float(elevation.max()))
     grid = torch.linspace(*span, 1 + int(np.ceil((span[1] - span[0]) / MAX_ELEVATION_STEP_DEG)))
     azimuths = torch.arange(options.azimuths) * (360 / options.azimuths)
-    candidates = Candidates(azimuths, grid, float(distance.median()), float(half_fov.median()))
+    candidates = CandidatePoses(azimuths, grid, float(distance.median()), float(half_fov.median()))
     own_elevation = cameras.elevation is None  # the elevation of each image is known
     nearest = (elevation[:, None] - grid).abs().argmin(1)
     allowed = (nearest[:, None] == torch.arange(len(grid))) | (not own_elevation)

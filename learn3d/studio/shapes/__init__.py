@@ -21,7 +21,9 @@ CATEGORIES: tuple[str, ...] = tuple(_RECIPES)
 
 
 def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
-    """A random shape of the category (one of `CATEGORIES`). It depends on the state of `rng` alone, which advances.
+    """A random shape of the category (one of `CATEGORIES`).
+
+    It depends on the state of `rng` alone, which advances.
 
     The components are watertight, oriented outwards, and overlap at the joints of the object. It
     has 150 to 8000 faces, mostly 1000 to 5000. The bounding box is centred at the origin, its

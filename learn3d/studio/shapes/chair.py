@@ -123,7 +123,7 @@ def _join_chair(
     outline = ellipse(width, depth, 24, exponent)
     outline[:, 0] *= 1 + (taper - 1) * (0.5 - outline[:, 1] / depth)
     under = height - thickness
-    part = slab(outline, thickness, bevel=(0.35 if cushioned else 0.2) * thickness).moved(y=under)
+    part = slab(outline, thickness, (0.35 if cushioned else 0.2) * thickness, under)
 
     support = star if family is OFFICE else draw.pick(family.supports)
     inside = 0.5 * 0.35 ** (1 / exponent)  # share of the half width where the legs stand
@@ -391,7 +391,7 @@ def shell_chair(
     lift = (curl * np.abs(across) ** 2.5 + wings * hip * np.abs(across) ** 3) * (1 - 0.7 * ease)
     pull = (curl + wings * hip) * np.abs(across) ** 2.5 * ease
     part = sheet(points(span * across, y + lift, z + pull), thickness).moved(y=height)
-    part += slab(ellipse(0.8 * width, 0.8 * depth, 20, 5), 0.03).moved(y=height - 0.045)
+    part += slab(ellipse(0.8 * width, 0.8 * depth, 20, 5), 0.03, y=height - 0.045)
     if support is legs:
         return part + legs(draw, 0.34 * width, 0.34 * depth, height - 0.035, plain=True)
     return part + support(draw, 0.37 * width, 0.38 * depth, height - 0.035)
@@ -435,7 +435,7 @@ def barrel_chair(
     r = radius - 0.3 * thickness + slant * np.maximum(y, 0.0)
     part = sheet(points(r * np.sin(angle), y, -r * np.cos(angle)), thickness).moved(y=height)
     under = height - cushion
-    part += slab(ellipse(2 * radius, 2 * radius, 28, exponent), cushion).moved(y=under)
+    part += slab(ellipse(2 * radius, 2 * radius, 28, exponent), cushion, y=under)
     if gap is not None:
         for a in np.linspace(-0.92 * reach, 0.92 * reach, draw.count(4, 11)):
             x = radius * np.sin(a)
@@ -461,7 +461,7 @@ def barrel_chair(
 def stool(draw: Draw, *, width, height, thickness, ratio, exponent, support) -> Part:
     """A seat without a back, round or square, low or high."""
     depth = width * ratio
-    seat = slab(ellipse(width, depth, 24, exponent), thickness).moved(y=height - thickness)
+    seat = slab(ellipse(width, depth, 24, exponent), thickness, y=height - thickness)
     return seat + support(draw, 0.38 * width, 0.38 * depth, height - thickness + 0.005)
 
 

@@ -143,7 +143,7 @@ def pendant(draw: Draw, *, count, radius, height, cord) -> Part:
     ceiling = height + cord
     pitch = 2.4 * radius
     shade = _shade(draw, radius, height) + pole(0.6 * height, ceiling + 0.01, 0.014)
-    plate = slab(rectangle(pitch * (count - 1) + 0.12, 0.12, 0.05, 4), 0.03).moved(y=ceiling)
+    plate = slab(rectangle(pitch * (count - 1) + 0.12, 0.12, 0.05, 4), 0.03, y=ceiling)
     return plate + join(shade.moved(x=x) for x in pitch * (np.arange(count) - (count - 1) / 2))
 
 
@@ -169,7 +169,7 @@ def chandelier(draw: Draw, *, count, reach, drop, swing, rise, globes, waves) ->
         arm += bar((reach, rise, 0), (reach, rise + 0.1, 0), 0.026)
     t = shares(9)
     column = revolve(np.c_[0.02 + 0.04 * np.abs(np.sin(waves * np.pi * t)), -0.12 + 0.3 * t], 12)
-    column += pole(0.1, drop, 0.016) + slab(ellipse(0.13, 0.13), 0.03).moved(y=drop - 0.01)
+    column += pole(0.1, drop, 0.016) + slab(ellipse(0.13, 0.13), 0.03, y=drop - 0.01)
     return column + arm.around(90 + 360 / count * np.arange(count))
 
 

@@ -84,14 +84,17 @@ def _bevelled(outline: np.ndarray, low: float, high: float, bevel: float) -> np.
     return np.stack([points(*rim.T, z) for rim, z in rims])
 
 
-def slab(outline: np.ndarray, thickness: float, bevel: float | None = None) -> Part:
-    """A plate with the given outline in (x, z), from y = 0 to `thickness`, its rims bevelled."""
+def slab(outline: np.ndarray, thickness: float, bevel: float | None = None, y: float = 0.0) -> Part:
+    """A plate with the given outline in (x, z), from y to y + `thickness`, its rims bevelled."""
     bevel = 0.2 * thickness if bevel is None else min(bevel, 0.45 * thickness)
-    return loft(_bevelled(outline, 0.0, thickness, bevel)[..., [0, 2, 1]])
+    return loft(_bevelled(outline, 0.0, thickness, bevel)[..., [0, 2, 1]]).moved(y=y)
 
 
 def box(size: Point, center: Point = (0.0, 0.0, 0.0), radius: float | None = None) -> Part:
-    """A box of this size [3] about `center` with rounded edges. Their default radius is 12 % of the shortest side."""
+    """A box of this size [3] about `center` with rounded edges.
+
+    Their default radius is 12 % of the shortest side.
+    """
     shortest, axis = np.min(size), int(np.argmax(size))  # lofted along its longest side
     radius = 0.12 * shortest if radius is None else min(radius, 0.45 * shortest)
     outline = rectangle(size[axis - 2], size[axis - 1], radius, 1 if radius < 0.2 * shortest else 3)
@@ -108,7 +111,10 @@ def between(lower: Point, upper: Point, radius: float | None = None) -> Part:
 def post(
     foot: Point, head: Point, outline: np.ndarray, profile: Sequence[tuple[float, float]]
 ) -> Part:
-    """A post, perhaps slanted, with horizontal sections. profile: [(height from 0 at the foot to 1, outline scale)]."""
+    """A post, perhaps slanted, with horizontal sections.
+
+    profile: [(height from 0 at the foot to 1, outline scale)].
+    """
     foot, section = np.asarray(foot), points(outline[:, 0], 0.0, outline[:, 1])
     return loft([foot + t * (head - foot) + scale * section for t, scale in profile])
 
@@ -144,7 +150,9 @@ def tube(
     closed: bool = False,
     side: Point = Z,
 ) -> Part:
-    """A tube along a path [P, 3], with mitred bends. section: outline [N, 2]; radius scales it, a number or [P].
+    """A tube along a path [P, 3], with mitred bends.
+
+    section: outline [N, 2]; radius scales it, a number or [P].
 
     The first axis of the section points towards `side` as far as the path allows.
     """

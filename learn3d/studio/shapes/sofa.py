@@ -174,7 +174,7 @@ def curved_sofa(
     edge = np.linspace(x[0], x[-1], 9)[1:-1]
     front = np.c_[edge, z[0] + bulge * (1 - (edge / x[0]) ** 2)]
     outline = np.r_[front, np.c_[x, z][::-1]][::-1]
-    cushion = slab(outline, seat - foot, 0.04).moved(y=foot)
+    cushion = slab(outline, seat - foot, 0.04, foot)
     return wrap + cushion + feet(draw, 0.6 * half, 0.22 * depth, foot + 0.02)
 
 

@@ -164,7 +164,7 @@ def star(
         )
         arm += wheel.rotated("y", 35).moved(reach - 0.01, 0.03)
     part += arm.around(-turn - 360 / arms * np.arange(arms))
-    return part + slab(rectangle(1.2 * half_x, 1.2 * half_z), 0.03).moved(y=height - 0.025)
+    return part + slab(rectangle(1.2 * half_x, 1.2 * half_z), 0.03, y=height - 0.025)
 
 
 @recipe(reach=(0.8, 1.15), thick=(0.02, 0.045), kind=["disc", "tulip", "dome", "cone"])
@@ -189,7 +189,7 @@ def disc(draw: Draw, half_x: float, half_z: float, height: float, *, reach, thic
         profile = [(reach, 0.0), *zip(radius, 0.012 + t * (height - 0.002), strict=True)]
     part = revolve(profile, 20)
     if kind in ("disc", "dome"):
-        part += slab(ellipse(1.2 * half_x, 1.2 * half_z, 16), 0.025).moved(y=height - 0.02)
+        part += slab(ellipse(1.2 * half_x, 1.2 * half_z, 16), 0.025, y=height - 0.02)
     if height > 0.55 and draw.maybe(0.6):
         ring = 0.75 * reach
         y = 0.35 * height
@@ -234,7 +234,10 @@ def loops(
 def cantilever(
     draw: Draw, half_x: float, half_z: float, height: float, *, size, reach, forward, bend
 ) -> Part:
-    """One bent tube: under the seat to the front, down to the floor, to the rear and across. It has no rear legs."""
+    """One bent tube: under the seat to the front, down to the floor, to the rear and across.
+
+    It has no rear legs.
+    """
     low = size / 2
     high = height - 0.3 * size
     foot = [(half_x, low, half_z + forward), (half_x, low, -(half_z * reach))]

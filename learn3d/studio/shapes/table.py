@@ -27,9 +27,8 @@ def _size(draw: Draw) -> tuple[float, float, float]:
 @recipe(thickness=(0.02, 0.07), bevel=[0.1, 0.2, 0.45])
 def _top(draw: Draw, outline: np.ndarray, height: float, *, thickness, bevel) -> tuple[Part, float]:
     """A table top whose upper side is at `height`, and the height of its lower side."""
-    return slab(outline, thickness, bevel * thickness).moved(
-        y=height - thickness
-    ), height - thickness
+    under = height - thickness
+    return slab(outline, thickness, bevel * thickness, under), under
 
 
 def table_with_legs(draw: Draw) -> Part:
@@ -97,7 +96,7 @@ def _pedestal(draw: Draw, reach: float, under: float) -> Part:
     low = draw(0.12, 0.3) * under
     radius = thick * (1 + 0.4 * np.sin(draw(2, 4) * np.pi * t))
     column = revolve(np.c_[radius, 0.5 * low + t * (top - 0.5 * low)], 14)
-    plate = slab(ellipse(reach, reach, 16), 0.03).moved(y=under - 0.025)
+    plate = slab(ellipse(reach, reach, 16), 0.03, y=under - 0.025)
     path = [
         (0, 1.2 * low, 0),
         (0.45 * reach, 1.1 * low, 0),
@@ -176,7 +175,7 @@ def desk(draw: Draw, *, half_x, half_z, height) -> Part:
 def drum_table(draw: Draw, *, width, height, solid) -> Part:
     """A low round table: a solid drum, or a cage of rods between two plates."""
     plate = ellipse(width, width, 32)
-    top = slab(plate, 0.04).moved(y=height - 0.04)
+    top = slab(plate, 0.04, y=height - 0.04)
     if solid:
         waist = (draw(0.3, 0.55) * width, height / 2)
         return top + revolve([(0.45 * width, 0), waist, (0.45 * width, height - 0.02)], 32)

@@ -23,7 +23,7 @@ from learn3d.studio.tables.tables import MEAN, TABLES, Row, Table
 RESAMPLES = 2000
 Cells = list[list[str]]
 Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
-Runs = Sequence[tuple[TrainConfig, Result]]  # measured runs
+MeasuredRuns = Sequence[tuple[TrainConfig, Result]]
 
 NOTES = (
     "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
@@ -104,7 +104,7 @@ def make_report(
 
 
 def _compare_methods(
-    table: Table, rows: Mapping[str, Row], runs: Sequence[TrainConfig], done: Runs
+    table: Table, rows: Mapping[str, Row], runs: Sequence[TrainConfig], done: MeasuredRuns
 ) -> tuple[Cells, Cells]:
     """Printed and measured values of each row by category, and the differences to the table's baseline."""
     measured: dict[tuple[str, str], dict[int, Result]] = {}
@@ -138,7 +138,7 @@ def _compare_methods(
     return main, differences
 
 
-def _run_rows(done: Runs) -> Cells:
+def _run_rows(done: MeasuredRuns) -> Cells:
     """A header, and the measures of each run."""
     rows = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
     for run, result in done:
@@ -155,7 +155,7 @@ def _run_rows(done: Runs) -> Cells:
     return rows
 
 
-def _curve_rows(done: Runs) -> Cells:
+def _curve_rows(done: MeasuredRuns) -> Cells:
     """A header, and the validations of each run."""
     rows = [["run", "split", "step", HEADERS[0], "MMD"]]
     for run, result in done:
@@ -184,7 +184,10 @@ def _general_command(run: TrainConfig) -> str:
 
 
 def _format_printed(printed: Mapping[str, float], column: str, categories: Sequence[str]) -> str:
-    """The paper's figure for a column. Its mean is over the same categories as ours, else in parentheses."""
+    """The paper's figure for a column.
+
+    Its mean is over the same categories as ours, else in parentheses.
+    """
     if column == MEAN and set(categories) != (set(printed) - {MEAN} or set(SYNSETS)):
         if all(name in printed for name in categories):
             return f"{np.mean([printed[name] for name in categories]):.3f}"

@@ -144,7 +144,10 @@ def read_result(path: Path) -> Result:
 
 
 def read_results(runs: Sequence[TrainConfig]) -> dict[Path, Result]:
-    """The stored results of these runs, by folder. Those of other data or another number of iterations are left out."""
+    """The stored results of these runs, by folder.
+
+    Those of other data or another number of iterations are left out.
+    """
     results = {}
     for run in runs:
         if (path := run.output / RESULT_FILE).is_file():

@@ -33,8 +33,8 @@ class Request:
     methods: tuple[str, ...] = ()
     """Methods of the table: labels of rows, or names of variants. If not given: all."""
     iterations: int | None = None
-    """Training steps; methods with a quarter of the batch, such as Plus, take four times as many. If not given: the
-    preset's."""
+    """Training steps; methods with a quarter of the batch, such as Plus, take four times as many.
+    If not given: the preset's."""
     batch_size: int | None = None
     """Images per step; Plus and others take a quarter of it. If not given: the preset's."""
     seeds: int | None = None
@@ -44,10 +44,11 @@ class Request:
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
     threads: int | None = None
-    """CPU threads of each run. If not given: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with --cluster."""
+    """CPU threads of each run. If not given: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with
+    --cluster."""
     set: tuple[str, ...] = ()
-    """Settings and training options to change: NAME=VALUE for all methods that have them, METHOD:NAME=VALUE for one. If
-    not given: none."""
+    """Settings and training options to change: NAME=VALUE for all methods that have them,
+    METHOD:NAME=VALUE for one. If not given: none."""
     workers: Workers = ONE_WORKER
     report_only: bool = False
     """Train nothing: report the runs that are complete."""
@@ -90,7 +91,9 @@ def select_rows(request: Request) -> dict[str, Row]:
 
 
 def plan_runs(request: Request) -> list[TrainConfig]:
-    """The training runs of a request, by category, then row, then seed. Tables that need the same run share its folder.
+    """The training runs of a request, by category, then row, then seed.
+
+    Tables that need the same run share its folder.
 
     Raises ValueError for an unknown method, for a layout without true voxels, and for options
     that do not fit (see `TrainConfig`).

@@ -59,7 +59,7 @@ _FIRST = (
 )
 _NOT_CURVES = {"hollow", "seconds"}
 SECTOR_DEG = 15
-POINTS = 500  # the most points of a curve: every n-th is drawn of a longer one
+CURVE_POINTS = 500  # the most points of a curve: every n-th is drawn of a longer one
 MOST_SHOWN = 100  # images with shapes; each takes some 60 kB
 #: All curves of a run: by split ("train", "val") and name, the value at each step, in the order
 #: of the steps.
@@ -330,7 +330,7 @@ def draw_curves(logs: Sequence[Log]) -> list[dict[str, Any]]:
         keys, key=lambda key: (key[0] == "train", [*_FIRST, key[1]].index(key[1]))
     ):
         lines = [list(log.get((split, name), {}).items()) for log in logs]
-        lines = [line[:: len(line) // POINTS + 1] for line in lines]
+        lines = [line[:: len(line) // CURVE_POINTS + 1] for line in lines]
         plot = {"title": plain(f"{TITLES.get(name, name)}, {split}")}
         plot["steps"] = [[step for step, _ in line] or None for line in lines]
         plot["values"] = [_numbers([value for _, value in line]) for line in lines]

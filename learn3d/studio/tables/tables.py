@@ -22,7 +22,10 @@ BATCH_DIVISOR = 4  # a step of Plus sees a quarter of the other methods' images,
 
 @dataclass(frozen=True)
 class Variant:
-    """A preset with changes. Its name is that of its run folders, so equal names mean the same runs in every table."""
+    """A preset with changes.
+
+    Its name is that of its run folders, so equal names mean the same runs in every table.
+    """
 
     preset: str
     # settings of the method and options of the training
@@ -72,7 +75,7 @@ _SUPERVISION = (
 _SUPERVISION |= {"lambda_smooth": 3e-4, "augment": ("colors",)}
 _SMALL: dict[str, Any] = {"small_batches_of": _PROPOSED}
 #: Widths of the view bins in azimuth and elevation, in degrees.
-BINS = ("60x60", "30x30", "20x20", "20x15", "15x20", "15x15", "10x10")
+BIN_WIDTHS = ("60x60", "30x30", "20x20", "20x15", "15x20", "15x15", "10x10")
 
 #: By name. Without the confusion loss the discriminator has no effect on the encoder, so its own
 #: loss is off, too.
@@ -88,7 +91,10 @@ VARIANTS: dict[str, Variant] = {
         _PROPOSED, {"lambda_adversarial": 0.0, "lambda_classification": 0.0}
     ),
     "without-smoothness": Variant(_PROPOSED, {"lambda_smooth": 0.0}),
-    **{f"bins-{widths}": Variant("peng2020-kar", {"view_bins": widths}, "best") for widths in BINS},
+    **{
+        f"bins-{widths}": Variant("peng2020-kar", {"view_bins": widths}, "best")
+        for widths in BIN_WIDTHS
+    },
     "kar-vanilla": Variant("peng2020-kar-vanilla", checkpoint="best"),
     "kar-vpl": Variant("kato2019-kar", checkpoint="best"),
     "kar-plus": Variant("plus-kar", checkpoint="best", small_batches_of="peng2020-kar"),

@@ -16,7 +16,10 @@ from learn3d.terminal import note
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """A trained method and the data on which figures show it. Runs on the same data share one `dataset`."""
+    """A trained method and the data on which figures show it.
+
+    Runs on the same data share one `dataset`.
+    """
 
     label: str
     method: Method  # in evaluation mode

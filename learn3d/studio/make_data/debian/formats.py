@@ -1,4 +1,7 @@
-"""Reads AC3D, the format of FlightGear's models, which trimesh does not read. Positions and triangles only."""
+"""Reads AC3D, the format of FlightGear's models, which trimesh does not read.
+
+Positions and triangles only.
+"""
 
 from collections.abc import Callable, Iterator
 
@@ -35,7 +38,10 @@ def _read_objects(
     translation: np.ndarray,
     skip: Callable[[str], object],
 ) -> Iterator[RawMesh]:
-    """The next `count` objects with their children. The parent's frame is v @ rotation [3, 3] + translation [3]."""
+    """The next `count` objects with their children.
+
+    The parent's frame is v @ rotation [3, 3] + translation [3].
+    """
     for _ in range(count):
         if not any(line.startswith("OBJECT") for line in lines):
             return

@@ -25,7 +25,7 @@ from learn3d.studio.make_data.debian.packages import PACKAGES
 from learn3d.studio.make_data.meshes import check, fit_to_box
 from learn3d.terminal import is_watched, note
 
-CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
+PACKAGED = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side of the grids that are compared to find duplicates
 MAX_SAMPLES = 2_000_000  # surface points in memory at a time
 DUPLICATE_IOU = 0.85  # two models whose surface grids have a larger IoU are duplicates
@@ -35,7 +35,7 @@ INDEX += ("vertices", "faces", "watertight")
 
 
 @dataclass
-class Report:
+class FetchReport:
     """The outcome of `fetch_debian_models`."""
 
     models: list[dict] = field(default_factory=list)  # rows of index.csv, one for each mesh
@@ -53,19 +53,19 @@ class Report:
         )
 
 
-def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Report:
+def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> FetchReport:
     """Write the meshes into the folder `output`, which appears when it is complete.
 
     packages_dir: folder of the .deb files, into which missing ones are downloaded (default: a
     temporary folder). The report lists unreadable models and duplicates. Raises ValueError if the
     output exists, or if a package is missing or damaged.
     """
-    output, report = output.resolve(), Report()
+    output, report = output.resolve(), FetchReport()
     if output.exists():
         raise ValueError(f"{output} already exists; remove it, or give another folder")
     output.parent.mkdir(parents=True, exist_ok=True)
     with publishing(output.parent, [output.name]) as scratch:
-        folder, kept = scratch / output.name, {category: {} for category in CATEGORIES}
+        folder, kept = scratch / output.name, {category: {} for category in PACKAGED}
         (folder / "licences").mkdir(parents=True)
         for name, find_models in PACKAGES.items():
             try:
@@ -91,7 +91,7 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Repor
                     )
                 except ValueError as reason:
                     report.dropped[facts["source"]] = str(reason)
-        report.models.sort(key=lambda row: (CATEGORIES.index(row["category"]), row["file"]))
+        report.models.sort(key=lambda row: (PACKAGED.index(row["category"]), row["file"]))
         with (folder / "index.csv").open("w", newline="", encoding="utf-8") as file:
             rows = [[row[column] for column in INDEX] for row in report.models]
             csv.writer(file, lineterminator="\n").writerows([INDEX, *rows])
@@ -99,7 +99,9 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Repor
 
 
 def get_package(name: str, folder: Path) -> Path:
-    """The .deb file of a package in `folder`. If it is missing, apt-get downloads it, which needs no root rights.
+    """The .deb file of a package in `folder`.
+
+    If it is missing, apt-get downloads it, which needs no root rights.
 
     Raises ValueError if apt-get fails, OSError if it is not installed.
     """

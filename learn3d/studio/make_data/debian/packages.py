@@ -22,7 +22,7 @@ from nmr.obj import read_obj
 
 #: Facts about a model of a package, which are columns of index.csv, with `stem`, the file name to
 #: use without suffix; and a function that reads it (y up, front +z), or raises ValueError.
-Model = tuple[dict[str, str], Callable[[], RawMesh]]
+PackagedModel = tuple[dict[str, str], Callable[[], RawMesh]]
 
 # The first pattern found in an entry's English name, in lower case, gives its category; None
 # skips the entry.
@@ -96,7 +96,7 @@ def place_furniture(vertices: np.ndarray, entry: Mapping[str, str]) -> np.ndarra
     return vertices
 
 
-def furniture_models(files: Mapping[str, bytes]) -> Iterator[Model]:
+def furniture_models(files: Mapping[str, bytes]) -> Iterator[PackagedModel]:
     """The pieces of furniture of every catalogue of a package, by catalogue and entry number."""
     for path in sorted(path for path in files if path.endswith(".sh3f")):
         archive, catalogue = zipfile.ZipFile(io.BytesIO(files[path])), PurePosixPath(path)
@@ -184,7 +184,7 @@ def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:
     ]
 
 
-def aircraft_models(files: Mapping[str, bytes]) -> Iterator[Model]:
+def aircraft_models(files: Mapping[str, bytes]) -> Iterator[PackagedModel]:
     """The airplanes among the files of the package, by path."""
     texts = {
         p.removeprefix(AIRCRAFT): text.decode("latin-1")

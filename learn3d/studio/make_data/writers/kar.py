@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import nmr
 from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import KAR as KAR_AXES
+from learn3d.data.conventions import KAR
 from learn3d.data.dataset import DEPTH_REACH
 from learn3d.data.readers.kar import read_splits
 from learn3d.files.writing import write_json
@@ -28,8 +28,8 @@ def _write_kar(objects: Iterable[RenderedObject], category: str, root: Path, out
     rotation as quat (w, x, y, z). extrinsic takes ShapeNet's coordinates (right-handed, y up,
     front x) to x right, y down, z away. The published code reads neither extrinsic nor quat.
     """
-    renders, volumes = (root / path for path in KAR.paths(category))
-    size, lists = KAR.image_size, {split: [] for split in SPLITS}
+    renders, volumes = (root / path for path in KAR_WRITER.paths(category))
+    size, lists = KAR_WRITER.image_size, {split: [] for split in SPLITS}
     focal = size / 2 / np.tan(np.deg2rad(KAR_HALF_FOV_DEG))
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     for item in objects:
@@ -67,7 +67,7 @@ def _write_mat(path: Path, **arrays: np.ndarray) -> None:
 
 
 #: The distances of Kar's own files are not published; here objects fill about as much of the image.
-KAR = Writer(
+KAR_WRITER = Writer(
     paths=lambda category: (
         f"renders/{synset_of(category)}",
         f"voxels/modelVoxels32/{synset_of(category)}",
@@ -76,6 +76,6 @@ KAR = Writer(
     views=functools.partial(random_views, (-20.0, 40.0), KAR_HALF_FOV_DEG),
     image_size=224,
     default_views=20,
-    convention=KAR_AXES,
+    convention=KAR,
     shared=("splits.json",),
 )

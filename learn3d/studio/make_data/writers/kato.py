@@ -45,7 +45,7 @@ def _voxels(objects: Sequence[RenderedObject]) -> np.ndarray:
     return np.array([item.voxels for item in objects], bool).reshape(-1, 32, 32, 32)
 
 
-KATO = Writer(
+KATO_WRITER = Writer(
     paths=lambda category: tuple(
         path.name for split in SPLITS for path in kato.split_paths("", category, split)
     ),
@@ -79,7 +79,7 @@ def _join_around(objects: Sequence[RenderedObject], category: str, split: str) -
 
 
 #: See `learn3d.data.readers.around`.
-AROUND = Writer(
+AROUND_WRITER = Writer(
     join=_join_around,
     default_views=12,
     views=functools.partial(random_views, (-10.0, 60.0), (7.0, 20.0)),

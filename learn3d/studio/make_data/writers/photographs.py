@@ -46,7 +46,9 @@ def _write_pascal3d(
         raise ValueError(
             "the layout pascal3d needs two pictures or more for training; give more meshes or views"
         )
-    for path, part in zip(PASCAL3D.paths(category), (rows[::2], rows[1::2], val_rows), strict=True):
+    for path, part in zip(
+        PASCAL3D_WRITER.paths(category), (rows[::2], rows[1::2], val_rows), strict=True
+    ):
         if part:
             images = np.empty(len(part), dtype=object)
             images[:] = [row.pop("images") for row in part]
@@ -72,7 +74,10 @@ def _pascal3d_views(vertices: np.ndarray, count: int, rng: np.random.Generator) 
 
 
 def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Paste a rendering [224, 224, 4] into a photograph. Returns its images, images_ref and bounding_boxes entries."""
+    """Paste a rendering [224, 224, 4] into a photograph.
+
+    Returns its images, images_ref and bounding_boxes entries.
+    """
     height, width = int(rng.integers(*HEIGHTS)), int(rng.integers(*WIDTHS))
     side = int(rng.uniform(*SHARES) * min(height, width))
     small = Image.fromarray(rgba).resize((side, side), Image.Resampling.BICUBIC)
@@ -99,7 +104,7 @@ def _photograph(rgba: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndar
 #: y up, z to the left as seen from the front. Objects are symmetric about z = 0, as the symmetric
 #: generator requires. Half the diagonal of the bounding box is 1, so that a rotated object stays
 #: in [-1, 1].
-PASCAL3D = Writer(
+PASCAL3D_WRITER = Writer(
     paths=lambda category: tuple(
         f"{pascal3d.class_name(category)}_{n}.npz" for n in ("train", "imagenet", "val")
     ),
@@ -118,7 +123,7 @@ PASCAL3D = Writer(
 
 def _write_photos(objects: Iterable[RenderedObject], category: str, root: Path, _: Path) -> None:
     """Write objects on out-of-focus backgrounds as RGB images, with anti-aliased masks and `poses.csv`; no voxels."""
-    folder, size = root / category, PHOTOS.image_size
+    folder, size = root / category, PHOTOS_WRITER.image_size
     folder.mkdir()
     table = [("file", "azimuth_deg", "elevation_deg", "distance", "fov_deg", "object", "split")]
     for item in objects:
@@ -136,7 +141,7 @@ def _write_photos(objects: Iterable[RenderedObject], category: str, root: Path, 
         csv.writer(file, lineterminator="\n").writerows(table)
 
 
-PHOTOS = Writer(
+PHOTOS_WRITER = Writer(
     paths=lambda category: (category,),
     write=_write_photos,
     views=functools.partial(

@@ -142,17 +142,17 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
         (7, 0.1, [7, 12, 97]),
         (0.01, 0, [4, 0, 112]),
     ):
-        splits = meshes.split_objects(116, test, val, 0)
+        splits = meshes.split_meshes(116, test, val, 0)
         assert [len(splits[s]) for s in ("test", "val", "train")] == sizes
         np.testing.assert_array_equal(
             np.concatenate([splits[s] for s in ("test", "val", "train")]), order
         )
     for count in (1, 2, 3, 7, 39):
-        small = meshes.split_objects(count, 0.2, 0.1, 0)  # the defaults leave something to train on
+        small = meshes.split_meshes(count, 0.2, 0.1, 0)  # the defaults leave something to train on
         assert len(small["train"]) >= max(1, count // 3)
         assert min(len(small["test"]), len(small["val"])) >= min(4, count // 3)
     with pytest.raises(ValueError, match="leave none of the 10 meshes to train on"):
-        meshes.split_objects(10, 6, 4, 0)
+        meshes.split_meshes(10, 6, 4, 0)
 
 
 @pytest.mark.parametrize(

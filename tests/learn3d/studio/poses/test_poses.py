@@ -17,7 +17,7 @@ from learn3d.methods.pose_updates import SIZE
 from learn3d.pictures.sheets import HEADER, MARGIN
 from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import (
-    Candidates,
+    CandidatePoses,
     Estimate,
     Masks,
     PoseOptions,
@@ -25,7 +25,7 @@ from learn3d.studio.poses.estimate import (
     _peak_votes,
     _turns,
 )
-from learn3d.studio.poses.sheet import COLUMNS, TILE, draw_pose_sheet
+from learn3d.studio.poses.sheet import COLUMNS, PICTURE_SIZE, draw_pose_sheet
 from learn3d.studio.poses.views import (
     CameraOptions,
     EstimatedViews,
@@ -156,7 +156,7 @@ def test_ambiguous_poses_get_low_confidence() -> None:
 
 
 def test_the_sheet_turns_images_and_prototypes_alike(tiny_set: ViewDataset) -> None:
-    count, step = len(tiny_set), TILE + MARGIN
+    count, step = len(tiny_set), PICTURE_SIZE + MARGIN
     azimuth, *others = (np.full((count, 1), value, np.float32) for value in (0, 30, 1))
     azimuth[:, 0] = 30 * (np.arange(count) % 12) - 180
     table = PoseTable(
@@ -167,10 +167,10 @@ def test_the_sheet_turns_images_and_prototypes_alike(tiny_set: ViewDataset) -> N
     estimate = Estimate(
         torch.ones(count, 24, 1), torch.ones(count), shape[None], faces, torch.ones(1), 1.0
     )
-    candidates = Candidates(torch.arange(24) * 15.0, torch.tensor([30.0]), 2.7, 15.0)
+    candidates = CandidatePoses(torch.arange(24) * 15.0, torch.tensor([30.0]), 2.7, 15.0)
     views = EstimatedViews((tiny_set,), torch.arange(count), candidates, estimate, table)
     before, after = (
         draw_pose_sheet(views, offset)[HEADER:, -COLUMNS * step :] for offset in (0.0, 90.0)
     )
     assert np.array_equal(after, np.roll(before, 3 * step, axis=1))
-    assert not np.array_equal(after[:TILE], before[:TILE])
+    assert not np.array_equal(after[:PICTURE_SIZE], before[:PICTURE_SIZE])

@@ -32,7 +32,7 @@ from learn3d.studio.tables.experiment import (
     train_and_test,
 )
 from learn3d.studio.tables.plan import Request, name_run, plan_runs, variant_of
-from learn3d.studio.tables.tables import BINS, TABLES, VARIANTS
+from learn3d.studio.tables.tables import BIN_WIDTHS, TABLES, VARIANTS
 from learn3d.tasks import Workers
 
 
@@ -51,7 +51,7 @@ def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
     )
     assert (run.seed, run.iterations, run.batch_size) == (1, 20_000, 128)
     bins = plan_runs(Request("bins", tmp_path, tmp_path, category="chair"))
-    assert [(run.view_bins, run.layout) for run in bins] == [(width, "kar") for width in BINS]
+    assert [(run.view_bins, run.layout) for run in bins] == [(width, "kar") for width in BIN_WIDTHS]
 
 
 def test_only_named_settings_differ_from_the_preset(tmp_path, request_for) -> None:
