@@ -1,14 +1,18 @@
-"""Comparing the folders of two training runs."""
+"""Disturbing training runs, and comparing the folders of two."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
-from learn3d.data.dataset import DatasetInfo
+from learn3d import training
+from learn3d.data.dataset import Batch, DatasetInfo
+from learn3d.methods.method import Method
 from learn3d.presets import configure
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
@@ -21,8 +25,7 @@ def check_same(folder: Path, other: Path) -> None:
         (ours, about), (theirs, about_other) = (
             checkpoint.load(f / f"{name}.safetensors") for f in (folder, other)
         )
-        assert ours.keys() == theirs.keys()
-        assert [key for key in ours if not same_bits(ours[key], theirs[key])] == []
+        same_tensors(ours, theirs)
         described = []
         for values in map(dataclasses.asdict, (about, about_other)):
             del values["progress"]["seconds"], values["config"]["output"]
@@ -47,5 +50,23 @@ def metadata(step: int = 3, **changes: Any) -> Metadata:
     return dataclasses.replace(about, **changes)
 
 
+def same_tensors(ours: dict[str, torch.Tensor], theirs: dict[str, torch.Tensor]) -> None:
+    """Two checkpoints have the same tensors, to the bit."""
+    assert ours.keys() == theirs.keys()
+    assert [name for name in ours if not same_bits(ours[name], theirs[name])] == []
+
+
 def same_bits(a: torch.Tensor, b: torch.Tensor) -> bool:
     return a.dtype == b.dtype and a.shape == b.shape and a.numpy().tobytes() == b.numpy().tobytes()
+
+
+def before_step(patch: pytest.MonkeyPatch, step: int, action: Callable[[], object]) -> None:
+    """Let something happen before a training step, once."""
+    take_step, left = training.take_step, [action]
+
+    def act_and_step(method: Method, batch: Batch, now: int) -> dict[str, float]:
+        if now == step and left:
+            left.pop()()
+        return take_step(method, batch, now)
+
+    patch.setattr(training, "take_step", act_and_step)

@@ -12,6 +12,12 @@ from learn3d.presets import PRESETS
 
 INFO = DatasetInfo(24, inverted=False)
 TINY = {"encoder": "conv-small", "generator": "sphere-small"}
+TINY_VPL = {"generator": "sphere-small", "discriminator_channels": 2}
+TINY_PRGAN = {
+    "encoder_from_step": 3,
+    "generator_channels": (2, 2, 2, 1),
+    "discriminator_channels": (2, 2, 2, 2),
+}
 
 
 def make_method(

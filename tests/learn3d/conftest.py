@@ -19,8 +19,6 @@ from learn3d.config import TrainConfig
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.methods.pose_invariant import PoseInvariantSettings
-from learn3d.networks.encoders import ENCODERS
-from learn3d.networks.generators import GENERATORS
 from learn3d.presets import PRESETS, configure, full_name
 from learn3d.tasks import Workers
 from learn3d.training import train
@@ -112,10 +110,9 @@ def finished_run(
 
 @pytest.fixture(scope="module")
 def tiny_names() -> Iterator[None]:
-    """The names conv-small and sphere-small mean the networks of `tiny_networks`."""
+    """The names conv, conv-small and sphere-small mean the networks of `tiny_networks`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ENCODERS, "conv-small", tiny_networks.TinyEncoder)
-        patch.setitem(GENERATORS, "sphere-small", tiny_networks.TinyGenerator)
+        tiny_networks.put_in_place(patch)
         yield
 
 

@@ -22,13 +22,14 @@ from learn3d.losses import (
 from learn3d.networks.discriminators import pose_discriminator
 
 
+def vector(name: str) -> dict[str, Tensor]:
+    arrays = load_vector(name).items()
+    return {key: torch.from_numpy(a) for key, a in arrays if a.dtype.kind in "fi"}
+
+
 @pytest.fixture(scope="module")
 def case() -> dict[str, Tensor]:
-    return {
-        k: torch.from_numpy(v)
-        for k, v in load_vector("loss_adversarial").items()
-        if v.dtype.kind in "fi"
-    }
+    return vector("loss_adversarial")
 
 
 @pytest.fixture
@@ -92,12 +93,12 @@ def test_prior_of_zero_codes_has_the_gradient_zero(form: str) -> None:
 
 def test_low_precision_inputs_give_float32_losses() -> None:
     logits, codes = torch.randn(2, 24).bfloat16(), torch.randn(2, 8).bfloat16()
-    losses = [
+    for loss in (
         domain_confusion_loss(logits, "log"),
         pose_classification_loss(logits, torch.tensor([0, 5])),
-    ]
-    losses += [gaussian_prior_loss(codes, "norm")]
-    assert all(loss.dtype == torch.float32 for loss in losses)
+        gaussian_prior_loss(codes, "norm"),
+    ):
+        assert loss.dtype == torch.float32
 
 
 def squared_distances(x: Tensor, y: Tensor) -> Tensor:
@@ -111,35 +112,25 @@ def mmd_of_views(x: Tensor, y: Tensor, name: str = "mmd") -> float:
 
 
 def test_mmd_vectors() -> None:
-    case = {
-        k: torch.from_numpy(v) for k, v in load_vector("loss_mmd").items() if v.dtype.kind == "f"
-    }
-    source = case["source"].clone().requires_grad_()
-    target = case["target"].clone().requires_grad_()
-    value = mmd(
-        *(
-            squared_distances(*pair)
-            for pair in ((source, source), (target, target), (source, target))
-        )
-    )
+    case = vector("loss_mmd")
+    source, target = (case[name].clone().requires_grad_() for name in ("source", "target"))
+    pairs = ((source, source), (target, target), (source, target))
+    value = mmd(*(squared_distances(*pair) for pair in pairs))
     value.backward()
     close(value, case["mmd"])
-    assert mmd_of_views(source.detach(), target.detach()) == pytest.approx(
-        float(case["mmd"]), rel=1e-5
-    )
     close(source.grad, case["grad_source"], 1e-5)
     close(target.grad, case["grad_target"], 1e-5)
-    assert mmd_of_views(source.detach(), source.detach()) == pytest.approx(
-        float(case["mmd_same"]), abs=1e-6
-    )
+    different = mmd_of_views(case["source"], case["target"])
+    assert different == pytest.approx(float(case["mmd"]), rel=1e-5)
+    same = mmd_of_views(case["source"], case["source"])
+    assert same == pytest.approx(float(case["mmd_same"]), abs=1e-6)
 
 
 def test_mmd_as_printed_equals_its_double_sum() -> None:
     generator = torch.Generator().manual_seed(0)
     x, y = torch.randn(5, 3, generator=generator), torch.randn(5, 3, generator=generator) + 1
-    bandwidth = sum(
-        (a - b).square().sum() for a, b in itertools.permutations(torch.cat([x, y]), 2)
-    ) / (10 * 9)
+    both = torch.cat([x, y])
+    bandwidth = squared_distances(both, both).sum() / (10 * 9)
 
     def mean_kernel(p: Tensor, q: Tensor) -> Tensor:
         return sum(torch.exp(-(a - b).square().sum() / bandwidth) for a in p for b in q) / 25
@@ -167,9 +158,8 @@ def test_silhouette_pyramid_equals_its_sum() -> None:
 
 
 def test_silhouette_pyramid_of_equal_and_of_empty_images() -> None:
-    disc = ((torch.arange(64) - 32)[:, None] ** 2 + (torch.arange(64) - 32) ** 2 < 300).float()[
-        None
-    ]
+    x = torch.arange(64) - 32
+    disc = (x[:, None] ** 2 + x**2 < 300).float()[None]
     empty = torch.zeros(1, 64, 64, requires_grad=True)
     # the grey does not count
     assert float(silhouette_pyramid_loss(disc / 2, disc)) == pytest.approx(0, abs=1e-10)
@@ -191,9 +181,8 @@ def test_energy_distance_equals_its_sum() -> None:
     within = torch.stack([distance(p, q) for p, q in itertools.permutations(drawn, 2)]).mean()
     found, wanted = silhouette_energy_distance(drawn, real), 2 * across - within
     torch.testing.assert_close(found, wanted)
-    torch.testing.assert_close(
-        *(torch.autograd.grad(value, drawn, retain_graph=True) for value in (found, wanted))
-    )
+    gradients = [torch.autograd.grad(value, drawn, retain_graph=True) for value in (found, wanted)]
+    torch.testing.assert_close(*gradients)
 
 
 def test_energy_distance_is_least_for_the_same_distribution() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from shapenet_files import box_mesh
 
 import nmr
 from learn3d.data.framing import frame, read_photo
@@ -17,17 +18,11 @@ from learn3d.data.masks import mask_box
 def silhouette(size: int) -> np.ndarray:
     """A box of sides 0.5, 1, 0.7 with its centre at the origin, uint8 [size, size]."""
     camera = nmr.LookAt.from_angles([2.5], [25.0], [40.0], half_fov_deg=24.0)
-    corners = torch.tensor(
-        [[x, y, z] for x in (-0.25, 0.25) for y in (-0.5, 0.5) for z in (-0.35, 0.35)]
+    vertices, faces = map(
+        torch.from_numpy, box_mesh(np.array([[[-0.25, -0.5, -0.35], [0.25, 0.5, 0.35]]]))
     )
-    quads = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
-    faces = torch.tensor([triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))])
-    return (
-        (255 * nmr.render_silhouette(corners, faces, camera, image_size=size)[0])
-        .round()
-        .byte()
-        .numpy()
-    )
+    drawn = nmr.render_silhouette(vertices.float(), faces, camera, image_size=size)[0]
+    return (255 * drawn).round().byte().numpy()
 
 
 def gray(mask: np.ndarray, value: int = 200) -> np.ndarray:

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 import torch
+from mirrors import reflected
 
 import nmr
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.poses import RotationPoses
 from learn3d.data.readers import kato
-
-
-def reflected(vertices: torch.Tensor, azimuth_deg: float) -> torch.Tensor:
-    """Mirrored at the vertical plane that a camera of this azimuth, at (sin a, -cos a) in x and z, looks along."""
-    angle = math.radians(azimuth_deg)
-    normal = torch.tensor([math.cos(angle), 0.0, math.sin(angle)])
-    return vertices - 2 * (vertices @ normal)[:, None] * normal
 
 
 def triangles_seen(plane: float | None, objects: int) -> ViewDataset:

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from runs import before_step, same_tensors
+from steps import TINY, TINY_VPL
 
-from learn3d import training
 from learn3d.config import TrainConfig
-from learn3d.data.dataset import Batch, ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.layouts import load_dataset
 from learn3d.data.pose_table import PoseTable, fingerprints
 from learn3d.data.poses import LookAtPoses, PoseCandidates
@@ -21,7 +22,6 @@ from learn3d.data.sampling import batches
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.files.reading import DamagedFile
 from learn3d.methods.plus import Plus
-from learn3d.presets import configure
 from learn3d.runs import checkpoint, measurement
 from learn3d.training import train
 
@@ -71,15 +71,13 @@ def test_a_table_is_read_as_written_and_matched_by_image(
 def test_a_hostile_table_is_refused(
     tmp_path: Path, tiny_set: ViewDataset, change: dict[str, np.ndarray | None], message: str
 ) -> None:
-    arrays = {
-        name: a for name, a in (vars(random_table(tiny_set)) | change).items() if a is not None
-    }
-    np.savez(tmp_path / "poses.npz", **arrays)
+    arrays = vars(random_table(tiny_set)) | change
+    np.savez(tmp_path / "poses.npz", **{k: a for k, a in arrays.items() if a is not None})
     with pytest.raises(DamagedFile, match=rf"poses.npz: .*{message}"):
         PoseTable.read(tmp_path / "poses.npz")
 
 
-def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
+def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset, tiny_config) -> None:
     """By (seed, step) alone, pose and class together."""
     count = len(tiny_set)
     poses = LookAtPoses(torch.arange(2.0 * count), 30.0, 2.7, 15.0)
@@ -92,10 +90,8 @@ def test_candidates_are_drawn_by_their_weights(tiny_set: ViewDataset) -> None:
         assert np.array_equal(view_ids, drawn.azimuth_deg.long() % 24)
         second.append((drawn.azimuth_deg % 2).mean())
     assert abs(np.mean(second) - 0.25) < 0.02
-    options = configure(
-        data=Path("."), category="x", output=Path("."), batch_size=8, iterations=2, augment=()
-    )
-    assert all((b.poses.azimuth_deg % 2).sum() < 8 for b in batches(dataset, options))
+    config = tiny_config(Path("."), batch_size=8, iterations=2, augment=())
+    assert all((b.poses.azimuth_deg % 2).sum() < 8 for b in batches(dataset, config))
 
 
 @pytest.fixture
@@ -119,22 +115,14 @@ def test_weights_of_poses_survive_a_stop(
     """Reweighted after the steps 1 and 3, stopped after step 4."""
     options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2}
     assert train(tiny_config(tmp_path / "whole", **options)).finished
-    take_step = training.take_step
-
-    def stop(method: Plus, batch: Batch, step: int) -> dict[str, float]:
-        if step == 4:
-            signal.raise_signal(signal.SIGINT)
-        return take_step(method, batch, step)
-
     with monkeypatch.context() as patch:
-        patch.setattr(training, "take_step", stop)
+        before_step(patch, 4, lambda: signal.raise_signal(signal.SIGINT))
         assert not train(tiny_config(tmp_path / "stopped", **options)).finished
     assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
     whole, stopped = (
         checkpoint.load(tmp_path / name / "last.safetensors")[0] for name in ("whole", "stopped")
     )
-    assert whole.keys() == stopped.keys()
-    assert all(torch.equal(whole[name], stopped[name]) for name in whole)
+    same_tensors(whole, stopped)
     weights = whole["poses.weights"]
     assert not np.array_equal(weights, PoseTable.read(table).weights[: len(weights)])
 
@@ -159,10 +147,10 @@ def test_a_run_is_measured_with_its_poses_on_its_own_data(
     assert measured == [True, False]
 
 
-@pytest.mark.parametrize(
-    "preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vanilla", "peng2020-kato-vpl"]
-)
+@pytest.mark.parametrize("preset", ["plus-kato", "peng2020-kato", "peng2020-kato-vpl"])
 def test_methods_learn_from_a_table(
-    preset: str, table: Path, run_folder: Path, tiny_config: Callable[..., TrainConfig]
+    preset: str, table: Path, tiny_names, run_folder: Path, tiny_config: Callable[..., TrainConfig]
 ) -> None:
-    assert train(tiny_config(run_folder, preset=preset, iterations=2, poses=table)).finished
+    networks = TINY_VPL if preset == "peng2020-kato-vpl" else TINY
+    config = tiny_config(run_folder, preset=preset, iterations=2, poses=table, **networks)
+    assert train(config).finished

@@ -15,7 +15,7 @@ import pytest
 import stub_work
 import torch
 from reader_checks import problems
-from runs import same_bits
+from runs import same_tensors
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -38,18 +38,15 @@ def small_shards(monkeypatch):
 
 def same_networks(folder, other) -> None:
     """Weights, optimizers and random state of two runs agree to the bit."""
-    (ours, _), (theirs, _) = (checkpoint.load(f / "last.safetensors") for f in (folder, other))
-    assert ours.keys() == theirs.keys()
-    assert [key for key in ours if not same_bits(ours[key], theirs[key])] == []
+    same_tensors(*(checkpoint.load(f / "last.safetensors")[0] for f in (folder, other)))
 
 
 @pytest.fixture
 def stored(tiny_folder, tmp_path, command, small_shards):
     """The tiny data set in shards."""
-    assert (
-        command("convert-dataset", "--data", tiny_folder, "--output", tmp_path / "shards")[0] == 0
-    )
-    return tmp_path / "shards"
+    output = tmp_path / "shards"
+    assert command("convert-dataset", "--data", tiny_folder, "--output", output)[0] == 0
+    return output
 
 
 @pytest.mark.parametrize(
@@ -88,9 +85,19 @@ def shard_file(stored: Path, number: int = 0, split: str = "train") -> Path:
     return shards.shard_path(stored / "02691156" / split, number)
 
 
-def flip_byte(path: Path, at: int) -> None:
+def set_file(stored: Path) -> Path:
+    return stored / "02691156" / "train" / shards.SET_FILE
+
+
+def change_set_file(stored: Path, **changes: int) -> None:
+    path = set_file(stored)
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def flip_bit(path: Path, name: str) -> None:
+    """Change a tensor of a shard."""
     content = bytearray(path.read_bytes())
-    content[at] ^= 1
+    content[content.index(load_file(path)[name].tobytes()) + 9] ^= 1
     path.write_bytes(content)
 
 
@@ -119,9 +126,7 @@ def test_shards_that_are_missing_or_too_many_are_refused(stored, tiny_folder, co
     with pytest.raises(ValueError, match="the split needs 3 shards, but has 4"):
         load_dataset("kato", stored, "airplane", "train")
     (mine := other.with_name("photograph.png")).write_bytes(b"mine")
-    (
-        stored / "02691156" / "train" / shards.SET_FILE
-    ).unlink()  # as an unfinished conversion leaves it
+    set_file(stored).unlink()  # as an unfinished conversion leaves it
     assert command("convert-dataset", "--data", tiny_folder, "--output", stored)[0] == 0
     assert mine.read_bytes() == b"mine" and not other.exists(), "only shards are removed"
     assert load_dataset("kato", stored, "airplane", "train").num_objects == 3
@@ -138,13 +143,9 @@ def rewrite(stored: Path, **changes) -> Path:
     path = shard_file(stored)
     with safe_open(path, "np") as file:
         metadata = json.loads(file.metadata()["shard"])
-    arrays = {
-        name: value for name, value in (load_file(path) | changes).items() if value is not None
-    }
+    arrays = {name: a for name, a in (load_file(path) | changes).items() if a is not None}
     for name in {"images", "voxels"} & changes.keys() & arrays.keys():
-        arrays[f"{name}.checksums"] = np.array(
-            [zlib.crc32(row) for row in changes[name]], np.uint32
-        )
+        arrays[f"{name}.checksums"] = np.uint32([zlib.crc32(row) for row in changes[name]])
     tables = {name: arrays[name] for name in arrays if name not in ("images", "voxels")}
     metadata["crc"] = shards._crc(metadata["objects"], tables)
     save_file(arrays, path, {"shard": json.dumps(metadata)})
@@ -173,13 +174,7 @@ def test_impossible_tables_are_refused(stored, changes, message) -> None:
 
 def test_shards_of_other_arrays_are_refused(stored) -> None:
     rewrite(stored, voxels=None, **{"voxels.checksums": None})
-    with pytest.raises(
-        DamagedFile, match=r"train: has shards that differ \(voxels of different kinds"
-    ):
-        load_dataset("kato", stored, "airplane", "train")
-    assert [p.path for p in problems("kato", stored, "train", "airplane")] == [
-        str(shard_file(stored).parent)
-    ]
+    expect(stored, shard_file(stored).parent, "has shards that differ (voxels of different kinds")
 
 
 def test_bools_other_than_0_and_1_are_refused(stored) -> None:
@@ -190,7 +185,7 @@ def test_bools_other_than_0_and_1_are_refused(stored) -> None:
 
 def test_a_changed_pixel_is_not_trained_on(stored, tiny_config, tmp_path, command) -> None:
     path = shard_file(stored)
-    flip_byte(path, path.read_bytes().index(load_file(path)["images"].tobytes()) + 9)
+    flip_bit(path, "images")
     with pytest.raises(DamagedFile, match=f"{path}: cannot be used any more .* another CRC-32"):
         train(dataclasses.replace(tiny_config(tmp_path / "run", iterations=18), data=stored))
     status, out, _ = command("check-dataset", stored)
@@ -199,7 +194,7 @@ def test_a_changed_pixel_is_not_trained_on(stored, tiny_config, tmp_path, comman
 
 def test_a_changed_table_is_refused(stored) -> None:
     path = shard_file(stored)
-    flip_byte(path, path.read_bytes().index(load_file(path)["azimuth_deg"].tobytes()) + 9)
+    flip_bit(path, "azimuth_deg")
     expect(stored, path, "another CRC-32")
 
 
@@ -214,8 +209,7 @@ def test_a_shard_that_changed_after_a_kill_is_noticed(stored, tiny_config, tmp_p
 
 
 def test_a_set_that_claims_a_million_shards_is_refused_at_once(stored) -> None:
-    path = stored / "02691156" / "train" / "set.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "shards": 10**6}))
+    change_set_file(stored, shards=10**6)
     began = time.process_time()
     expect(stored, shard_file(stored, 3), "the split needs 1000000 shards, but has 3")
     assert time.process_time() - began < 2
@@ -226,23 +220,19 @@ def test_a_file_that_is_cut_short_later_is_an_error(stored) -> None:
     path = shard_file(stored)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(
-        DamagedFile, match=r"00000\.safetensors: cannot be used any more \(it ends early\)"
+        DamagedFile, match=r"0\.safetensors: cannot be used any more \(it ends early"
     ):
         dataset.batch(torch.tensor([0, 1]))
 
 
 def test_another_layout_or_set_file(stored) -> None:
-    with pytest.raises(
-        ValueError,
-        match="has images of 64 pixels in the layout 'kato', expected 64 pixels in 'kar'",
-    ):
+    with pytest.raises(ValueError, match="in the layout 'kato', expected 64 pixels in 'kar'"):
         shards.load(stored, "airplane", "train", layout="kar")
     with pytest.raises(ValueError, match=r"expected 224 pixels in 'kato'; .* another --image-size"):
         shards.load(stored, "airplane", "train", layout="kato", image_size=224)
     assert all(split.count("error") == 1 for split in check_folder("kar", stored))
     assert sum(split.count("error") for split in check_folder("kato", stored)) == 0
-    path = stored / "02691156" / "train" / "set.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "shards": 0}))
+    change_set_file(stored, shards=0)
     with pytest.raises(DamagedFile, match=r"set\.json: is no description of shards \(shards must "):
         load_dataset("kato", stored, "airplane", "train")
 

@@ -10,13 +10,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from steps import TINY, make_method
 
 from learn3d.data.dataset import Batch
 from learn3d.data.readers import kato
 from learn3d.losses import domain_confusion_loss, pose_classification_loss
-from learn3d.methods import create_method
 from learn3d.methods.pose_invariant import PoseInvariant
-from learn3d.presets import PRESETS
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
 from learn3d.training import take_step
 
@@ -49,11 +48,8 @@ def confusion(method: PoseInvariant, batch: Batch) -> float:
 def test_pose_confusion_takes_the_view_out_of_the_codes(
     dataset: kato.ViewDataset, weight: float, unsure: bool
 ) -> None:
-    small = {"encoder": "conv-small", "generator": "sphere-small", "learning_rate": 1e-3}
-    settings = dataclasses.replace(
-        PRESETS["peng2020-kato"].settings, **small, lambda_adversarial=weight, lambda_prior=0.0
-    )
-    method = create_method(settings, dataset.info(None), device="cpu", precision="fp32", seed=0)
+    weights = {"lambda_adversarial": weight, "lambda_prior": 0.0, "learning_rate": 1e-3}
+    method = make_method("peng2020-kato", dataset.info(None), **TINY, **weights)
     batch = dataset.batch(torch.arange(len(dataset)), voxels=False)
     learner = torch.optim.Adam(method.discriminator.parameters(), lr=3e-3)
     codes = method.encode(batch.images).detach()

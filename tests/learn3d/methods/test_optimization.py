@@ -2,41 +2,34 @@
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 import math
 import signal
 from pathlib import Path
 from typing import get_args
 
 import pytest
-import tiny_networks
 import torch
+from runs import before_step, same_tensors
+from steps import TINY, TINY_PRGAN, TINY_VPL, make_method
 from torch import nn
 
 from learn3d import training
-from learn3d.data.dataset import DatasetInfo
-from learn3d.methods import _METHODS, create_method
+from learn3d.methods import _METHODS
 from learn3d.methods.method import Method
 from learn3d.methods.optimization import EMA, LRSchedule, TrainingSchedule, adam
-from learn3d.networks.encoders import ENCODERS
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.training import train
 
-TINY = {"encoder": "conv-small", "generator": "sphere-small"}
 #: A run of each method with tiny networks.
 TINY_RUNS = {
     "proposed": TINY,
     "plus": TINY | {"preset": "plus-kato", "bank_size": 8},
     "multi-view": TINY | {"preset": "multi-view-kato"},
     "many-views": TINY | {"preset": "many-views-kato", "batch_size": 10},
-    "vpl": {
-        "preset": "peng2020-kato-vpl",
-        "generator": "sphere-small",
-        "discriminator_channels": 2,
-    },
-    "prgan": {"preset": "gadelha2017-kato", "encoder_from_step": 3}
-    | {"generator_channels": (2, 2, 2, 1), "discriminator_channels": (2, 2, 2, 2)},
+    "vpl": TINY_VPL | {"preset": "peng2020-kato-vpl"},
+    "prgan": TINY_PRGAN | {"preset": "gadelha2017-kato"},
 }
 
 
@@ -115,20 +108,15 @@ def test_schedules() -> None:
 
     assert factors() == [1, 1, 1, 1]
     assert factors(lr_schedule="linear") == [1, 0.75, 0.5, 0.25]
-    assert factors(lr_schedule="cosine") == pytest.approx(
-        [(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)]
-    )
+    cosine = [(1 + math.cos(math.pi * k / 4)) / 2 for k in range(4)]
+    assert factors(lr_schedule="cosine") == pytest.approx(cosine)
     assert factors(warmup_steps=2) == [0.5, 1, 1, 1]
     assert factors(warmup_steps=2, lr_schedule="linear") == [0.5, 1, 1, 0.5]
     for name in get_args(LRSchedule):
         TrainingSchedule(4, name)
     published = TrainingSchedule(200_000, "step")
-    assert [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)] == [
-        1,
-        1,
-        0.1,
-        0.1,
-    ]
+    rates = [published.lr_factor(step) for step in (1, 190_000, 190_001, 200_000)]
+    assert rates == [1, 1, 0.1, 0.1]
     with pytest.raises(ValueError, match="the schedule 'cubic' has no branch"):
         factors(lr_schedule="cubic")
     with pytest.raises(ValueError, match="warmup_steps"):
@@ -149,59 +137,30 @@ def test_the_average_is_the_one_of_a_slow_reference() -> None:
         decay = min(0.5, (1 + step) / (10 + step))
         for name, value in network.state_dict().items():
             wanted[f"net.{name}"] = decay * wanted[f"net.{name}"] + (1 - decay) * value.double()
-    assert average.tensors["net.1.num_batches_tracked"] == 11
-    del wanted["net.1.num_batches_tracked"]
-    for name, value in wanted.items():
-        torch.testing.assert_close(average.tensors[name].double(), value, atol=1e-5, rtol=1e-5)
+    wanted["net.1.num_batches_tracked"] = torch.tensor(11)
+    close = {"atol": 1e-5, "rtol": 1e-5, "check_dtype": False}
+    torch.testing.assert_close(average.tensors, wanted, **close)
 
-    own = {name: value.clone() for name, value in network.state_dict().items()}
-    averaged = {name: value.clone() for name, value in average.tensors.items()}
+    own, averaged = copy.deepcopy(network.state_dict()), copy.deepcopy(average.tensors)
     with average.in_place():
-        assert all(
-            torch.equal(averaged[f"net.{name}"], value)
-            for name, value in network.state_dict().items()
-        )
-    assert all(torch.equal(own[name], value) for name, value in network.state_dict().items())
-    assert all(torch.equal(averaged[name], value) for name, value in average.tensors.items())
+        same_tensors({f"net.{name}": t for name, t in network.state_dict().items()}, averaged)
+    same_tensors(network.state_dict(), own)
+    same_tensors(average.tensors, averaged)
 
 
 def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) -> None:
-    settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **TINY, learning_rate=1e-3)
     ends = []
     for average in (0.0, 0.9):
         schedule = TrainingSchedule(4, "linear", ema_decay=average)
-        method = create_method(
-            settings,
-            DatasetInfo(24, inverted=False),
-            device="cpu",
-            precision="fp32",
-            seed=0,
-            schedule=schedule,
-        )
+        method = make_method("peng2020-kato", schedule=schedule, **TINY, learning_rate=1e-3)
         for step in (1, 2, 3):
             training.take_step(method, tiny_set.batch(torch.arange(4)), step)
-            assert [o.param_groups[0]["lr"] for o in method.optimizers.values()] == [
-                1e-3 * (1 - (step - 1) / 4)
-            ] * 3
+            rates = [o.param_groups[0]["lr"] for o in method.optimizers.values()]
+            assert rates == [1e-3 * (1 - (step - 1) / 4)] * 3
             with method.in_use():
                 method.encode(tiny_set.batch(torch.arange(2)).images)
-        ends.append({name: network.state_dict() for name, network in method.networks.items()})
-    assert all(
-        torch.equal(ends[0][n][key], value) for n in ends[0] for key, value in ends[1][n].items()
-    )
-
-
-def stop_after(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    """Let a signal end the run after this step."""
-    take_step = training.take_step
-
-    def step_and_signal(method: Method, batch, now: int) -> dict[str, float]:
-        losses = take_step(method, batch, now)
-        if now == step:
-            signal.raise_signal(signal.SIGTERM)
-        return losses
-
-    monkeypatch.setattr(training, "take_step", step_and_signal)
+        ends.append(method.networks.state_dict())
+    same_tensors(*ends)
 
 
 def test_every_method_has_a_tiny_run() -> None:
@@ -215,7 +174,6 @@ def test_every_method_has_a_tiny_run() -> None:
 def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
     name: str, tiny_names, tiny_config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(ENCODERS, "conv", tiny_networks.TinyEncoder)
     options = TINY_RUNS[name] | {
         "lr_schedule": "cosine",
         "warmup_steps": 1,
@@ -224,20 +182,15 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
     }
     train(tiny_config(tmp_path / "straight", **options))
     with monkeypatch.context() as patch:
-        stop_after(patch, 2)
+        before_step(patch, 2, lambda: signal.raise_signal(signal.SIGTERM))
         assert train(tiny_config(tmp_path / "stopped", **options)).progress.step == 2
     torch.manual_seed(99)
     assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
     for file in ("last", "best"):
-        ours, theirs = (
-            checkpoint.load(tmp_path / run / f"{file}.safetensors")[0]
-            for run in ("straight", "stopped")
-        )
-        assert ours.keys() == theirs.keys()
-        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-    assert (tmp_path / "straight/metrics.jsonl").read_text() == (
-        tmp_path / "stopped/metrics.jsonl"
-    ).read_text()
+        runs = (tmp_path / "straight", tmp_path / "stopped")
+        same_tensors(*(checkpoint.load(run / f"{file}.safetensors")[0] for run in runs))
+    straight, stopped = ((run / "metrics.jsonl").read_text() for run in runs)
+    assert straight == stopped
 
 
 def test_what_a_run_is_evaluated_with_is_the_average(
@@ -245,17 +198,15 @@ def test_what_a_run_is_evaluated_with_is_the_average(
 ) -> None:
     train(tiny_config(tmp_path, **TINY, ema_decay=0.8, validate_every=4))
     last, best = (checkpoint.load(tmp_path / f"{file}.safetensors")[0] for file in ("last", "best"))
-    averages = {
-        name.removeprefix("ema."): value for name, value in last.items() if name.startswith("ema.")
-    }
-    assert averages
+    averages, own, selected = (
+        {key.removeprefix(kind): t for key, t in tensors.items() if key.startswith(kind)}
+        for tensors, kind in ((last, "ema."), (last, "network."), (best, "network."))
+    )
     loaded = checkpoint.load_method(tmp_path / "last.safetensors")[0]
-    for name, network in loaded.networks.items():
-        for key, value in network.state_dict().items():
-            assert torch.equal(value, averages[f"{name}.{key}"])
-            assert torch.equal(value, best[f"network.{name}.{key}"])
+    same_tensors(loaded.networks.state_dict(), averages)
+    same_tensors(selected, averages)
     assert not any(name.startswith("ema.") for name in best)
-    assert any(not torch.equal(last[f"network.{name}"], value) for name, value in averages.items())
+    assert any(not torch.equal(own[name], value) for name, value in averages.items())
 
 
 def test_a_schedule_keeps_the_number_of_iterations(tiny_names, tiny_config, tmp_path: Path) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import pytest
 import torch
 import torch.nn.functional as F
+from steps import make_method
 from torch import Tensor, nn
 
 import nmr
@@ -22,10 +24,7 @@ SMALL = {"generator_channels": (4, 4, 2, 1), "discriminator_channels": (4, 4, 4,
 
 
 def small_prgan(**settings: object) -> PrGAN:
-    torch.manual_seed(0)
-    return PrGAN(
-        PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS, inverted=False), "cpu", "fp32"
-    )
+    return make_method(PrGANSettings(**SMALL | settings), DatasetInfo(VIEWS, inverted=False))
 
 
 def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None) -> Batch:
@@ -36,44 +35,29 @@ def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None)
     poses = poses or LookAtPoses(-360.0 / VIEWS * views, 30.0, 2.732, 15.0)
     images = torch.zeros(count, 4, 64, 64, dtype=torch.uint8)
     images[:, 3] = (255 * masks).to(torch.uint8)
-    return Batch(
-        images,
-        masks,
-        poses,
-        views,
-        torch.arange(count),
-        torch.zeros(count, dtype=torch.int64),
-        None,
-    )
+    return Batch(images, masks, poses, views, torch.arange(count), 0 * views, None)
 
 
-def changed(method: PrGAN, before: dict[str, nn.Module]) -> set[str]:
-    pairs = {
-        name: zip(before[name].parameters(), method.networks[name].parameters(), strict=True)
-        for name in before
-    }
-    return {name for name in before if any(not torch.equal(a, b) for a, b in pairs[name])}
+def changed(method: PrGAN, before: nn.ModuleDict) -> set[str]:
+    """The names of the networks with other parameters."""
+    now = dict(method.networks.named_parameters())
+    changed = [name for name, p in before.named_parameters() if not torch.equal(p, now[name])]
+    return {name.split(".")[0] for name in changed}
 
 
 @pytest.mark.parametrize("channels", [(1, 1), (5, 1), (3, 2)])
 def test_doubling_is_torchs_transposed_convolution(channels: tuple[int, int]) -> None:
     torch.manual_seed(0)
     layer = DoublingConvolution(*channels)
-    x = (
-        torch.randn(2, channels[0], 3, 3, 3)
-        .to(memory_format=torch.channels_last_3d)
-        .requires_grad_()
-    )
+    x = torch.randn(2, channels[0], 3, 3, 3).to(memory_format=torch.channels_last_3d)
+    x.requires_grad_()
     grad = torch.randn(2, channels[1], 6, 6, 6)
-    results = []
-    for function in (
-        layer,
-        lambda y: F.conv_transpose3d(y, layer.weight, layer.bias, stride=2, padding=1),
-    ):
-        y = function(x)
-        results.append([y, *torch.autograd.grad(y, (x, layer.weight, layer.bias), grad)])
-    for ours, torchs in zip(*results, strict=True):
-        torch.testing.assert_close(ours, torchs)
+    torchs = F.conv_transpose3d(x, layer.weight, layer.bias, stride=2, padding=1)
+    results = [
+        [y, *torch.autograd.grad(y, (x, layer.weight, layer.bias), grad)]
+        for y in (layer(x), torchs)
+    ]
+    torch.testing.assert_close(*results)
 
 
 def test_every_view_is_drawn_from_an_equal_share_of_v() -> None:
@@ -132,18 +116,14 @@ def test_accuracy_is_the_mean_probability_of_being_right(monkeypatch: pytest.Mon
     monkeypatch.setattr(method, "generate", lambda z: torch.zeros(len(z), 64, 64))
     # 3 and -1
     monkeypatch.setattr(method, "discriminator", lambda images: 4 * images.amax((1, 2)) - 1)
-    probability = torch.tensor([3.0, 1.0]).sigmoid().mean()
-    assert float(method.accuracy(batch.masks, method.sample_z(4))) == pytest.approx(
-        float(probability)
-    )
+    probability = float(torch.tensor([3.0, 1.0]).sigmoid().mean())
+    assert float(method.accuracy(batch.masks, method.sample_z(4))) == pytest.approx(probability)
 
 
 def test_statistics_are_means_and_variances_over_the_batch() -> None:
     real, fake = torch.tensor([[0.0, 1.0], [2.0, 1.0]]), torch.tensor([[0.0, 0.0], [0.0, 4.0]])
-    assert (
-        float(statistics_loss(real, fake))
-        == (1 - 0) ** 2 + (1 - 2) ** 2 + (1 - 0) ** 2 + (0 - 4) ** 2
-    )
+    of_means, of_variances = (1 - 0) ** 2 + (1 - 2) ** 2, (1 - 0) ** 2 + (0 - 4) ** 2
+    assert float(statistics_loss(real, fake)) == of_means + of_variances
 
 
 def test_encoder_learns_to_invert_a_fixed_generator(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,14 +149,9 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
     truth = KATO.voxelize(vertices, faces)
     method = small_prgan()
 
-    class Fixed(nn.Module):
-        def forward(self, codes: Tensor) -> Tensor:
-            return (
-                nmr.voxelize(vertices + 0.5, faces, size=64).float().expand(len(codes), -1, -1, -1)
-                / TAU
-            )
-
-    method.generator = Fixed()
+    density = nmr.voxelize(vertices + 0.5, faces, size=64).float() / TAU
+    method.generator = nn.Module()
+    method.generator.forward = lambda codes: density.expand(len(codes), -1, -1, -1)
     grids = method.decode(torch.zeros(1, SHAPE_CODE))
     assert grids.occupancy.max() == 1
     assert grids.threshold == 0.1
@@ -186,32 +161,23 @@ def test_voxels_lie_where_the_data_sets_voxels_do() -> None:
 
 
 @pytest.mark.parametrize(
-    ("poses", "message"),
+    ("change", "message"),
     [
-        (
-            RotationPoses(torch.eye(3).expand(3, 3, 3)),
-            r"view k at azimuth -90 k .*this data set gives rotations",
-        ),
-        (
-            LookAtPoses(torch.tensor([0.0, -90.0, -171.0]), 30.0, 2.732, 15.0),
-            "a camera of view 2 has azimuth -171",
-        ),
-        (
-            LookAtPoses(
-                torch.tensor([0.0, 270.0, 180.0]), torch.tensor([30.0, 31.0, 30.0]), 2.732, 15.0
-            ),
-            "elevation 31",
-        ),
-        (
-            LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.0, 15.0),
-            "view 0 has .*distance 2, ",
-        ),
-        (
-            LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.732, 25.0),
-            "half field of view 25",
-        ),
+        ({"azimuth_deg": torch.tensor([0.0, -90.0, -171.0])}, "camera of view 2 has azimuth -171"),
+        ({"elevation_deg": torch.tensor([30.0, 31.0, 30.0])}, "elevation 31"),
+        ({"distance": 2.0}, "view 0 has .*distance 2, "),
+        ({"half_fov_deg": 25.0}, "half field of view 25"),
     ],
 )
-def test_other_cameras_are_refused(poses: LookAtPoses | RotationPoses, message: str) -> None:
+def test_other_cameras_are_refused(change: dict[str, object], message: str) -> None:
+    poses = LookAtPoses(torch.tensor([0.0, 270.0, 180.0]), 30.0, 2.732, 15.0)
     with pytest.raises(ValueError, match=message):
-        small_prgan().check_batch(make_batch(poses=poses))
+        small_prgan().check_batch(make_batch(poses=dataclasses.replace(poses, **change)))
+
+
+def test_rotations_are_refused() -> None:
+    batch = make_batch(poses=RotationPoses(torch.eye(3).expand(3, 3, 3)))
+    with pytest.raises(
+        ValueError, match=r"view k at azimuth -90 k .*this data set gives rotations"
+    ):
+        small_prgan().check_batch(batch)

@@ -6,13 +6,12 @@ import dataclasses
 
 import pytest
 import torch
+from steps import INFO, make_method
 
 import nmr
-from learn3d.data.dataset import DatasetInfo
-from learn3d.methods import create_method, mesh_method
+from learn3d.methods import mesh_method
 from learn3d.methods.mesh_method import refine
 from learn3d.pictures.surfaces import grid_surface
-from learn3d.presets import PRESETS
 from learn3d.studio.picture_to_mesh.reconstruction import reconstruct_dataset
 
 
@@ -41,16 +40,9 @@ def test_full_and_empty_grids() -> None:
 
 
 def make(plane: float | None):
-    settings = dataclasses.replace(
-        PRESETS["plus-kato"].settings, encoder="conv-small", lambda_novel_view=0.0
-    )
-    return create_method(
-        settings,
-        DatasetInfo(24, inverted=False, mirror_plane_deg=plane),
-        device="cpu",
-        precision="fp32",
-        seed=0,
-    )
+    settings = {"encoder": "conv-small", "lambda_novel_view": 0.0}
+    info = dataclasses.replace(INFO, mirror_plane_deg=plane)
+    return make_method("plus-kato", info, **settings)
 
 
 def take_steps(monkeypatch: pytest.MonkeyPatch, code: int, vertices: int) -> None:
@@ -75,13 +67,7 @@ def test_the_silhouette_comes_closer(tiny_set, monkeypatch, steps: tuple[int, in
 
 def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set, monkeypatch) -> None:
     take_steps(monkeypatch, 1, 1)
-    method = create_method(
-        PRESETS["kato2019-kar"].settings,
-        DatasetInfo(24, inverted=False),
-        device="cpu",
-        precision="fp32",
-        seed=0,
-    )
+    method = make_method("kato2019-kar")
     batch = tiny_set.batch(torch.tensor([0]))
     images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
     shapes = refine(method, images, batch.masks, batch.poses)
@@ -107,14 +93,11 @@ def test_shapes_of_a_data_set_are_refined(finished_run, tiny_folder, tmp_path) -
 
 
 def test_voxels_cannot_be_fitted(tiny_set) -> None:
-    settings = dataclasses.replace(
-        PRESETS["gadelha2017-kato"].settings,
-        generator_channels=(4, 4, 2, 1),
-        discriminator_channels=(4, 8, 8, 8),
-    )
-    method = create_method(
-        settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0
-    )
+    channels = {
+        "generator_channels": (4, 4, 2, 1),
+        "discriminator_channels": (4, 8, 8, 8),
+    }
+    method = make_method("gadelha2017-kato", **channels)
     batch = tiny_set.batch(torch.tensor([0]))
     with pytest.raises(ValueError, match="leave out --refine"):
         refine(method, batch.images, batch.masks, batch.poses)

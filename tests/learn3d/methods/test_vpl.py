@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from functools import partial
 
@@ -10,14 +11,13 @@ import pytest
 import tiny_networks
 import torch
 import torch.nn.functional as F
-from steps import backpropagate
+from steps import backpropagate, make_method
 
 import nmr
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import Batch, DatasetInfo, ViewDataset
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.losses import silhouette_pyramid_loss
-from learn3d.methods import create_method
 from learn3d.methods.vpl import VPL, VPLSettings, other_views
 from learn3d.networks.generators import GENERATORS, ConvCubeGenerator, LinearCubeGenerator
 from learn3d.presets import PRESETS
@@ -55,18 +55,14 @@ def narrow_networks(monkeypatch) -> None:
 def make_batch(image_size: int, count: int = 2, rotations: bool = False) -> Batch:
     """Boxy ellipsoids at two views, of two categories."""
     sphere, faces = nmr.icosphere(2)
-    sizes = torch.tensor([[0.4, 0.2, 0.2], [0.2, 0.4, 0.3], [0.3, 0.3, 0.3], [0.1, 0.3, 0.4]])[
-        :count
-    ]
+    sizes = torch.tensor([[0.4, 0.2, 0.2], [0.2, 0.4, 0.3], [0.3, 0.3, 0.3], [0.1, 0.3, 0.4]])
+    poses = LookAtPoses(torch.tensor([30.0, 120.0, 30.0, 250.0])[:count], 30.0, 2.732, 15.0)
     if rotations:
-        poses = RotationPoses(
-            torch.linalg.qr(torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0)))[0]
-        )
-    else:
-        poses = LookAtPoses(torch.tensor([30.0, 120.0, 30.0, 250.0])[:count], 30.0, 2.732, 15.0)
+        random = torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0))
+        poses = RotationPoses(torch.linalg.qr(random)[0])
+    vertices = sphere * sizes[:count, None]
     images, masks = (
-        nmr.render_silhouette(sphere * sizes[:, None], faces, poses.cameras(), image_size=size)
-        * 255
+        255 * nmr.render_silhouette(vertices, faces, poses.cameras(), image_size=size)
         for size in (image_size, 64)
     )
     colors = images[:, None] * torch.tensor([0.3, 0.6, 0.9])[:, None, None]
@@ -89,11 +85,16 @@ def make_batch(image_size: int, count: int = 2, rotations: bool = False) -> Batc
 
 
 def create(settings: VPLSettings, **shape: int) -> VPL:
-    return create_method(settings, replace(SHAPE, **shape), device="cpu", precision="fp32", seed=0)
+    return make_method(settings, replace(SHAPE, **shape))
 
 
 def state_of(network: torch.nn.Module) -> dict[str, torch.Tensor]:
-    return {name: value.clone() for name, value in network.state_dict().items()}
+    return copy.deepcopy(network.state_dict())
+
+
+def generator_parameters(*methods: VPL) -> zip[tuple[torch.nn.Parameter, ...]]:
+    """Each parameter of the generators, of all methods together."""
+    return zip(*(method.generator.parameters() for method in methods), strict=True)
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -140,9 +141,7 @@ def test_odd_steps_move_shapes_as_without_a_discriminator() -> None:
     losses, plain = backpropagate(method, batch, 1), backpropagate(baseline, batch, 1)
     assert plain.keys() == {"projection", "smoothness"}
     assert losses["projection"][1] == plain["projection"][1]
-    for own, other in zip(
-        method.generator.parameters(), baseline.generator.parameters(), strict=True
-    ):
+    for own, other in generator_parameters(method, baseline):
         torch.testing.assert_close(own.grad, other.grad)
 
 
@@ -163,9 +162,7 @@ def test_even_steps_pull_the_other_view_towards_real() -> None:
     adversarial = F.binary_cross_entropy_with_logits(logits, torch.ones(2))
     assert weight == 0.1 and loss.item() == pytest.approx(adversarial.item(), rel=1e-4)
     (0.1 * adversarial).backward()
-    for full, plain, expected in zip(
-        *(m.generator.parameters() for m in (method, baseline, adversary)), strict=True
-    ):
+    for full, plain, expected in generator_parameters(method, baseline, adversary):
         difference = (full.grad - plain.grad - expected.grad).norm()
         assert difference < 1e-3 * expected.grad.norm()
 
@@ -189,9 +186,7 @@ def test_reversal_gives_shapes_minus_lambda_times_and_the_discriminator_all() ->
         for s, poses in zip(silhouettes, views, strict=True)
     ]
     loss = F.softplus(-logits[0]).mean() + F.softplus(logits[1]).mean()
-    weights = [
-        parameter for parameter in plain.discriminator.parameters() if parameter.requires_grad
-    ]
+    weights = [p for p in plain.discriminator.parameters() if p.requires_grad]
     *of_weights, of_real, of_fake = torch.autograd.grad(
         loss, [*weights, *silhouettes], retain_graph=True
     )
@@ -204,21 +199,13 @@ def test_reversal_gives_shapes_minus_lambda_times_and_the_discriminator_all() ->
         losses = backpropagate(method, batch, 1)
         assert losses.keys() == {"projection", "inflation", "discrimination"}
         assert losses["discrimination"][1].item() == pytest.approx(loss.item(), rel=1e-4)
-        own = [
-            parameter.grad
-            for parameter in method.discriminator.parameters()
-            if parameter.requires_grad
-        ]
-        for gradient, expected in zip(own, of_weights, strict=True):
-            torch.testing.assert_close(gradient, expected, rtol=1e-3, atol=1e-5)
+        own = [p.grad for p in method.discriminator.parameters() if p.requires_grad]
+        torch.testing.assert_close(own, list(of_weights), rtol=1e-3, atol=1e-5)
         # The renderer's gradient is not linear in that of the images (only pixels that lower the loss pull): sum first.
-        of_images = [of_projection - factor * of_real, -factor * of_fake]
-        expected = torch.autograd.grad(
-            [*silhouettes, pressure],
-            [plain.generator.base],
-            [*of_images, torch.ones(())],
-            retain_graph=True,
-        )[0]
+        of_results = [of_projection - factor * of_real, -factor * of_fake, torch.ones(())]
+        (expected,) = torch.autograd.grad(
+            [*silhouettes, pressure], plain.generator.base, of_results, retain_graph=True
+        )
         torch.testing.assert_close(
             method.generator.base.grad, expected, rtol=1e-3, atol=1e-4 * expected.abs().max()
         )
