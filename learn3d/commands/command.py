@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
+import docstring_parser  # of tyro
 import tyro
 from typing_extensions import Self, dataclass_transform  # in typing from Python 3.11 on
 
@@ -44,8 +45,11 @@ class Command:
     @classmethod
     def parse(cls, name: str, arguments: Sequence[str]) -> Self:
         """The command with the given options. Prints the help and exits if --help is among them."""
-        about = cls.about() if {"-h", "--help"} & set(arguments) else ""
+        about = ""
         default = cls.default(arguments)
+        if {"-h", "--help"} & set(arguments):
+            about = cls.about()
+            _join_help_lines(cls, default)
         given = {} if default is None else {"default": default}
         return tyro.cli(
             cls, args=arguments, prog=f"learn3d {name}", description=about, config=FLAT, **given
@@ -64,6 +68,24 @@ class Command:
         if wrong := self.given(*names):
             options = ", ".join(f"--{name.replace('_', '-')}" for name in wrong)
             raise ValueError(f"{options} does not go with {kind}; leave it out")
+
+
+def _join_help_lines(kind: type, default: object) -> None:
+    """Take the line breaks of the source out of the help of a dataclass's options, where tyro keeps them.
+
+    default: an instance, or None.
+    """
+    options = {option.name: option for option in dataclasses.fields(kind)}
+    for base in reversed(kind.__mro__[:-1]):
+        for text in docstring_parser.parse_from_object(base).params:
+            if text.description and text.arg_name in options:
+                help_text = " ".join(text.description.split())
+                options[text.arg_name].metadata = {"help": help_text}
+    for name, option in options.items():
+        value = getattr(default, name, None)
+        nested = option.type if value is None else type(value)
+        if dataclasses.is_dataclass(nested):
+            _join_help_lines(nested, value)
 
 
 class OnDataset(Command):

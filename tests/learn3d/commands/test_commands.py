@@ -137,6 +137,15 @@ def test_help_is_complete_and_fits(words: tuple[str, ...], command, monkeypatch)
         assert len(text) > 20 and re.search(r"[.)]( [\w.]+ options.*)?$", text), name
 
 
+def test_help_has_no_line_breaks_of_the_source(command, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "250")
+    page = command("reconstruct", "--help")[1]
+    assert "the best first; a model without templates makes one. (default: 1)" in page
+    assert "Category of the object in the image files (default: recognized), or of the" in page
+    page = command("estimate-poses", "--help")[1]
+    assert "If not given: from the data set, or 30 if it has none. (default: None)" in page
+
+
 def test_help_has_every_preset_and_the_options_of_the_chosen_one(command) -> None:
     page = command("train", "--help", "--preset", "vpl")[1]
     for option in ("--lambda-discriminator", "--augment", "--encoder", "--pictures-every"):
