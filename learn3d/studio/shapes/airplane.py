@@ -63,7 +63,14 @@ class Planform:
     def winglets(self, draw: Draw) -> Part:
         """Upturned wing tips."""
         x, y, z, chord = self.at(1.0)
-        tip = fin(draw(0.05, 0.085), chord, 0.5 * chord, draw(25, 50), z=z, thickness=0.1)
+        tip = fin(
+            draw(0.05, 0.085),
+            root=chord,
+            tip=0.5 * chord,
+            sweep_deg=draw(25, 50),
+            z=z,
+            thickness=0.1,
+        )
         return tip.rotated("z", -draw(0, 30)).moved(x - 0.004, y - 0.004).both_sides()
 
 
@@ -129,15 +136,30 @@ def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
         return side.rotated("z", draw(32, 45)).moved(y=base).both_sides()
     dihedral = draw(0, 7)
     if kind == "twin":
-        plan = Planform(half, chord, 0.95 * chord, 3, dihedral, -0.5 + chord + 0.01, 0.4 * radius)
-        x, y, front, end = plan.at(1.0)
-        upright = fin(0.8 * height, 1.2 * end, 0.8 * end, draw(5, 25), z=front + 0.02)
-        return plan.wing() + upright.moved(x, y - draw(0.1, 0.45) * height).both_sides()
-    part = fin(height + base, root, tip, sweep, z).moved(y=0.4 * base)
-    if swept and draw.maybe(0.4):  # a dorsal fillet
-        part += fin(0.45 * height + base, 1.6 * root, 0.5 * root, 62, z + 0.75 * root, 0.04).moved(
-            y=0.4 * base
+        plan = Planform(
+            half=half,
+            root=chord,
+            tip=0.95 * chord,
+            sweep_deg=3,
+            dihedral_deg=dihedral,
+            z=-0.5 + chord + 0.01,
+            y=0.4 * radius,
         )
+        x, y, front, end = plan.at(1.0)
+        upright = fin(
+            0.8 * height, root=1.2 * end, tip=0.8 * end, sweep_deg=draw(5, 25), z=front + 0.02
+        )
+        return plan.wing() + upright.moved(x, y - draw(0.1, 0.45) * height).both_sides()
+    part = fin(height + base, root=root, tip=tip, sweep_deg=sweep, z=z).moved(y=0.4 * base)
+    if swept and draw.maybe(0.4):  # a dorsal fillet
+        part += fin(
+            0.45 * height + base,
+            root=1.6 * root,
+            tip=0.5 * root,
+            sweep_deg=62,
+            z=z + 0.75 * root,
+            thickness=0.04,
+        ).moved(y=0.4 * base)
     share = {"T": 0.97, "cross": draw(0.35, 0.6), "conventional": 0.0}[kind]
     if kind == "conventional":
         front = -0.5 + chord + draw(0.0, 0.04)
@@ -150,9 +172,17 @@ def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     if kind == "T":
         chord = min(chord, 1.3 * tip)
         tip_chord = min(tip_chord, 0.9 * tip)
-    return (
-        part + Planform(half, chord, tip_chord, lean, dihedral, front, level, thickness=0.1).wing()
+    plan = Planform(
+        half=half,
+        root=chord,
+        tip=tip_chord,
+        sweep_deg=lean,
+        dihedral_deg=dihedral,
+        z=front,
+        y=level,
+        thickness=0.1,
     )
+    return part + plan.wing()
 
 
 def along_z(
@@ -269,7 +299,13 @@ def airliner(draw: Draw, *, radius, freighter, tall, nose, nose_power, tail_star
     upsweep = draw(0.5, 0.9) if freighter else draw(0.25, 0.6)
     droop = draw(0.1, 0.35)
     plane = fuselage(
-        radius, tall, nose * radius, nose_power, tail_start, upsweep=upsweep, droop=droop
+        radius,
+        tall=tall,
+        nose=nose * radius,
+        nose_power=nose_power,
+        tail_start=tail_start,
+        upsweep=upsweep,
+        droop=droop,
     )
     size = draw.measures(
         half=(0.40, 0.56), sweep_deg=(15, 38), root=(0.15, 0.21), tip=(0.035, 0.07)
@@ -366,10 +402,23 @@ def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
     if shape == "delta":
         half = min(half, 0.9 * root / np.tan(np.radians(sweep)))
     plan = Planform(
-        half, root, tip, sweep, draw(-5, 2), z, draw(-0.3, 0.6) * radius, thickness=0.06
+        half=half,
+        root=root,
+        tip=tip,
+        sweep_deg=sweep,
+        dihedral_deg=draw(-5, 2),
+        z=z,
+        y=draw(-0.3, 0.6) * radius,
+        thickness=0.06,
     )
     plane = fuselage(radius, tail_start=0.75, **form) + plan.wing()
-    plane += canopy(0.9 * radius, 1.1 * radius, draw(0.18, 0.28), 0.8 * radius, draw(0.15, 0.22))
+    plane += canopy(
+        width=0.9 * radius,
+        height=1.1 * radius,
+        length=draw(0.18, 0.28),
+        y=0.8 * radius,
+        z=draw(0.15, 0.22),
+    )
     if twin:
         plane += _intake_tunnel(radius, draw(0.8, 1.25) * radius).both_sides()
     else:
@@ -382,17 +431,33 @@ def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
         plane += _canted_fin(draw, radius).both_sides()
     else:
         height = draw(0.17, 0.25) + 0.6 * radius
-        plane += fin(height, draw(0.2, 0.3), 0.09, draw(35, 52), z=-0.2).moved(y=0.3 * radius)
+        plane += fin(height, root=draw(0.2, 0.3), tip=0.09, sweep_deg=draw(35, 52), z=-0.2).moved(
+            y=0.3 * radius
+        )
     if shape != "delta":
         plane += Planform(
-            draw(0.17, 0.23), 0.15, 0.06, draw(30, 45), -3, -0.34, 0.0, thickness=0.06
+            half=draw(0.17, 0.23),
+            root=0.15,
+            tip=0.06,
+            sweep_deg=draw(30, 45),
+            dihedral_deg=-3,
+            z=-0.34,
+            y=0.0,
+            thickness=0.06,
         ).wing()
         if draw.maybe(0.4):  # strakes from the wing root towards the nose
             outer = (2.0 * radius, plan.y, z - 0.03, 0.7 * root, 0.05)
             plane += wing([(0.0, plan.y, z + 0.2, root + 0.1, 0.05), outer]).both_sides()
     elif draw.maybe(0.5):  # canards
         plane += Planform(
-            draw(0.15, 0.2), 0.11, 0.04, 45, 4, 0.24, 0.35 * radius, thickness=0.06
+            half=draw(0.15, 0.2),
+            root=0.11,
+            tip=0.04,
+            sweep_deg=45,
+            dihedral_deg=4,
+            z=0.24,
+            y=0.35 * radius,
+            thickness=0.06,
         ).wing()
     places = {(0.4, 0.6, 0.8, 1.0)[draw.count(0, 3)] for _ in range(draw.count(0, 3))}
     return plane + join(_store(draw, plan, share).both_sides() for share in sorted(places))
@@ -414,7 +479,7 @@ def _intake_tunnel(radius: float, wide: float) -> Part:
 
 @recipe(cant_deg=(0, 25), x=(0.9, 1.4), height=(0.13, 0.19), sweep_deg=(30, 45))
 def _canted_fin(draw: Draw, radius: float, *, cant_deg, x, height, sweep_deg) -> Part:
-    upright = fin(height, 0.19, 0.08, sweep_deg, z=-0.27)
+    upright = fin(height, root=0.19, tip=0.08, sweep_deg=sweep_deg, z=-0.27)
     return upright.rotated("z", -cant_deg).moved(x * radius, 0.3 * radius)
 
 
@@ -456,7 +521,7 @@ def turboprop(draw: Draw, *, radius, high, **form) -> Part:
     disc = draw(0.07, 0.1)
     for share in (draw(0.26, 0.34),) if two else (0.27, 0.56):
         plane += _propeller_engine(
-            draw, plan, share, thick, draw(0.08, 0.13), disc, blades
+            draw, plan, share, thick=thick, longer=draw(0.08, 0.13), disc=disc, blades=blades
         ).both_sides()
     kind = (
         {"T": 2, "conventional": 2, "cross": 0.7}
@@ -504,7 +569,9 @@ def light_plane(draw: Draw, *, radius, high, pusher, **form) -> Part:
     if high:
         plane += box((1.5 * radius, 1.1 * tall, 0.2), (0, 0.62 * tall, 0.14), 0.03)
     else:
-        plane += canopy(1.5 * radius, 1.3 * tall, draw(0.24, 0.36), 0.72 * tall, 0.1)
+        plane += canopy(
+            width=1.5 * radius, height=1.3 * tall, length=draw(0.24, 0.36), y=0.72 * tall, z=0.1
+        )
     plane += propeller(draw, draw(0.11, 0.16), draw.count(2, 3), hub=0.025).moved(
         z=-0.515 if pusher else 0.497
     )
@@ -520,7 +587,13 @@ def light_plane(draw: Draw, *, radius, high, pusher, **form) -> Part:
         return plane + _floats(draw, radius, tall)
     if draw.maybe(0.75):
         main_z, other_z = (0.03, 0.4) if draw.maybe(0.6) else (0.25, -0.46)
-        plane += gear(tall, tall + draw(0.05, 0.09), 2.0 * radius, main_z, other_z)
+        plane += gear(
+            belly=tall,
+            drop=tall + draw(0.05, 0.09),
+            main_x=2.0 * radius,
+            main_z=main_z,
+            other_z=other_z,
+        )
     return plane
 
 
@@ -542,7 +615,14 @@ def _floats(draw: Draw, radius: float, tall: float, *, drop, length) -> Part:
 def glider(draw: Draw, *, radius) -> Part:
     """A sailplane: a slender pod and boom under very long wings."""
     plane = fuselage(
-        radius, 1.25, 0.26, 1.8, tail_start=0.33, tail_power=0.75, tail_radius=0.22, upsweep=0.1
+        radius,
+        tall=1.25,
+        nose=0.26,
+        nose_power=1.8,
+        tail_start=0.33,
+        tail_power=0.75,
+        tail_radius=0.22,
+        upsweep=0.1,
     )
     size = draw.measures(
         half=(0.9, 1.35),
@@ -555,7 +635,9 @@ def glider(draw: Draw, *, radius) -> Part:
     )
     size["y"] *= radius
     plan = Planform(**size, z=0.16)
-    plane += plan.wing() + canopy(1.5 * radius, 1.6 * radius, 0.26, 0.75 * radius, 0.27)
+    plane += plan.wing() + canopy(
+        width=1.5 * radius, height=1.6 * radius, length=0.26, y=0.75 * radius, z=0.27
+    )
     plane += tail(draw, draw.pick({"T": 3, "conventional": 1, "V": 0.5}), 0.9 * radius)
     return plane + (plan.winglets(draw) if draw.maybe(0.4) else Part())
 
@@ -565,7 +647,15 @@ def warbird(draw: Draw, *, radius, twin, radial, tall) -> Part:
     """A propeller fighter or a twin-engined bomber of the 1940s."""
     nose = 0.07 if radial and not twin else draw(0.12, 0.25)
     nose_power = 3.0 if radial else 2.0
-    plane = fuselage(radius, tall, nose, nose_power, draw(0.4, 0.5), tail_radius=0.15, upsweep=0.35)
+    plane = fuselage(
+        radius,
+        tall=tall,
+        nose=nose,
+        nose_power=nose_power,
+        tail_start=draw(0.4, 0.5),
+        tail_radius=0.15,
+        upsweep=0.35,
+    )
     size = draw.measures(
         half=(0.5, 0.66),
         root=(0.19, 0.25),
@@ -579,7 +669,13 @@ def warbird(draw: Draw, *, radius, twin, radial, tall) -> Part:
     size["y"] *= radius
     plan = Planform(**size)
     plane += plan.wing()
-    plane += canopy(0.95 * radius, 1.2 * radius, draw(0.16, 0.34), 1.05 * radius, draw(-0.02, 0.1))
+    plane += canopy(
+        width=0.95 * radius,
+        height=1.2 * radius,
+        length=draw(0.16, 0.34),
+        y=1.05 * radius,
+        z=draw(-0.02, 0.1),
+    )
     disc = draw(0.12, 0.16)
     if twin:
         x, y, z, chord = plan.at(0.32)
@@ -596,7 +692,15 @@ def warbird(draw: Draw, *, radius, twin, radial, tall) -> Part:
 @recipe(radius=(0.06, 0.075), exponent=(2, 5), gap=(0.16, 0.22), stagger=(-0.03, 0.1), triplane=0.2)
 def biplane(draw: Draw, *, radius, exponent, gap, stagger, triplane) -> Part:
     """A biplane, or rarely a triplane, with struts and fixed gear."""
-    plane = fuselage(radius, 1.2, 0.06, 3.0, tail_start=0.35, tail_radius=0.2, exponent=exponent)
+    plane = fuselage(
+        radius,
+        tall=1.2,
+        nose=0.06,
+        nose_power=3.0,
+        tail_start=0.35,
+        tail_radius=0.2,
+        exponent=exponent,
+    )
     chord = draw(0.13, 0.18) * (0.8 if triplane else 1)
     half = draw(0.42, 0.58)
     z = draw(0.24, 0.3)
@@ -605,8 +709,18 @@ def biplane(draw: Draw, *, radius, exponent, gap, stagger, triplane) -> Part:
     for t in np.linspace(0, 1, 3 if triplane else 2):
         reach = half * (1 if t == 1 else draw(0.85, 1.0))
         y = -0.9 * radius + t * (gap + radius)
-        plans.append(Planform(reach, chord, 0.9 * chord, 0, 1.5, z + t * stagger, y, shape=shape))
-        plane += plans[-1].wing()
+        plan = Planform(
+            half=reach,
+            root=chord,
+            tip=0.9 * chord,
+            sweep_deg=0,
+            dihedral_deg=1.5,
+            z=z + t * stagger,
+            y=y,
+            shape=shape,
+        )
+        plans.append(plan)
+        plane += plan.wing()
     bottom, *_, top = plans
     for share in (0.75,) if draw.maybe(0.5) else (0.45, 0.85):
         x = share * bottom.half

@@ -144,7 +144,12 @@ def _join_chair(
         rear = -depth / 2 + 0.03 + (curve + bulge) - np.tan(np.radians(recline)) * rise
         edge = 0.5 * width - 0.02 if angular else max(stile_x, half_x)
         part += _arm(
-            draw, (stile_x, height + rise, rear), rise, edge, height - 0.6 * thickness, depth
+            draw,
+            back=(stile_x, height + rise, rear),
+            rise=rise,
+            edge=edge,
+            base=height - 0.6 * thickness,
+            depth=depth,
         ).both_sides()
     return part
 
@@ -210,20 +215,20 @@ def _back(
     if not draw.maybe(family.padded):
         kind = draw.pick(_BACKS)
         if kind == "solid":
-            return _plate(draw, half, top, curve, draw(0.02, 0.045)), 0.0
+            return _plate(draw, half, top=top, curve=curve, thickness=draw(0.02, 0.045)), 0.0
         return _hoop(draw, half, top, curve) if kind == "hoop" else _frame(
             draw, half, height, curve, kind
         ), 0.0
     thickness = draw(0.05, 0.11)
     if family is OFFICE and not draw.maybe(0.3):  # mostly held above the seat by a spine
         gap = draw(0.12, 0.35) * top
-        back = _plate(draw, draw(0.8, 1.1) * half, top - gap, max(curve, 0.03), thickness).moved(
-            y=gap
-        )
+        back = _plate(
+            draw, draw(0.8, 1.1) * half, top=top - gap, curve=max(curve, 0.03), thickness=thickness
+        ).moved(y=gap)
         path = [(0, -0.06, 0.12), (0, -0.06, -0.07), (0, gap + 0.3 * (top - gap), -0.4 * thickness)]
         back += strip(rounded_path(path, 0.06), 0.06, 0.02, side=X)
     elif draw.maybe(0.5):
-        back = _plate(draw, 1.05 * half, top, curve, thickness)
+        back = _plate(draw, 1.05 * half, top=top, curve=curve, thickness=thickness)
     else:
         back = board(half + 0.03, (-0.02, top), (-thickness / 2, thickness / 2), 0.03)
     return back, thickness / 2
@@ -242,7 +247,7 @@ def _frame(
     ).both_sides()
     rail = draw(0.04, 0.12) if high else draw(0.03, 0.06)
     arch = draw.of(Perhaps(0.4, (0.01, 0.07)))
-    part += _rail(half, top - 0.45 * rail, rail, thick, curve, arch)
+    part += _rail(half, y=top - 0.45 * rail, height=rail, thickness=thick, curve=curve, arch=arch)
     if kind == "open":
         return part
     low = draw(0.06, 0.3) * height
@@ -251,7 +256,14 @@ def _frame(
         pitch = (top - rail - low) / (count + 0.5)
         each = min(draw(0.25, 0.6) * pitch, 0.08)
         return part + join(
-            _rail(half, low + (k + 0.5) * pitch, each, thick, curve, 0.6 * arch)
+            _rail(
+                half,
+                y=low + (k + 0.5) * pitch,
+                height=each,
+                thickness=thick,
+                curve=curve,
+                arch=0.6 * arch,
+            )
             for k in range(count)
         )
     if kind in ("panel", "band"):
@@ -262,9 +274,9 @@ def _frame(
     upper = top - 0.6 * rail
     if draw.maybe(0.5) or kind == "lattice":
         bottom = low
-        part += _rail(half, low, draw(0.025, 0.05), thick, curve)
+        part += _rail(half, y=low, height=draw(0.025, 0.05), thickness=thick, curve=curve)
     if kind == "splat":
-        return part + _splat(draw, bottom, upper + arch * 0.8, half, thick)
+        return part + _splat(draw, low=bottom, high=upper + arch * 0.8, half=half, thick=thick)
     if kind == "cross":
         x = np.linspace(-half, half, 7)
         path = points(x, np.linspace(bottom + 0.01, upper, 7), _bow(x, half, curve))
@@ -277,7 +289,7 @@ def _frame(
         part += bar((x, bottom, z), (x, upper + arch * (1 - (x / half) ** 2), z), *size)
     if kind == "lattice":
         for y in np.linspace(bottom, upper, draw.count(1, 3) + 2)[1:-1]:
-            part += _rail(half, y, draw(0.015, 0.03), 0.7 * thick, curve)
+            part += _rail(half, y=y, height=draw(0.015, 0.03), thickness=0.7 * thick, curve=curve)
     return part
 
 
