@@ -1,4 +1,6 @@
-"""The options of a training run: a frozen dataclass, its checks and its JSON form. `presets` has instances of it."""
+"""The options of a training run: a frozen dataclass, its checks and its JSON form. `presets` has
+instances of it.
+"""
 
 import dataclasses
 import json
@@ -24,11 +26,14 @@ class TrainConfig:
     """One training run. config.json and every checkpoint hold it."""
 
     data: MayDiffer[FilePath]
-    """Folder of the data set. In the layout kato its files are 02691156_train_images.npz and so on."""
+    """Folder of the data set. In the layout kato its files are 02691156_train_images.npz and so
+    on."""
     category: Annotated[str, Field(min_length=1)]
-    """Categories to train on together, separated by commas: names (chair), synset ids, or names of your own."""
+    """Categories to train on together, separated by commas: names (chair), synset ids, or names
+    of your own."""
     output: MayDiffer[FilePath]
-    """Folder of this run: checkpoints, metrics, pictures. It must be new or empty without --resume or --overwrite."""
+    """Folder of this run: checkpoints, metrics, pictures. It must be new or empty without
+    --resume or --overwrite."""
     preset: str
     """Method, or preset of a method for other data. It sets the defaults of the other options."""
     label: MayDiffer[str]
@@ -42,27 +47,29 @@ class TrainConfig:
     batch_size: Annotated[int, Field(ge=1, le=65_536)]
     """Images per training step."""
     view_bins: str | None = None
-    """Size of the view classes, azimuth x elevation in degrees. None: 15x20 for kar; one class for each fixed
-    camera."""
+    """Size of the view classes, azimuth x elevation in degrees. None: 15x20 for kar; one class
+    for each fixed camera."""
     views_per_object: Count | None = None
     """Training views per object: the first ones for kar, else random ones, the same in every run.
     If not given: one for kar, else all."""
     poses: MayDiffer[FilePath | None] = None
     """Table of poses from learn3d estimate-poses, instead of the poses of the data set."""
     pose_updates: Annotated[int, Field(ge=0, le=16)] = 3
-    """Number of times a run reweights the candidates of --poses by the IoU of its own shapes: after 1/2, 1/4, ... of
-    all steps. 0: never."""
+    """Number of times a run reweights the candidates of --poses by the IoU of its own shapes:
+    after 1/2, 1/4, ... of all steps. 0: never."""
     sampling: Sampling = "views"
-    """How batches are drawn. views: single images. pairs: two views of each object. groups: five views of each object.
-    classes: single images, every category equally often."""
+    """How batches are drawn. views: single images. pairs: two views of each object. groups: five
+    views of each object. classes: single images, every category equally often."""
     augment: Annotated[tuple[Augmentation, ...], Items] = ()
     """Random augmentations of the training images (--augment without a name: none)."""
     lr_schedule: LRSchedule = "constant"
-    """Learning-rate schedule. linear, cosine: decay to 0. step: a tenth in the last 5 % of all steps."""
+    """Learning-rate schedule. linear, cosine: decay to 0. step: a tenth in the last 5 % of all
+    steps."""
     warmup_steps: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Steps over which the learning rate ramps up from 0, but at most a tenth of the run."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Decay per step of the EMA of all weights; evaluation and reconstruction use the EMA. 0: no EMA."""
+    """Decay per step of the EMA of all weights; evaluation and reconstruction use the EMA. 0: no
+    EMA."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights and of the order of the images."""
     device: MayDiffer[Literal["cpu", "cuda"]] = "cpu"
@@ -73,11 +80,13 @@ class TrainConfig:
     """Number of CPU threads. If not given: one or all, whichever is faster;
     measured at the start and when steps slow down."""
     log: MayDiffer[Literal["tensorboard", "wandb"]] = "tensorboard"
-    """Second log besides metrics.jsonl; wandb sends the metrics to your account there (pip install wandb)."""
+    """Second log besides metrics.jsonl; wandb sends the metrics to your account there (pip
+    install wandb)."""
     val_split: MayDiffer[Literal["val", "test"]] = "val"
     """Split for validation during training and for choosing the best checkpoint."""
     validate_every: MayDiffer[Step] = 2000
-    """Steps between validations (IoU of voxels or silhouettes, and MMD); the last step is always validated."""
+    """Steps between validations (IoU of voxels or silhouettes, and MMD); the last step is always
+    validated."""
     max_val_images: MayDiffer[Count | None] = None
     """Number of images to validate on, evenly from all objects and views of the split. None: all."""
     pictures_every: MayDiffer[Step] = 1000
@@ -119,7 +128,9 @@ class TrainConfig:
 
 
 def config_to_dict(config: TrainConfig) -> dict[str, Any]:
-    """The configuration as plain JSON values; the method's settings are a dictionary under "settings"."""
+    """The configuration as plain JSON values; the method's settings are a dictionary under
+    "settings".
+    """
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
@@ -131,7 +142,9 @@ _MAY_DIFFER_NAMES = {
 
 
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
-    """A line for each option that must not change, but differs between `config` and the run `saved`."""
+    """A line for each option that must not change, but differs between `config` and the run
+    `saved`.
+    """
     old, new = (
         {"method": type(c.settings).__name__.removesuffix("Settings"), **all_options(c)}
         for c in (saved, config)

@@ -1,10 +1,20 @@
-"""Device and precision of the networks, and memory allocation."""
+"""Device, precision, memory and threads of the networks.
+
+Threads synchronise hundreds of times a step. If cores are oversubscribed, a step with all threads
+takes up to 14 times as long as with one; on an idle machine it takes a fraction. So both are
+measured.
+"""
 
 import ctypes
+import os
+import statistics
+from collections import deque
 from pathlib import Path
 from typing import Literal
 
 import torch
+
+from learn3d.runs.distributed import world_size
 
 CPUINFO = "/proc/cpuinfo"  # Linux lists the CPU's instruction sets here
 
@@ -31,7 +41,8 @@ _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # <malloc.h>
 
 
 def keep_freed_memory() -> bool:
-    """Let this process reuse freed memory instead of returning it; True if that worked (Linux with glibc).
+    """Let this process reuse freed memory instead of returning it; True if that worked (Linux
+    with glibc).
 
     By default each step maps and unmaps the pages of every large tensor, a quarter of its CPU
     time at batch 128. Resident memory stays at its peak.
@@ -47,3 +58,85 @@ def keep_freed_memory() -> bool:
             mallopt(_M_TOP_PAD, 1 << 27),
         )
     )
+
+
+WARM_UP, TRIAL = 1, 5  # steps at the start of a trial that are not timed, and all of its steps
+WINDOW = 20  # steps whose median is compared with the smallest median so far
+SLOWER = 3.0  # ratio of the two medians at which both numbers of threads are measured again
+
+
+class ThreadTuner:
+    """Chooses between one thread and all by the duration of training steps.
+
+    The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, if there is
+    only one core, or if several ranks train together.
+    """
+
+    def __init__(self, threads: int | None) -> None:
+        self.all = threads or torch.get_num_threads()
+        self.fixed = (
+            threads is not None
+            or "OMP_NUM_THREADS" in os.environ
+            or self.all == 1
+            or world_size() > 1
+        )
+        self._seconds: deque[float] = deque(maxlen=WINDOW)  # durations of the last steps
+        self._best = float("inf")  # smallest median of WINDOW steps
+        self._medians: dict[
+            int, float
+        ] = {}  # medians of the current trial, by the number of threads
+        self._trying = not self.fixed
+        self._use(self.all)
+
+    def resume(self, chosen: int | None) -> None:
+        """Use the number that the run had chosen before it was interrupted, if this machine has
+        as many cores.
+        """
+        if not self.fixed and chosen is not None and chosen <= self.all:
+            self._trying = False
+            self._use(chosen)
+
+    @property
+    def chosen(self) -> int | None:
+        """The chosen number of threads, for `resume`; None if it is fixed or not chosen yet."""
+        return None if self.fixed or self._trying else self.threads
+
+    def __str__(self) -> str:
+        """The number of threads, for the first line of a run's log."""
+        if self._trying:
+            return f"{self.all} threads or 1, whichever is faster"
+        return f"{self.threads} thread{'s' * (self.threads > 1)}"
+
+    def after_step(self, seconds: float) -> str:
+        """Record the duration of a step. Returns a line for the log when a number is chosen, else
+        "".
+        """
+        self._seconds.append(seconds)
+        if self.fixed or len(self._seconds) < (TRIAL if self._trying else WINDOW):
+            return ""
+        if self._trying:
+            return self._try()
+        median = statistics.median_low(self._seconds)
+        self._best = min(self._best, median)
+        if median > SLOWER * self._best:
+            self._trying = True
+            self._medians = {}
+            self._use(self.all)
+        return ""
+
+    def _try(self) -> str:
+        self._medians[self.threads] = statistics.median(list(self._seconds)[WARM_UP:])
+        if self.threads == self.all:
+            self._use(1)
+            return ""
+        self._trying = False
+        self._best = min(self._medians.values())
+        times = {count: f"{1000 * self._medians[count]:.0f} ms a step" for count in (1, self.all)}
+        self._use(min(self._medians, key=self._medians.__getitem__))
+        other = self.all if self.threads == 1 else 1
+        return f"threads: {self.threads} ({times[self.threads]}; with {other}: {times[other]}); --threads fixes it"
+
+    def _use(self, threads: int) -> None:
+        self.threads = threads
+        self._seconds.clear()
+        torch.set_num_threads(threads)

@@ -1,4 +1,6 @@
-"""Voxel IoU, silhouette IoU, surface distances and pose invariance (MMD) of a trained method on one split."""
+"""Voxel IoU, silhouette IoU, surface distances and pose invariance (MMD) of a trained method on
+one split.
+"""
 
 import itertools
 import math
@@ -14,8 +16,7 @@ from learn3d.data.conventions import view_poses
 from learn3d.data.dataset import MASK_SIZE, Batch, ViewDataset
 from learn3d.losses import mmd
 from learn3d.methods.method import Grids, Meshes, Method
-from learn3d.pictures.sheets import TILE, natural_colors, tile
-from learn3d.pictures.surfaces import Surface, draw_surface, grid_surface, orbit
+from learn3d.pictures import TILE, Surface, draw_surface, grid_surface, natural_colors, orbit, tile
 
 # The picture grid of a training
 TURNS_DEG = (0, 60, 120, 180, 240, 300)  # views of a shape, counted from the input's view
@@ -60,7 +61,9 @@ class Evaluation:
 
     @property
     def selection_metric(self) -> str:
-        """Metric that selects the best checkpoint: the IoU of silhouettes, which needs no 3D data, if it is known."""
+        """Metric that selects the best checkpoint: the IoU of silhouettes, which needs no 3D
+        data, if it is known.
+        """
         return "silhouette_iou" if "silhouette_iou" in self.means else "voxel_iou"
 
 
@@ -95,7 +98,8 @@ def evaluate(
     novel_views = bool((others != torch.arange(len(others))).any())
     generator = torch.Generator().manual_seed(0)
     surfaces = _true_surfaces(dataset, generator) if detailed else []
-    codes, values = [], []
+    codes = []
+    values = []
     with method.in_use():
         for chosen in samples.split(batch_size):
             batch = dataset.batch(chosen)
@@ -135,7 +139,8 @@ def evaluate(
 def _compare_voxels(
     shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, detailed: bool
 ) -> dict[str, Tensor]:
-    convention, definitions = dataset.convention, ("kato18", "kato19")[: 1 + detailed]
+    convention = dataset.convention
+    definitions = ("kato18", "kato19")[: 1 + detailed]
     if isinstance(shapes, Meshes):
         grids = [
             convention.voxelize(shapes.vertices, shapes.faces, definition)
@@ -156,7 +161,9 @@ def _compare_voxels(
 
 
 def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
-    """IoU of a batch's masks and the silhouettes at its cameras: sum of minima over sum of maxima (NaN: both empty)."""
+    """IoU of a batch's masks and the silhouettes at its cameras: sum of minima over sum of maxima
+    (NaN: both empty).
+    """
     size = batch.masks.shape[-1]
     silhouettes = nmr.render_silhouette(
         shapes.vertices, shapes.faces, batch.cameras, image_size=size
@@ -171,7 +178,9 @@ def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
 def _compare_surfaces(
     shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Chamfer-L1 and F-score with the true points [P, 3] of each object; see `MEASURED` for empty surfaces."""
+    """Chamfer-L1 and F-score with the true points [P, 3] of each object; see `MEASURED` for empty
+    surfaces.
+    """
     found = []
     for surface, theirs in zip(shapes.surfaces(), truth, strict=True):
         ours = _sample(surface, generator)
@@ -211,7 +220,8 @@ def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
 
 
 def _other_images(object_ids: np.ndarray) -> Tensor:
-    """For each sample another one of its object, int64 [M]: a quarter of the object's images further on.
+    """For each sample another one of its object, int64 [M]: a quarter of the object's images
+    further on.
 
     If views go around the object, that is a quarter turn. Half a turn would show the same
     outline, mirrored.
@@ -224,7 +234,8 @@ def _other_images(object_ids: np.ndarray) -> Tensor:
 
 
 def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:
-    """`count` different samples, int64 [count], ascending, spread evenly over views and objects; always the same ones.
+    """`count` different samples, int64 [count], ascending, spread evenly over views and objects;
+    always the same ones.
 
     Samples are taken one by one in a shuffled order, each time from the views and objects that
     were taken least.

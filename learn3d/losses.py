@@ -1,4 +1,6 @@
-"""Losses on shape codes, pose logits, silhouettes and depth, and the MMD, all in float32. See also nmr.losses."""
+"""Losses on shape codes, pose logits, silhouettes and depth, and the MMD, all in float32. See
+also nmr.losses.
+"""
 
 import math
 from typing import Literal
@@ -19,7 +21,8 @@ def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:
 
 
 def domain_confusion_loss(logits: Tensor, form: Literal["log", "probability"]) -> Tensor:
-    """L_adv: batch mean of the distance between predicted and uniform probabilities of K views (eq. 4).
+    """L_adv: batch mean of the distance between predicted and uniform probabilities of K views
+    (eq. 4).
 
     "probability", as printed: sum_k (p_k - 1/K)^2. "log", as in the published code: sum_k
     (log(1/K) - log p_k)^2, which is unbounded and much stronger for a confident discriminator.
@@ -51,7 +54,8 @@ def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:
-    """L_prior: batch mean of the norm of the codes (eq. 5, "norm") or of its square (published code, "squared").
+    """L_prior: batch mean of the norm of the codes (eq. 5, "norm") or of its square (published
+    code, "squared").
 
     codes [B,C]; differentiable; the gradient at a zero code is zero.
     """
@@ -79,7 +83,8 @@ def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def silhouette_energy_distance(silhouettes: Tensor, masks: Tensor) -> Tensor:
-    """Energy distance between the distributions of silhouettes p and masks t (Szekely and Rizzo 2013).
+    """Energy distance between the distributions of silhouettes p and masks t (Szekely and Rizzo
+    2013).
 
     2 mean_ij d(p_i, t_j) - mean_(i != k) d(p_i, p_k); the third term is constant and left out.
     The distance d(a, b) = 1 - a.b / (a.a + b.b - a.b) is 1 - IoU for silhouettes of 0 and 1

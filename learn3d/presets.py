@@ -215,7 +215,9 @@ PRESETS: dict[str, TrainConfig] = {
 
 
 def full_name(name: str) -> str:
-    """The name of a preset, given that name or the short name of a method. Raises ValueError for other names."""
+    """The name of a preset, given that name or the short name of a method. Raises ValueError for
+    other names.
+    """
     preset = SHORT_NAMES[name][0] if str(name) in SHORT_NAMES else name
     if str(preset) not in PRESETS:
         raise ValueError(unknown_name("preset", name, [*SHORT_NAMES, *PRESETS]))
@@ -223,7 +225,8 @@ def full_name(name: str) -> str:
 
 
 def configure(preset: str = DEFAULT_PRESET, **options: Any) -> TrainConfig:
-    """The run of a preset with these options in place of its own; data, category and output must be among them.
+    """The run of a preset with these options in place of its own; data, category and output must
+    be among them.
 
     preset: its name, or the short name of a method. Settings of the method are options, too; they
     may also be given together, as `settings`: an instance, or a dictionary. Raises ValueError for
@@ -247,7 +250,9 @@ def configure(preset: str = DEFAULT_PRESET, **options: Any) -> TrainConfig:
 
 
 def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
-    """Build a TrainConfig from plain values. Raises a ValueError that names `source` and the wrong option."""
+    """Build a TrainConfig from plain values. Raises a ValueError that names `source` and the
+    wrong option.
+    """
     try:
         if not isinstance(values, dict):
             raise ValueError(f"must hold options by name ({{...}}), got {type(values).__name__}")
@@ -257,7 +262,9 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read the config.json of a run. Raises MissingFile or ValueError if it is missing or damaged."""
+    """Read the config.json of a run. Raises MissingFile or ValueError if it is missing or
+    damaged.
+    """
     wanted = "the options of a run; to start a new run, leave out --resume"
     return config_from_dict(read_json(path, limits.TEXT_BYTES, wanted), source=str(path))
 
@@ -267,7 +274,9 @@ USUAL_OPTIONS = ("preset", "data", "category", "output", "iterations", "batch_si
 
 
 def command_line(config: TrainConfig, **placeholders: str) -> str:
-    """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of options' values."""
+    """The command that repeats a run, quoted for a POSIX shell. placeholders: words in place of
+    options' values.
+    """
     values = all_options(config)
     usual = all_options(PRESETS[config.preset])
     names = [

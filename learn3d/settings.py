@@ -24,7 +24,8 @@ T = TypeVar("T")
 
 
 def checked(cls: type[T]) -> type[T]:
-    """Class decorator: a frozen dataclass that raises a ValueError naming each wrong, missing or unknown field.
+    """Class decorator: a frozen dataclass that raises a ValueError naming each wrong, missing or
+    unknown field.
 
     `__post_init__` checks fields against each other; it may raise a ValueError, too.
     """
@@ -45,7 +46,9 @@ def checked(cls: type[T]) -> type[T]:
 
 
 def _sentence(error: Any, cls: type) -> str:
-    """One of pydantic's errors as part of a sentence: the field, the wanted value, the given value."""
+    """One of pydantic's errors as part of a sentence: the field, the wanted value, the given
+    value.
+    """
     name = error["loc"][0] if error["loc"] else ""
     if isinstance(name, int):  # a positional argument
         name = fields(cls)[name].name

@@ -1,4 +1,5 @@
-"""Runs tasks, each in a process of its own: a few at a time on this machine, or on the workers of a Dask cluster.
+"""Runs tasks, each in a process of its own: a few at a time on this machine, or on the workers of
+a Dask cluster.
 
 A task is a function call that writes files and continues from them when it is called again. So an
 interrupted `run_tasks` is resumed by the same call, and a task whose process or worker died is
@@ -36,8 +37,9 @@ class Workers:
     jobs: Count = 1
     """Number of processes at a time on this machine."""
     cluster: str | None = None
-    """Address of a Dask scheduler, such as tcp://HOST:8786. Its workers run the pieces; all machines must see the same
-    files under the same names. If not given: processes on this machine."""
+    """Address of a Dask scheduler, such as tcp://HOST:8786. Its workers run the pieces; all
+    machines must see the same files under the same names. If not given: processes on this
+    machine."""
 
     def __post_init__(self) -> None:
         if self.cluster is not None and self.jobs > 1:
@@ -47,7 +49,9 @@ class Workers:
 
     @property
     def threads(self) -> int:
-        """Threads of each task: its share of this machine's cores; 1 on a cluster, which has a worker for each core."""
+        """Threads of each task: its share of this machine's cores; 1 on a cluster, which has a
+        worker for each core.
+        """
         import torch  # here, as the processes of a cluster need none
 
         return 1 if self.cluster else max(1, torch.get_num_threads() // self.jobs)
@@ -75,7 +79,8 @@ def run_tasks(tasks: Sequence[Task], workers: Workers) -> list[str]:
     is started, and each running one saves its state and ends. Raises OSError if no scheduler
     answers at `workers.cluster`.
     """
-    failed, starts = [], collections.Counter()
+    failed = []
+    starts = collections.Counter()
     with stop_on_signal() as asked, _executor(workers) as (executor, stop):
 
         def start(task: Task) -> concurrent.futures.Future:
@@ -112,7 +117,9 @@ def run_tasks(tasks: Sequence[Task], workers: Workers) -> list[str]:
 
 @contextlib.contextmanager
 def _executor(workers: Workers) -> Iterator[tuple[concurrent.futures.Executor, Any]]:
-    """The executor of tasks, and the event that stops them. At the end it waits for those that run."""
+    """The executor of tasks, and the event that stops them. At the end it waits for those that
+    run.
+    """
     if workers.cluster is None:
         with concurrent.futures.ThreadPoolExecutor(workers.jobs) as threads:
             yield threads, threading.Event()
@@ -135,7 +142,8 @@ def _executor(workers: Workers) -> Iterator[tuple[concurrent.futures.Executor, A
 
 
 def run_task(task: bytes, log: Path, folder: str, stop: Any) -> tuple[int, str]:
-    """Run a pickled task in a new process with the current folder `folder`, until it ends or `stop` is set.
+    """Run a pickled task in a new process with the current folder `folder`, until it ends or
+    `stop` is set.
 
     Returns its exit status, and the end of its log.
     """
@@ -164,7 +172,9 @@ def run_task(task: bytes, log: Path, folder: str, stop: Any) -> tuple[int, str]:
 
 
 def _environment() -> dict[str, str]:
-    """The environment of a task's process, without Dask's setting that malloc returns memory at once, which is slow."""
+    """The environment of a task's process, without Dask's setting that malloc returns memory at
+    once, which is slow.
+    """
     return {name: value for name, value in os.environ.items() if name != "MALLOC_TRIM_THRESHOLD_"}
 
 
@@ -183,7 +193,9 @@ def _stop_with_parent() -> None:
 
 
 def _outcome(future: concurrent.futures.Future) -> tuple[int, str]:
-    """Exit status and end of the log of a task, as `run_task` returns them; status -1 if its worker died."""
+    """Exit status and end of the log of a task, as `run_task` returns them; status -1 if its
+    worker died.
+    """
     try:
         return future.result()
     except concurrent.futures.CancelledError:

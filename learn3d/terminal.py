@@ -19,7 +19,8 @@ _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\u
 
 
 def without_traceback(main: Callable[P, int]) -> Callable[P, int]:
-    """Decorator of the main function of a command, which returns an exit status: errors become one line on stderr.
+    """Decorator of the main function of a command, which returns an exit status: errors become
+    one line on stderr.
 
     ValueError, OSError, MemoryError and FloatingPointError end it with status 1 and the line
     "error: " and the message. Ctrl-C ends it with status 130. Any other error is a bug and keeps
@@ -75,13 +76,17 @@ def _print(text: str, stream: TextIO) -> None:
 
 
 def _silence(stream: TextIO) -> None:
-    """Let no further output fail. Python flushes once more when it ends: "Note on SIGPIPE" of module `signal`."""
+    """Let no further output fail. Python flushes once more when it ends: "Note on SIGPIPE" of
+    module `signal`.
+    """
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextlib.contextmanager
 def closed_pipe_ends() -> Iterator[None]:
-    """End the program in good order if its output goes to a closed pipe (`| head`) within this context."""
+    """End the program in good order if its output goes to a closed pipe (`| head`) within this
+    context.
+    """
     try:
         try:
             yield
@@ -112,13 +117,15 @@ def align(rows: Sequence[Sequence[str]]) -> str:
 
 @contextlib.contextmanager
 def stop_on_signal() -> Iterator[SimpleNamespace]:
-    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop: the attribute `name` of the context, "" before.
+    """Turn the first SIGINT, SIGTERM or SIGHUP into a request to stop: the attribute `name` of
+    the context, "" before.
 
     A second SIGINT interrupts at once. SIGHUP comes when the terminal is closed; if it is ignored
     (nohup), it stays ignored. Does nothing outside the main thread, because only this one can
     handle signals.
     """
-    stop, previous = SimpleNamespace(name=""), {}
+    stop = SimpleNamespace(name="")
+    previous = {}
 
     def handle(number: int, _: object) -> None:
         if stop.name and number == signal.SIGINT:

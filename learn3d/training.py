@@ -8,19 +8,18 @@ from learn3d.config import TrainConfig
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.mirror_plane import find_mirror_plane
 from learn3d.data.sampling import VIEWS_OF_OBJECT, batches
-from learn3d.device import keep_freed_memory, resolve_precision
+from learn3d.device import ThreadTuner, keep_freed_memory, resolve_precision
 from learn3d.evaluation import NO_MMD, evaluate, picture_grid, spread_samples
 from learn3d.methods import create_method
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Losses, Method
 from learn3d.methods.pose_updates import update_poses, update_steps
-from learn3d.pictures.sheets import save_png
+from learn3d.pictures import save_png
 from learn3d.runs import distributed
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress, load_data
 from learn3d.runs.log import RunLog, check_log, open_log
 from learn3d.runs.run import Run, Summary, describe_images
-from learn3d.runs.threads import ThreadTuner
 from learn3d.terminal import stop_on_signal
 
 PICTURE_ROWS = 8  # of the picture grids
@@ -39,7 +38,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     checkpoint predates it); OSError if a checkpoint cannot be written or another process works in
     the folder.
     """
-    started, folder = time.monotonic(), config.output
+    started = time.monotonic()
+    folder = config.output
     config = dataclasses.replace(
         config, precision=resolve_precision(config.precision, config.device)
     )
@@ -49,20 +49,12 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     with run_folder.lock_folder(folder):
         if not resume:
             run_folder.check_can_start(folder, overwrite)
-        train_set, val_set = (load_data(config, split) for split in ("train", config.val_split))
-        plane = find_mirror_plane(train_set) if config.settings.wants_mirror_plane else None
-        info = train_set.info(
-            plane, train_set.solidity() if config.settings.wants_solidity else None
-        )
-        options = {
-            name: getattr(config, name) for name in ("device", "precision", "seed", "schedule")
-        }
-        method = create_method(config.settings, info, **options)
-        # it may raise, like the next line, before `begin` removes an older run
+        run, train_set, val_set = create_run(config)
+        method = run.method
+        # the data and a batch are checked before `begin` removes an older run
         empty_masks = train_set.check_masks()
         rows = distributed.own_rows(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
         method.check_batch(next(batches(train_set, config, rows=rows)))
-        run = Run(config, method, info, describe_images(train_set), train_set.candidates)
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)
         distributed.check_same(
             options=config, data=run.data, step=progress.step, versions=run.versions
@@ -72,7 +64,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             return Summary(folder, progress, True, time.monotonic() - started)
         estimated = train_set.candidates is not None and isinstance(method, MeshMethod)
         updates = update_steps(config.iterations, config.pose_updates if estimated else 0)
-        before, start = progress.seconds, progress.step + 1
+        seconds_before = progress.seconds
+        first = progress.step + 1
         threads.resume(progress.threads)
 
         with (
@@ -83,18 +76,20 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
             for warning in filter(None, (*notes, empty_masks)):
                 log.say(f"warning: {warning}")
             log.say(run.describe(progress, train_set, val_set, threads))
-            for step, batch in enumerate(batches(train_set, config, start, rows), start):
+            for step, batch in enumerate(batches(train_set, config, first, rows), first):
                 step_began = time.monotonic()
-                losses, stopped_by = distributed.mean_losses(
-                    take_step(method, batch, step), stop.name
-                )
+                losses = take_step(method, batch, step)
+                losses, stopped_by = distributed.mean_losses(losses, stop.name)
                 if chosen := threads.after_step(time.monotonic() - step_began):
                     log.say(f"step {step}: {chosen}")
-                # the last two steps: some methods alternate between two networks
+                # those of the last two steps, as some methods alternate between two networks
                 recent = progress.losses | losses
-                state = {"step": step, "losses": losses, "threads": threads.chosen}
                 progress = dataclasses.replace(
-                    progress, **state, seconds=before + time.monotonic() - started
+                    progress,
+                    step=step,
+                    losses=losses,
+                    threads=threads.chosen,
+                    seconds=seconds_before + time.monotonic() - started,
                 )
                 log.step(step, losses)
 
@@ -103,9 +98,8 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
                     log.metrics(step, "train", recent)
                 if step in updates:
                     changed = update_poses(method, train_set)
-                    log.say(
-                        f"step {step}: poses reweighted; the best pose of {changed:.0%} of the images changed"
-                    )
+                    found = f"the best pose of {changed:.0%} of the images changed"
+                    log.say(f"step {step}: poses reweighted; {found}")
                 if last or step % config.validate_every == 0:
                     progress = validate(run, val_set, progress, log)
                 if last or step % config.pictures_every == 0:
@@ -119,8 +113,32 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     return Summary(folder, progress, progress.step == config.iterations, time.monotonic() - started)
 
 
+def create_run(config: TrainConfig) -> tuple[Run, ViewDataset, ViewDataset]:
+    """The run of a configuration with its method, and its training and validation images.
+
+    Raises ValueError if the method cannot learn from the data.
+    """
+    train_set = load_data(config, "train")
+    val_set = load_data(config, config.val_split)
+    settings = config.settings
+    plane = find_mirror_plane(train_set) if settings.wants_mirror_plane else None
+    solidity = train_set.solidity() if settings.wants_solidity else None
+    info = train_set.info(plane, solidity)
+    method = create_method(
+        settings,
+        info,
+        device=config.device,
+        precision=config.precision,
+        seed=config.seed,
+        schedule=config.schedule,
+    )
+    run = Run(config, method, info, describe_images(train_set), train_set.candidates)
+    return run, train_set, val_set
+
+
 def take_step(method: Method, batch: Batch, step: int) -> dict[str, float]:
-    """Take training step `step` (from 1). Returns its losses before weighting, and "total", their weighted sum.
+    """Take training step `step` (from 1). Returns its losses before weighting, and "total", their
+    weighted sum.
 
     Raises FloatingPointError if a loss is not finite, before its gradient is computed.
     """
@@ -131,13 +149,12 @@ def take_step(method: Method, batch: Batch, step: int) -> dict[str, float]:
             group["lr"] = factor * group.setdefault("initial_lr", group["lr"])
     values: dict[str, float] = {}
     total = 0.0
-    for losses, names in method.phases(
-        batch, step
-    ):  # PrGAN's steps have several phases, others have one
+    # one phase with the method's `losses` and all optimizers; PrGAN has several
+    for losses, names in method.phases(batch, step):
         values |= loss_values(losses, step)
         total += sum(weight * values[name] for name, (weight, _) in losses.items())
         weighted = sum(weight * loss for weight, loss in losses.values())
-        (weighted / distributed.size()).backward()
+        (weighted / distributed.world_size()).backward()
         for name in names:
             optimizers[name].step()
         for optimizer in optimizers.values():
@@ -157,12 +174,14 @@ def loss_values(losses: Losses, step: int) -> dict[str, float]:
 
 
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:
-    """Measure IoU and MMD on the validation images; save the networks if their IoU is the best so far.
+    """Measure IoU and MMD on the validation images; save the networks if their IoU is the best so
+    far.
 
     `Evaluation.selection_metric` says which IoU. Returns the progress with the best IoU and its
     step.
     """
-    config, step = run.config, progress.step
+    config = run.config
+    step = progress.step
     result = evaluate(run.method, val_set, max_images=config.max_val_images)
     log.metrics(step, config.val_split, result.means)
     metric = result.selection_metric
@@ -181,7 +200,9 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
 
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
-    """Write pictures/<step>.png: the same few validation images of different objects and views each time."""
+    """Write pictures/<step>.png: the same few validation images of different objects and views
+    each time.
+    """
     if distributed.rank() > 0:
         return
     samples = spread_samples(val_set.object_ids, val_set.view_ids, PICTURE_ROWS)

@@ -16,8 +16,8 @@ from scipy import ndimage
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.masks import keep_object, mask_box
-from learn3d.pictures.photograph import natural_look, photograph
-from learn3d.pictures.sheets import save_png, tile
+from learn3d.pictures import photograph, save_png, tile
+from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.picture_to_mesh.cutting import Box, find_outline
 from learn3d.studio.picture_to_mesh.reconstruction import load_model
 from learn3d.studio.shapes import make_shape

@@ -12,10 +12,16 @@ import tyro
 import nmr
 from learn3d.data.conventions import KATO, mesh_to_object, view_poses
 from learn3d.data.poses import wrap_deg
-from learn3d.pictures.photograph import natural_look, photograph
+from learn3d.pictures import photograph
+from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
 from learn3d.studio.picture_to_mesh.fit import fit, predict
-from learn3d.studio.picture_to_mesh.reconstruction import frame, load_model, recognize, reduce_mask
+from learn3d.studio.picture_to_mesh.reconstruction import (
+    enlarge,
+    load_model,
+    recognize,
+    reduce_mask,
+)
 from learn3d.studio.picture_to_mesh.templates import fit_template
 
 COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,azimuth,kind,warned".split(
@@ -45,7 +51,7 @@ def main(models: Path, category: str, run: Path | None = None, images: int = 48)
             colors, lights = natural_look(vertices.numpy(), mesh.faces, rng)
             look = {"image_size": 256, "lights": lights}
             (rgb,), (alpha,) = photograph(vertices, mesh.faces, colors, pose.cameras(), **look)
-            mask = reduce_mask(frame(rgb, alpha)[3])
+            mask = reduce_mask(enlarge(rgb, alpha)[3])
             predicted = predict(model.method, torch.from_numpy(model.prepare(rgb, alpha)), mask)
             template, kind = next(fit_template(model.templates, model.categories, predicted, mask))
             boxed = template._replace(

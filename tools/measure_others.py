@@ -14,7 +14,8 @@ from learn3d.data.conventions import mesh_to_object, view_poses
 from learn3d.data.framing import read_photo
 from learn3d.data.masks import keep_object
 from learn3d.files.formats import RawMesh
-from learn3d.pictures.photograph import natural_look, photograph
+from learn3d.pictures import photograph
+from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
 from learn3d.studio.picture_to_mesh.reconstruction import load_model, recognize
 from learn3d.studio.shapes import make_shape

@@ -10,8 +10,7 @@ import torch
 import tyro
 
 import nmr
-from learn3d.pictures.sheets import save_gif, tile
-from learn3d.pictures.surfaces import Surface, draw_surface
+from learn3d.pictures import Surface, draw_surface, save_gif, tile
 from learn3d.studio.shapes import make_shape
 
 OBJECTS = {

@@ -11,9 +11,8 @@ import tyro
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.pictures.photograph import PALETTES, natural_look, photograph
-from learn3d.pictures.sheets import save_png, tile
-from learn3d.pictures.surfaces import Surface, draw_around
+from learn3d.pictures import Surface, draw_around, photograph, save_png, tile
+from learn3d.studio.make_data.looks import PALETTES, natural_look
 from learn3d.studio.picture_to_mesh.reconstruction import (
     export_mesh,
     load_model,

@@ -12,7 +12,7 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.pictures.photograph import photograph
+from learn3d.pictures import photograph
 from learn3d.studio.shapes import make_shape
 
 WIDTH, HEIGHT = 320, 240

@@ -1,4 +1,5 @@
-"""Commands as dataclasses: the docstring describes the command, its fields are options, the texts below them the help.
+"""Commands as dataclasses: the docstring describes the command, its fields are options, the texts
+below them the help.
 
 tyro parses the command line and writes the help. If a field holds a dataclass, its fields are
 options, too.
@@ -27,7 +28,9 @@ FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.AvoidSubcommands)
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Command:
-    """Base class of commands, which become frozen dataclasses. `run` does the work and may return an exit status."""
+    """Base class of commands, which become frozen dataclasses. `run` does the work and may return
+    an exit status.
+    """
 
     def __init_subclass__(cls) -> None:
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
@@ -39,7 +42,9 @@ class Command:
 
     @classmethod
     def default(cls, arguments: Sequence[str]) -> Self | None:
-        """The values of options that are not given, if they depend on those that are; None: as the fields say."""
+        """The values of options that are not given, if they depend on those that are; None: as
+        the fields say.
+        """
         return None
 
     @classmethod
@@ -98,8 +103,8 @@ class OnDataset(Command):
     split: Split = "test"
     """Part of the data set."""
     which: Which = "last"
-    """Checkpoint of a run: the last one, or the one with the best validation IoU (of silhouettes at novel views, if the
-    data have several views of an object)."""
+    """Checkpoint of a run: the last one, or the one with the best validation IoU (of silhouettes
+    at novel views, if the data have several views of an object)."""
 
     def pick(self, *names: str) -> dict[str, Any]:
         """The options above by name, and others."""

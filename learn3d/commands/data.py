@@ -5,8 +5,7 @@ from pathlib import Path
 
 from learn3d.commands.command import Command, DataFolder, Split
 from learn3d.data import shards
-from learn3d.data.categories import synset_of
-from learn3d.data.conventions import IMAGE_SIZE
+from learn3d.data.conventions import IMAGE_SIZE, SET_FILE, has_shards, shards_folder, synset_of
 from learn3d.data.layouts import Layout, check_folder, load_dataset, reader
 from learn3d.files.writing import check_target, write_json
 from learn3d.settings import Count, split_names
@@ -15,7 +14,8 @@ from learn3d.terminal import INTERRUPTED, align, note, say
 
 
 class CheckDataset(Command):
-    """Read every file of a data set and list all faults: missing, truncated, empty or inconsistent files.
+    """Read every file of a data set and list all faults: missing, truncated, empty or
+    inconsistent files.
 
     Example:
       learn3d check-dataset DATA --layout kar --category airplane,chair --split train
@@ -66,7 +66,8 @@ class CheckDataset(Command):
 
 
 class ConvertDataset(Command):
-    """Convert a data set that is larger than memory into shards, which training reads piece by piece.
+    """Convert a data set that is larger than memory into shards, which training reads piece by
+    piece.
 
     Example:
       learn3d convert-dataset --data KAR --layout kar --output SHARDS --category chair,airplane
@@ -86,7 +87,8 @@ class ConvertDataset(Command):
     image_size: int = IMAGE_SIZE
     """Side of the images in pixels, for the method's encoder; larger images are scaled down."""
     views_per_object: Count | None = None
-    """Number of training images to keep of each object. If not given: the layout's protocol, one for kar, else all."""
+    """Number of training images to keep of each object. If not given: the layout's protocol, one
+    for kar, else all."""
     workers: Workers
 
     def run(self) -> int:
@@ -101,8 +103,8 @@ class ConvertDataset(Command):
             if self.layout == "pascal3d" and "val" in splits:
                 splits = (*splits, "test")  # evaluation reads the val photographs by this name
             for split in splits:
-                folder = shards.split_folder(self.output, category, split)
-                if shards.holds(self.output, category, split):
+                folder = shards_folder(self.output, category, split)
+                if has_shards(self.output, category, split):
                     say(f"{folder}: exists; remove it to convert it again")
                     continue
                 few = self.views_per_object if split == "train" else None
@@ -111,7 +113,7 @@ class ConvertDataset(Command):
                     f"{category} {split}", convert_split, arguments, folder.with_suffix(".log")
                 )
         failed = run_tasks(list(tasks.values()), self.workers)
-        if missing := [folder for folder in tasks if not (folder / shards.SET_FILE).is_file()]:
+        if missing := [folder for folder in tasks if not (folder / SET_FILE).is_file()]:
             note(
                 f"{len(missing)} of {len(tasks)} splits are missing; the same command converts them"
             )

@@ -1,4 +1,5 @@
-"""Conventions: the object frame, Kato's 24 views, and the axes of each data set's voxels.
+"""Conventions: the object frame, Kato's 24 views, the axes of each data set's voxels, and the names of
+categories and splits.
 
 The object frame is that of the renderer: LEFT-handed, x right, y up, z away from the camera of
 view 0. Mesh files are right-handed; `mesh_to_object` converts their coordinates. A prediction is
@@ -7,6 +8,7 @@ truth. Sources: the published evaluation code, see docs/methods/README.md.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -40,17 +42,22 @@ class VoxelConvention:
     kato18_scale: float = 1.0  # scale of meshes before the kato18 voxelizer, whose rays are on the grid's corner lines
 
     def to_axes(self, grid: Tensor) -> Tensor:
-        """Convert grids [B, s, s, s] from the axes (x, y, z) of the object frame to those of the stored voxels."""
+        """Convert grids [B, s, s, s] from the axes (x, y, z) of the object frame to those of the
+        stored voxels.
+        """
         return grid.transpose(*self.swap).flip(self.flip)
 
     def to_object(self, grid: Tensor) -> Tensor:
-        """The inverse of `to_axes`: convert stored voxels [B, s, s, s] to the axes (x, y, z) of the object frame."""
+        """The inverse of `to_axes`: convert stored voxels [B, s, s, s] to the axes (x, y, z) of
+        the object frame.
+        """
         return grid.flip(self.flip).transpose(*self.swap)
 
     def voxelize(
         self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18"
     ) -> Tensor:
-        """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the stored voxels.
+        """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the
+        stored voxels.
 
         vertices: float [B, V, 3] or [V, 3]. faces: integer [F, 3] or [B, F, 3]. definition:
         "kato18" for the voxelizer of Kato et al. 2018 and of the paper, "kato19" for the
@@ -63,7 +70,9 @@ class VoxelConvention:
         return self.to_axes(grid)
 
     def exceeds_grid(self, vertices: Tensor, definition: Definition = "kato18") -> Tensor:
-        """Which meshes (vertices float [B, V, 3]) exceed the grid, and therefore count as hollow: bool [B]."""
+        """Which meshes (vertices float [B, V, 3]) exceed the grid, and therefore count as hollow:
+        bool [B].
+        """
         return (self._to_unit(vertices, definition) - 0.5).abs().amax(dim=(1, 2)) > 0.5
 
     def _to_unit(self, vertices: Tensor, definition: Definition) -> Tensor:
@@ -95,7 +104,9 @@ class LayoutProperties:
     options: tuple[str, ...] = ()  # those of image_size and views_per_object that the reader takes
 
     def about(self, category: str, split: str) -> dict[str, Any]:
-        """The fields of a `ViewDataset` that all data sets of the layout share, and its category and split."""
+        """The fields of a `ViewDataset` that all data sets of the layout share, and its category
+        and split.
+        """
         return {
             "category": category,
             "split": split,
@@ -133,7 +144,8 @@ LAYOUTS = {
 
 
 def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
-    """Matrix float64 [3, 3] from right-handed mesh coordinates to the object frame: object = matrix @ mesh.
+    """Matrix float64 [3, 3] from right-handed mesh coordinates to the object frame: object =
+    matrix @ mesh.
 
     `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x",
     "-x", "y" ...). A viewer in front of the mesh has up x front on the right. So the rows are [up
@@ -155,3 +167,72 @@ def view_poses(view_ids: torch.Tensor) -> LookAtPoses:
     """Poses of Kato's views `view_ids`, int64 [B] in 0 .. 23."""
     azimuth_deg = AZIMUTH_STEP_DEG * torch.as_tensor(view_ids).to(torch.float32)
     return LookAtPoses(azimuth_deg, ELEVATION_DEG, DISTANCE, HALF_FOV_DEG)
+
+
+# Kato's 13 categories of ShapeNet, splits, and the names of their files
+SPLITS = ("train", "val", "test")
+SET_FILE = "set.json"  # a split with this file is complete as shards (`data.shards`)
+SYNSETS = {
+    "airplane": "02691156",
+    "bench": "02828884",
+    "cabinet": "02933112",
+    "car": "02958343",
+    "chair": "03001627",
+    "display": "03211117",
+    "lamp": "03636649",
+    "loudspeaker": "03691459",
+    "rifle": "04090263",
+    "sofa": "04256520",
+    "table": "04379243",
+    "telephone": "04401088",
+    "vessel": "04530566",
+}
+_OTHER_NAMES = {"aeroplane": "airplane"}  # in Pascal3D+
+
+
+def synset_of(category: str) -> str:
+    """File name prefix of a category: the ShapeNet synset id of Kato's 13 names; any other name
+    is its own prefix.
+
+    Raises ValueError for an empty name or one that cannot be part of a file name.
+    """
+    forbidden = set('/\\:*?"<>|\0')
+    if (
+        not category
+        or not category.isprintable()
+        or set(category) & forbidden
+        or category.startswith(".")
+    ):
+        raise ValueError(
+            f"category must be a plain name such as 'chair' or a synset id, got {category!r}"
+        )
+    return SYNSETS.get(_OTHER_NAMES.get(category, category), category)
+
+
+def shards_folder(folder: Path | str, category: str, split: str) -> Path:
+    """The folder of the shards of a split."""
+    return Path(folder) / synset_of(category) / split
+
+
+def has_shards(folder: Path | str, category: str, split: str) -> bool:
+    """Whether the folder has this split as complete shards; False for an invalid category."""
+    try:
+        return (shards_folder(folder, category, split) / SET_FILE).is_file()
+    except (ValueError, OSError):
+        return False
+
+
+def find_splits(folder: Path | str, *patterns: str) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder and the splits of each. patterns: paths such as "*/SPLIT.txt"; *
+    is the category.
+    """
+    found = {}
+    for pattern in patterns:
+        for split in SPLITS:
+            before, after = pattern.replace("SPLIT", split).split("*")
+            for path in Path(folder).glob(f"{before}*{after}"):
+                name = path.relative_to(folder).as_posix().removeprefix(before).removesuffix(after)
+                found.setdefault(name, set()).add(split)
+    return {
+        name: tuple(split for split in SPLITS if split in found[name]) for name in sorted(found)
+    }

@@ -15,21 +15,27 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.conventions import VOXEL_SIZE, VoxelConvention
-from learn3d.data.disk_array import DiskArray
 from learn3d.data.poses import LookAtPoses, PoseCandidates, Poses
 from learn3d.data.view_bins import AngleBins
 from learn3d.files.limits import MASK_SIZE
 from learn3d.settings import checked
 
 if TYPE_CHECKING:
-    from learn3d.data.framing import Crops
+    from learn3d.data.crops import Crops
+    from learn3d.data.disk_array import DiskArray
 
-Array = np.ndarray | DiskArray
+    Array = np.ndarray | DiskArray
+
+
+# fields of `ViewDataset` with a value for each view that are None if unknown, and the images
+_OF_VIEWS = ("images", "masks", "depth", "poses", "stored_sizes", "crops")
 
 
 @checked
 class DatasetInfo:
-    """Properties of the data that methods need to build their networks. Every checkpoint has them."""
+    """Properties of the data that methods need to build their networks. Every checkpoint has
+    them.
+    """
 
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K view classes
     inverted: bool  # colours are stored as 255 - colour
@@ -104,7 +110,9 @@ class ViewDataset:
     candidates: PoseCandidates | None = None
 
     def __post_init__(self) -> None:
-        m, n, side = len(self.images), self.num_objects, self.images.shape[-1]
+        m = len(self.images)
+        n = self.num_objects
+        side = self.images.shape[-1]
         if self.images.shape != (m, 4, side, side) or self.images.dtype != np.uint8:
             raise ValueError(
                 f"images must be uint8 [M, 4, S, S], got {self.images.dtype} {list(self.images.shape)}"
@@ -163,7 +171,8 @@ class ViewDataset:
         return DatasetInfo(*sizes, mirror_plane_deg, cube_side, solidity)
 
     def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
-        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU. ValueError for other indices.
+        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU. ValueError for
+        other indices.
 
         voxels: False for training, which needs none; they are twice as large as the images.
         """
@@ -197,7 +206,9 @@ class ViewDataset:
         )
 
     def digest(self, *, voxels: bool = True) -> int:
-        """CRC-32 of images, masks, poses and classes, and of voxels if wanted. Arrays on disk count by checksums."""
+        """CRC-32 of images, masks, poses and classes, and of voxels if wanted. Arrays on disk
+        count by checksums.
+        """
         poses = () if self.poses is None else vars(self.poses).values()
         parts = [
             self.images,
@@ -217,7 +228,8 @@ class ViewDataset:
         crc = 0
         for part in parts + [self.voxels] * voxels:
             if part is not None:
-                stored = np.array(part.digest(), "<u4") if isinstance(part, DiskArray) else part
+                on_disk = hasattr(part, "digest")
+                stored = np.array(part.digest(), "<u4") if on_disk else part
                 crc = zlib.crc32(np.ascontiguousarray(stored), crc)
         return crc
 
@@ -234,7 +246,9 @@ class ViewDataset:
         return float(self.object_sizes().mean(dtype=np.float64))
 
     def solidity(self) -> float:
-        """Mean ratio of a mask's area to that of its convex hull, for at most 256 images; 0 if all masks are empty."""
+        """Mean ratio of a mask's area to that of its convex hull, for at most 256 images; 0 if
+        all masks are empty.
+        """
         from skimage.morphology import convex_hull_image  # takes half a second to import
 
         masks = (
@@ -251,7 +265,9 @@ class ViewDataset:
         return self.images[samples][:, 3] if self.masks is None else self.masks[samples]
 
     def object_sizes(self) -> np.ndarray:
-        """The larger side of each mask's bounding box over the side of the image: float [M], 0 for an empty mask."""
+        """The larger side of each mask's bounding box over the side of the image: float [M], 0
+        for an empty mask.
+        """
         if self.stored_sizes is not None:
             return self.stored_sizes
         masks = self.images[:, 3] > 127
@@ -265,7 +281,9 @@ class ViewDataset:
         return np.maximum(*sides)
 
     def with_bins(self, bins: AngleBins) -> ViewDataset:
-        """The same views with cells of azimuth and elevation as view classes. Raises ValueError without such poses."""
+        """The same views with cells of azimuth and elevation as view classes. Raises ValueError
+        without such poses.
+        """
         if not isinstance(self.poses, LookAtPoses):
             got = "no poses" if self.poses is None else "rotations"
             raise ValueError(
@@ -280,7 +298,8 @@ class ViewDataset:
         return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), **parts)
 
     def with_few_views(self, count: int) -> ViewDataset:
-        """`count` random views of each object, or all of an object with fewer; the same ones in every run.
+        """`count` random views of each object, or all of an object with fewer; the same ones in
+        every run.
 
         Raises ValueError if no object has `count` views.
         """
@@ -299,20 +318,11 @@ class ViewDataset:
 
     def select(self, samples: np.ndarray) -> ViewDataset:
         """The samples `samples`, int64 [B], and all objects. Arrays on disk are not read."""
-        names = (
-            "images",
-            "masks",
-            "depth",
-            "view_ids",
-            "object_ids",
-            "stored_sizes",
-            "crops",
-            "poses",
-        )
-        parts = {name: part for name in names if (part := getattr(self, name)) is not None}
+        parts = {name: getattr(self, name) for name in (*_OF_VIEWS, "view_ids", "object_ids")}
         chosen = {
-            n: p.select(samples) if isinstance(p, DiskArray) else p[samples]
-            for n, p in parts.items()
+            name: part.select(samples) if hasattr(part, "select") else part[samples]
+            for name, part in parts.items()
+            if part is not None
         }
         return dataclasses.replace(self, **chosen)
 
@@ -322,20 +332,26 @@ DEPTH_REACH = 0.9
 
 
 def depth_levels(depth: Tensor, poses: LookAtPoses) -> Tensor:
-    """Quantise depth maps float [M, S, S]: 1 .. 255 within `DEPTH_REACH` of the centre's depth, 0 for no surface."""
+    """Quantise depth maps float [M, S, S]: 1 .. 255 within `DEPTH_REACH` of the centre's depth, 0
+    for no surface.
+    """
     nearer = (depth - poses.distance[:, None, None]) / DEPTH_REACH
     level = (1 + 127 * (nearer + 1)).round().clamp(1, 255)
     return torch.where(nearer.abs() <= 1, level, 0).to(torch.uint8)
 
 
 def depth_of_levels(levels: Tensor, poses: LookAtPoses) -> Tensor:
-    """The inverse of `depth_levels`: float32 [M, S, S] in units of the object frame, 0 for no surface."""
+    """The inverse of `depth_levels`: float32 [M, S, S] in units of the object frame, 0 for no
+    surface.
+    """
     depth = ((levels.float() - 1) / 127 - 1) * DEPTH_REACH + poses.distance[:, None, None]
     return torch.where(levels > 0, depth, 0.0)
 
 
 def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
-    """Join categories of one layout and split to a set with class ids. ValueError if their view classes differ."""
+    """Join categories of one layout and split to a set with class ids. ValueError if their view
+    classes differ.
+    """
     if len(datasets) == 1:
         return datasets[0]
     return dataclasses.replace(
@@ -347,7 +363,9 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
 
 
 def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
-    """Concatenate the views and objects of several sets. Raises ValueError if their kinds of images or poses differ."""
+    """Concatenate the views and objects of several sets. Raises ValueError if their kinds of
+    images or poses differ.
+    """
     first = datasets[0]
     for other in datasets[1:]:
         if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
@@ -355,17 +373,7 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
                 f"{other.category} and {first.category} differ in view classes or image size"
             )
     joined = {}
-    for name in (
-        "images",
-        "masks",
-        "depth",
-        "poses",
-        "view_ids",
-        "voxels",
-        "points",
-        "stored_sizes",
-        "crops",
-    ):
+    for name in (*_OF_VIEWS, "view_ids", "voxels", "points"):
         parts = [getattr(d, name) for d in datasets]
         if len({type(part) for part in parts}) > 1:
             raise ValueError(

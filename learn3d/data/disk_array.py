@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.files.reading import DamagedFile, open_file
+from learn3d.files.reading import DamagedFile, FaultHandler, attempt, open_file
 
 MAX_BYTES = 2**45  # size of a file
+_ROWS_AT_ONCE = 256  # rows that `check` reads at a time
 WANTED = "a shard of a data set"
 CHANGED = "its content has changed since it was written: another CRC-32"
 #: A row of an array: the number of its file, its number in the file, and its CRC-32.
@@ -23,7 +24,8 @@ ROW = np.dtype([("file", np.int32), ("row", np.int32), ("crc", np.uint32)])
 
 @dataclass(frozen=True, eq=False)
 class DiskArray:
-    """An array [M, ...] on disk, whose rows are in some files. `array[samples]` reads rows, int64 [B].
+    """An array [M, ...] on disk, whose rows are in some files. `array[samples]` reads rows, int64
+    [B].
 
     Files are not mapped into memory: if a mapped file is truncated later, a signal ends the
     process. Here a DamagedFile with its name is raised.
@@ -61,6 +63,14 @@ class DiskArray:
     def digest(self) -> int:
         """CRC-32 of the checksums of all rows."""
         return zlib.crc32(np.ascontiguousarray(self.rows["crc"]))
+
+    def check(self, on_fault: FaultHandler) -> None:
+        """Read all rows; report the first fault of each file."""
+        for number in range(len(self.files)):
+            rows = np.flatnonzero(self.rows["file"] == number)
+            for part in np.array_split(rows, len(rows) // _ROWS_AT_ONCE + 1):
+                if attempt(on_fault, self.__getitem__, part) is None:
+                    break
 
     def __getitem__(self, samples: np.ndarray) -> np.ndarray:
         file_of, row_of, crc_of = (self.rows[samples][name] for name in ROW.names)

@@ -9,22 +9,31 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-from learn3d.data import shards
-from learn3d.data.categories import SPLITS, find_splits, synset_of
-from learn3d.data.conventions import IMAGE_SIZE, LAYOUTS
+from learn3d.data.conventions import (
+    IMAGE_SIZE,
+    LAYOUTS,
+    SET_FILE,
+    SPLITS,
+    find_splits,
+    has_shards,
+    shards_folder,
+    synset_of,
+)
 from learn3d.data.dataset import ViewDataset, concatenate
 from learn3d.data.view_bins import AngleBins
-from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, Problem
+from learn3d.files.reading import FAULTS, FaultHandler, MissingFile, OddFile, refuse
+from learn3d.terminal import note
 
 Layout = Literal[tuple(LAYOUTS)]
+ALL_VIEWS = 2**31  # more views of an object than any data set has
 
 
 def reader(layout: str) -> ModuleType:
     """The module that reads a layout of `LAYOUTS`; it is imported when it is needed.
 
-    `load(folder, category, split, *, findings, ...)` reads a split of a category (name or synset
-    id), with the layout's `options` as keywords. It raises MissingFile or DamagedFile for the
-    first fault; if the findings are not strict, it records all faults and returns None.
+    `load(folder, category, split, *, on_fault, ...)` returns a split of a category (name or synset
+    id), with the layout's `options` as keywords. It gives each MissingFile, DamagedFile and OddFile
+    to `on_fault`, which raises faults; if it does not, the set lacks what is faulty.
     `contents(folder)` returns the categories of a folder and the splits of each. Raises KeyError
     for another name.
     """
@@ -35,7 +44,9 @@ def reader(layout: str) -> ModuleType:
 def check_options(
     layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None
 ) -> None:
-    """Raise ValueError for an unknown layout, or for an option of `load_dataset` that it does not support."""
+    """Raise ValueError for an unknown layout, or for an option of `load_dataset` that it does not
+    support.
+    """
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     if "image_size" not in LAYOUTS[layout].options and image_size != IMAGE_SIZE:
@@ -52,7 +63,9 @@ def check_options(
 
 
 def require_folder(folder: Path | str) -> None:
-    """Raise FileNotFoundError if the folder of a data set does not exist; the message has its absolute path."""
+    """Raise FileNotFoundError if the folder of a data set does not exist; the message has its
+    absolute path.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         absolute = "" if folder.is_absolute() else f" ({folder.absolute()})"
@@ -95,15 +108,24 @@ def load_dataset(
             f"category must be one name, or different names joined by commas, got {category!r}"
         )
     options = {"image_size": image_size, "views_per_object": views_per_object}
+    check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
+    odd: list[OddFile] = []
+
+    def on_fault(found: Exception) -> None:
+        refuse(found)
+        odd.append(found)
+
     try:
         dataset = concatenate(
-            [_read_split(layout, folder, name, split, **options) for name in names]
+            [_read_split(layout, folder, name, split, on_fault, **options) for name in names]
         )
-    except (DamagedFile, MissingFile) as error:
+    except FAULTS as error:
         _check_layout(folder, layout)
-        check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
         message = f"{error.message}. To list all faults of the data set, run: {check}"
         raise type(error)(error.path, message) from error
+    if odd:
+        others = f" ({len(odd) - 1} more: {check})" if len(odd) > 1 else ""
+        note(f"note: {odd[0]}{others}")
     if views_per_object is not None:
         dataset = dataset.with_few_views(views_per_object)
     if poses is not None:
@@ -118,17 +140,21 @@ def _read_split(
     folder: Path | str,
     category: str,
     split: str,
-    findings: Findings = STRICT,
+    on_fault: FaultHandler,
     **options: Any,
-) -> ViewDataset | None:
-    """Read a split of a category from its shards, or with the layout's reader and those of the options that it has."""
-    if shards.holds(folder, category, split):
+) -> ViewDataset:
+    """Read a split of a category from its shards, or with the layout's reader and those of the
+    options that it has.
+    """
+    if has_shards(folder, category, split):
+        from learn3d.data import shards  # here, as most data sets have none
+
         size = options.get("image_size")
         return shards.load(
-            folder, category, split, layout=layout, image_size=size, findings=findings
+            folder, category, split, layout=layout, image_size=size, on_fault=on_fault
         )
     known = {name: options[name] for name in LAYOUTS[layout].options if name in options}
-    return reader(layout).load(folder, category, split, findings=findings, **known)
+    return reader(layout).load(folder, category, split, on_fault=on_fault, **known)
 
 
 def _check_layout(folder: Path | str, asked: str) -> None:
@@ -146,12 +172,23 @@ def _check_layout(folder: Path | str, asked: str) -> None:
 
 
 @dataclass(frozen=True)
+class Problem:
+    """A fault or an oddity of one file."""
+
+    path: str
+    message: str  # what was found, and what was expected
+    severity: Literal["error", "warning"]
+
+
+@dataclass(frozen=True)
 class SplitReport:
-    """Faults of one category and split. Errors are those that `load_dataset` would raise; it would accept warnings."""
+    """Faults of one category and split. Errors are those that `load_dataset` would raise; it
+    would accept warnings.
+    """
 
     category: str
     split: str
-    objects: int  # number of objects that the files list
+    objects: int  # number of objects that can be read
     problems: tuple[Problem, ...]
 
     def count(self, severity: str) -> int:
@@ -169,7 +206,7 @@ def check_folder(
     """
     check_options(layout)
     require_folder(folder)
-    found = find_splits(folder, f"*/SPLIT/{shards.SET_FILE}")
+    found = find_splits(folder, f"*/SPLIT/{SET_FILE}")
     with contextlib.suppress(
         *(ValueError, OSError) if found or categories else ()
     ):  # the check finds this fault, too
@@ -182,19 +219,36 @@ def check_folder(
         raise MissingFile(
             Path(folder), f"holds nothing of the layout {layout!r}; its files: docs/data-sets.md"
         )
-    reports = []
-    for category in categories or found:
-        for split in splits or found.get(category) or found.get(synset_of(category)) or SPLITS:
-            findings = Findings()
-            try:
-                _read_split(layout, folder, category, split, findings)
-            except (ValueError, OSError) as error:
-                path = getattr(error, "path", folder)
-                message = getattr(error, "message", str(error))
-                findings.problems.append(Problem(str(path), message))
-            reports.append(
-                SplitReport(
-                    category, split, findings.objects, tuple(dict.fromkeys(findings.problems))
-                )
-            )
-    return reports
+    return [
+        _check_split(layout, folder, category, split)
+        for category in categories or found
+        for split in splits or found.get(category) or found.get(synset_of(category)) or SPLITS
+    ]
+
+
+def _check_split(layout: Layout, folder: Path | str, category: str, split: str) -> SplitReport:
+    """Read all of a split, and collect what is wrong."""
+    found: list[Exception] = []
+    objects = 0
+    try:
+        dataset = _read_split(
+            layout, folder, category, split, found.append, views_per_object=ALL_VIEWS
+        )
+        objects = dataset.num_objects
+        if has_shards(folder, category, split):
+            from learn3d.data import shards
+
+            where = shards_folder(folder, category, split)
+            shards.check_arrays(dataset, where, found.append)
+    except (ValueError, OSError) as error:
+        if all(isinstance(each, OddFile) for each in found):
+            found.append(error)  # else it follows from faults that are listed
+    problems = [
+        Problem(
+            str(getattr(each, "path", folder)),
+            getattr(each, "message", str(each)),
+            "warning" if isinstance(each, OddFile) else "error",
+        )
+        for each in found
+    ]
+    return SplitReport(category, split, objects, tuple(dict.fromkeys(problems)))

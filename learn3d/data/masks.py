@@ -13,7 +13,8 @@ _SAID = 0.01  # area that is left out, over that of the object, from which it is
 
 
 def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
-    """The object of a mask uint8 [H, W], without specks and other things; what was left out, None if next to nothing.
+    """The object of a mask uint8 [H, W], without specks and other things; what was left out, None
+    if next to nothing.
 
     Pixels above 127 that touch, also diagonally, form a region. The object is the largest region
     with its other parts: regions near it, and a larger one may be farther away. Fainter pixels
@@ -66,7 +67,9 @@ def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
 
 
 def _describe(left_out: np.ndarray, area: float) -> str | None:
-    """A sentence about the areas of regions that were left out; None if all are below a hundredth of the object."""
+    """A sentence about the areas of regions that were left out; None if all are below a hundredth
+    of the object.
+    """
     if left_out.max() >= _SIMILAR * area:
         return "several objects of similar size were found, and only the largest is used"
     share = left_out.sum() / area
@@ -97,6 +100,12 @@ def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
 
 
 def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Bounding box of the pixels above 127: left, top, right, bottom; right and bottom are excluded."""
+    """Bounding box of the pixels above 127: left, top, right, bottom; right and bottom are
+    excluded.
+
+    Raises ValueError if there are none.
+    """
+    if not (mask > 127).any():
+        raise ValueError("the mask has no pixel above half strength; is it the right mask?")
     rows, columns = (np.flatnonzero((mask > 127).any(axis=axis)) for axis in (1, 0))
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

@@ -27,7 +27,9 @@ MAX_CANDIDATES = 64
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """C candidate poses for each of N images, the most probable first. Raises ValueError for impossible values."""
+    """C candidate poses for each of N images, the most probable first. Raises ValueError for
+    impossible values.
+    """
 
     fingerprint: np.ndarray  # uint64 [N]
     azimuth_deg: np.ndarray  # float32 [N, C]
@@ -39,7 +41,8 @@ class PoseTable:
     confidence: np.ndarray
 
     def __post_init__(self) -> None:
-        count, shape = len(self.fingerprint), self.azimuth_deg.shape
+        count = len(self.fingerprint)
+        shape = self.azimuth_deg.shape
         if not count or len(shape) != 2 or not 1 <= shape[1] <= MAX_CANDIDATES:
             raise ValueError(
                 f"azimuth_deg must be [N, C] with N >= 1 and C in 1 .. {MAX_CANDIDATES}, got {shape}"
@@ -92,7 +95,8 @@ class PoseTable:
             return cls(*npz.read_several(Path(path), names, _WANTED))
 
     def apply(self, dataset: ViewDataset, source: str) -> ViewDataset:
-        """The data set with the poses of this table and view classes from them. `source` names the table in messages.
+        """The data set with the poses of this table and view classes from them. `source` names
+        the table in messages.
 
         Raises ValueError if an image is not in the table.
         """

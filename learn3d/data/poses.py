@@ -1,4 +1,6 @@
-"""Camera poses of the samples of a data set: look-at poses, rotations, and candidates for unknown ones."""
+"""Camera poses of the samples of a data set: look-at poses, rotations, and candidates for unknown
+ones.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,8 @@ class _PoseSet:
 
 @dataclass(frozen=True, eq=False)
 class LookAtPoses(_PoseSet):
-    """M perspective cameras that look at the origin from (distance, elevation, azimuth) in the object frame.
+    """M perspective cameras that look at the origin from (distance, elevation, azimuth) in the
+    object frame.
 
     Conventions of `nmr.cameras.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e
     cos a).
@@ -101,13 +104,16 @@ class LookAtPoses(_PoseSet):
         ).to(torch.float32)
 
     def mirrored(self, chosen: Tensor) -> LookAtPoses:
-        """The poses after the images `chosen` (bool [M]) are flipped left-right: their azimuths are negated."""
+        """The poses after the images `chosen` (bool [M]) are flipped left-right: their azimuths
+        are negated.
+        """
         return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
 
 
 @dataclass(frozen=True, eq=False)
 class RotationPoses(_PoseSet):
-    """M orthographic cameras, each given by a rotation (Pascal3D+): v' = R v, and x', y' in [-1, 1] span the image.
+    """M orthographic cameras, each given by a rotation (Pascal3D+): v' = R v, and x', y' in [-1,
+    1] span the image.
 
     Objects are moved in front of the camera (z' + `depth_offset`), which changes no pixel of a
     silhouette.
@@ -167,7 +173,8 @@ class PoseCandidates:
         return len(self.weights)
 
     def draw(self, indices: Tensor, seed: int, step: int) -> tuple[LookAtPoses, Tensor]:
-        """Poses and view classes int64 [B] of the images `indices`: a candidate each, drawn by weights, seed and step.
+        """Poses and view classes int64 [B] of the images `indices`: a candidate each, drawn by
+        weights, seed and step.
 
         So the gradient is an unbiased estimate of that of the expected loss over the candidates,
         at the cost of one pose.

@@ -26,7 +26,8 @@ VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_
 def batches(
     dataset: ViewDataset, options: Any, start: int = 1, rows: Tensor | slice = ALL_ROWS
 ) -> Iterator[Batch]:
-    """The batches of the training steps `start` .. `options.iterations`, sampled and augmented, without voxels.
+    """The batches of the training steps `start` .. `options.iterations`, sampled and augmented,
+    without voxels.
 
     options: `sampling`, `batch_size`, `augment`, `seed` and `iterations`, as in `TrainConfig`.
     rows: int64 [b], the rows that this rank takes of each batch (default: all). Random numbers
@@ -55,7 +56,8 @@ def batches(
 def sample_indices(
     dataset: ViewDataset, sampling: Sampling, batch_size: int, seed: int, step: int
 ) -> Tensor:
-    """Samples of step `step` (from 1): int64 [batch_size], or the largest multiple of the group size below it.
+    """Samples of step `step` (from 1): int64 [batch_size], or the largest multiple of the group
+    size below it.
 
     "views": epochs of shuffled views. "pairs": two different views of each of batch_size / 2
     random objects, [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "groups": GROUP_SIZE views of
@@ -108,8 +110,11 @@ def _epoch_order(num_samples: int, seed: int, epoch: int) -> Tensor:
 
 @functools.lru_cache(maxsize=2)
 def _grouped_views(dataset: ViewDataset, by_class: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Samples int64 [M] sorted by object or category, after the positions int64 at which each starts, and M."""
-    ids, count = dataset.object_ids, dataset.num_objects
+    """Samples int64 [M] sorted by object or category, after the positions int64 at which each
+    starts, and M.
+    """
+    ids = dataset.object_ids
+    count = dataset.num_objects
     if by_class:
         ids = np.zeros_like(ids) if dataset.class_ids is None else dataset.class_ids[ids]
         count = dataset.num_classes
@@ -133,7 +138,8 @@ def augment(
     count: int | None = None,
     rows: Tensor | slice = ALL_ROWS,
 ) -> Batch:
-    """The batch with the named augmentations, in this order, each drawn independently for every sample.
+    """The batch with the named augmentations, in this order, each drawn independently for every
+    sample.
 
     "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato
     and Harada 2019).
@@ -154,7 +160,8 @@ def augment(
     rng = np.random.default_rng([seed, step, 1])
     count = len(batch) if count is None else count
     for position, name in enumerate(names):
-        images, colors = batch.images, batch.images[:, :3]
+        images = batch.images
+        colors = batch.images[:, :3]
         if name == "crop":
             if position > 0 or batch.crops is None:
                 wanted = "the original images, which only the layout pascal3d without shards has"

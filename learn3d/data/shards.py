@@ -1,4 +1,5 @@
-"""Data sets of any size, stored as shards: files from which training reads the rows of one batch at a time.
+"""Data sets of any size, stored as shards: files from which training reads the rows of one batch
+at a time.
 
 The folder `FOLDER/CATEGORY/SPLIT/` of a split has the files
 
@@ -32,17 +33,24 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from learn3d.data.categories import synset_of
-from learn3d.data.conventions import LAYOUTS
+from learn3d.data.conventions import LAYOUTS, SET_FILE, shards_folder
 from learn3d.data.dataset import ViewDataset, join_datasets
 from learn3d.data.disk_array import CHANGED, MAX_BYTES, ROW, WANTED, DiskArray
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.files import limits
-from learn3d.files.reading import STRICT, DamagedFile, Findings, open_file, parse_json, read_json
+from learn3d.files.reading import (
+    DamagedFile,
+    FaultHandler,
+    OddFile,
+    attempt,
+    open_file,
+    parse_json,
+    read_json,
+    refuse,
+)
 from learn3d.files.writing import replacing, write_json
 from learn3d.settings import checked
 
-SET_FILE = "set.json"
 SHARD_BYTES = 2**28  # approximate size of the images in a shard
 _FILES = 5 * "[0-9]" + "*.safetensors"
 _REPORTS = 5 * "[0-9]" + "*.report.json"  # lists of meshes from `make_data.render`
@@ -56,7 +64,6 @@ _DTYPES = {  # by tensor; all others are float32
 }
 _POSES = {kind.__name__: kind for kind in (LookAtPoses, RotationPoses)}
 _MAKE_AGAIN = "make or copy it again"
-_ROWS_AT_ONCE = 256  # rows that the check reads at a time
 
 Text = Annotated[str, Field(max_length=1000)]
 
@@ -73,26 +80,15 @@ class SetFile:
     constants: dict[Text, float]  # fields of the poses with one value for all
 
 
-def split_folder(folder: Path | str, category: str, split: str) -> Path:
-    """The folder of the shards of a split."""
-    return Path(folder) / synset_of(category) / split
-
-
-def holds(folder: Path | str, category: str, split: str) -> bool:
-    """Whether the folder has this split as complete shards; False for an invalid category."""
-    try:
-        return (split_folder(folder, category, split) / SET_FILE).is_file()
-    except (ValueError, OSError):
-        return False
-
-
 def shard_path(folder: Path, number: int) -> Path:
     """Path of shard `number` in the folder of its split. The file exists only if it is complete."""
     return folder / f"{number:05d}.safetensors"
 
 
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
-    """Write `part` of a data set, with its arrays in memory, as shard `number` in the folder of its split."""
+    """Write `part` of a data set, with its arrays in memory, as shard `number` in the folder of
+    its split.
+    """
     tensors = {name: getattr(part, name).astype(np.int32) for name in ("object_ids", "view_ids")}
     tensors["sides"] = part.object_sizes().astype(np.float32)
     tensors |= {name: v.numpy() for name, v in _pose_fields(part).items() if isinstance(v, Tensor)}
@@ -109,7 +105,9 @@ def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
 
 
 def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> None:
-    """Mark a split of `shards` shards as complete, and remove what killed processes left. `part`: any part of it."""
+    """Mark a split of `shards` shards as complete, and remove what killed processes left. `part`:
+    any part of it.
+    """
     for path in itertools.chain(*(folder.glob(pattern) for pattern in _PARTIALS)):
         path.unlink(missing_ok=True)
     facts = SetFile(
@@ -160,14 +158,14 @@ def load(
     *,
     layout: str,
     image_size: int | None = None,
-    findings: Findings = STRICT,
-) -> ViewDataset | None:
+    on_fault: FaultHandler = refuse,
+) -> ViewDataset:
     """Read names and tables of a split, about 60 bytes for each view; the arrays stay on disk.
 
     Raises MissingFile and DamagedFile if shards are missing, damaged, or of another layout or
-    image size. If the findings are not strict, it checks all arrays, too, and returns None.
+    image size.
     """
-    where = split_folder(folder, category, split)
+    where = shards_folder(folder, category, split)
     content = read_json(where / SET_FILE, limits.JSON_BYTES, "the description of shards")
     try:
         facts = SetFile(**content)
@@ -185,31 +183,33 @@ def load(
         missing = next(
             path for n in itertools.count() if (path := shard_path(where, n)) not in paths
         )
-        findings.take(
-            DamagedFile(missing, f"the split needs {facts.shards} shards, but has {len(paths)}")
-        )
-    read = (findings.attempt(_read_shard, path, facts, category, split) for path in paths)
+        found = f"the split needs {facts.shards} shards, but has {len(paths)}"
+        on_fault(DamagedFile(missing, found))
+    read = (attempt(on_fault, _read_shard, path, facts, category, split) for path in paths)
     parts = [part for part in read if part is not None]
+    if not parts:
+        raise DamagedFile(where, f"has no whole shard; {_MAKE_AGAIN}")
     try:
-        dataset = join_datasets(parts) if parts else None
+        return join_datasets(parts)
     except ValueError as error:
         raise DamagedFile(where, f"has shards that differ ({error}); {_MAKE_AGAIN}") from error
-    if findings.strict or dataset is None:
-        return dataset
-    findings.objects = dataset.num_objects
-    for array in (
-        a for part in parts for name in _ARRAYS if (a := getattr(part, name)) is not None
-    ):
-        for rows in np.array_split(np.arange(len(array)), len(array) // _ROWS_AT_ONCE + 1):
-            if findings.attempt(array.__getitem__, rows) is None:
-                break
+
+
+def check_arrays(dataset: ViewDataset, where: Path, on_fault: FaultHandler) -> None:
+    """Read all arrays of a set of shards, whose folder is `where`, and report faults of their
+    rows.
+    """
+    for name in _ARRAYS:
+        if (array := getattr(dataset, name)) is not None:
+            array.check(on_fault)
     if warning := dataset.check_masks():
-        findings.warn(where, warning)
-    return None
+        on_fault(OddFile(where, warning))
 
 
 def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDataset:
-    """Read names and tables of a shard, and check them against the facts; its arrays stay on disk."""
+    """Read names and tables of a shard, and check them against the facts; its arrays stay on
+    disk.
+    """
     with open_file(path, MAX_BYTES, WANTED) as file:
         try:
             names, tables, arrays = _read_tables(path, file)
@@ -274,10 +274,12 @@ def _read_tables(
     if _crc(metadata["objects"], tables) != metadata["crc"]:
         raise ValueError(CHANGED)
     size = int.from_bytes(file.read(8), "little")
-    header, arrays = parse_json(file.read(size)), {}
+    header = parse_json(file.read(size))
+    arrays = {}
     for name in read.keys() - tables.keys():
         rows = np.zeros(len(tables[f"{name}.checksums"]), ROW)
-        rows["row"], rows["crc"] = np.arange(len(rows)), tables[f"{name}.checksums"]
+        rows["row"] = np.arange(len(rows))
+        rows["crc"] = tables[f"{name}.checksums"]
         if len(rows) != header[name]["shape"][0]:
             raise ValueError(
                 f"{name} has {header[name]['shape'][0]} rows, but {len(rows)} checksums"

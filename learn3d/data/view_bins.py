@@ -23,7 +23,8 @@ IMAGES_PER_CLASS = 8  # smallest mean number of images per view class
 
 @checked
 class AngleBins:
-    """Cells of equal width in azimuth and elevation, K = azimuth cells x elevation cells (paper, table of bins).
+    """Cells of equal width in azimuth and elevation, K = azimuth cells x elevation cells (paper,
+    table of bins).
 
     Cell = floor((azimuth + 180) / w) * n_el + floor((elevation - low) / h), as in the published
     code. Angles beyond the range are clamped to the first or last cell.
@@ -49,7 +50,9 @@ class AngleBins:
 
     @classmethod
     def parse(cls, text: str) -> AngleBins:
-        """From "15x20" (azimuth x elevation widths in degrees), or "15x20:-20:40" with a range of elevations."""
+        """From "15x20" (azimuth x elevation widths in degrees), or "15x20:-20:40" with a range of
+        elevations.
+        """
         number = r"(-?\d+(?:\.\d+)?)"
         if not (match := re.fullmatch(f"{number}x{number}(?::{number}:{number})?", text)):
             wanted = "AZIMUTHxELEVATION in degrees, such as 15x20 or 15x20:-20:40"
@@ -92,13 +95,15 @@ class AngleBins:
 def training_classes(
     views: tuple[np.ndarray, np.ndarray], training: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Class int64 [M] in 0 .. K-1 of each view, and the cells int64 [K] of the classes: those with training views.
+    """Class int64 [M] in 0 .. K-1 of each view, and the cells int64 [K] of the classes: those
+    with training views.
 
     views: their cells int64 [M] and directions float [M, D]. training: those of the training
     views. A view in another cell gets the class of the training view with the nearest direction,
     that is the largest dot product.
     """
-    cells, unseen = views[0].copy(), ~np.isin(views[0], training[0])
+    cells = views[0].copy()
+    unseen = ~np.isin(views[0], training[0])
     cells[unseen] = training[0][(views[1][unseen] @ training[1].T).argmax(axis=1)]
     kept = np.unique(training[0])
     return np.searchsorted(kept, cells), kept

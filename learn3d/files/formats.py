@@ -1,5 +1,6 @@
-"""Reads untrusted meshes, voxel grids and pretrained weights in the sandbox."""
+"""Reads untrusted meshes, voxel grids, tables of numbers and pretrained weights in the sandbox."""
 
+import io
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,24 +9,17 @@ from typing import BinaryIO
 import numpy as np
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import DamagedFile, faults_of, open_file, read_bytes
+from learn3d.files.reading import DamagedFile, faults_of, open_file, read_bytes, read_text
 
 # the last two need further packages
-EXTENSIONS = (
-    ".obj",
-    ".off",
-    ".ply",
-    ".stl",
-    ".glb",
-    ".gltf",
-    ".3mf",
-    ".dae",
-)
+EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".3mf", ".dae")
 
 
 @dataclass(frozen=True, eq=False)
 class RawMesh:
-    """The triangles of a file: right-handed coordinates of any scale and position, either winding."""
+    """The triangles of a file: right-handed coordinates of any scale and position, either
+    winding.
+    """
 
     vertices: np.ndarray  # float64 [V, 3]
     faces: np.ndarray  # int64 [F, 3]
@@ -71,7 +65,9 @@ def _read(path: Path) -> RawMesh:
 
 
 def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3]. Modules are imported here, so that a worker imports only those it needs."""
+    """Vertices [V, 3] and faces [F, 3]. Modules are imported here, so that a worker imports only
+    those it needs.
+    """
     kind = path.suffix.lower()
     if kind == ".obj":
         from nmr.obj import read_obj
@@ -108,7 +104,9 @@ def _file_below(folder: Path, name: str) -> bytes:
 
 
 def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
-    """Which numbers of the array `name` [size, size, size] of a MATLAB file (version 5 to 7) are not 0: bool."""
+    """Which numbers of the array `name` [size, size, size] of a MATLAB file (version 5 to 7) are
+    not 0: bool.
+    """
     import scipy.io  # imported here, as its import takes longer than a worker's start
 
     wanted = f"a MATLAB file (version 5 to 7) with the array {name!r} of numbers [{size}, {size}, {size}]"
@@ -121,8 +119,20 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
     return array != 0
 
 
+def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
+    """The first rows and columns of a table of numbers in a text file: float64 [rows, columns],
+    all finite.
+    """
+    text = io.StringIO(read_text(path, limits.TEXT_BYTES, wanted))
+    table = np.loadtxt(text, comments=None, usecols=range(columns), max_rows=rows, ndmin=2)
+    if (found := np.isfinite(table).all(axis=1).sum()) < rows:
+        raise ValueError(f"{found} rows of finite numbers, {rows} are needed")
+    return table
+
+
 def read_state_dict(path: Path) -> dict[str, np.ndarray]:
-    """Read the tensors of a state dict (.safetensors or from torch.save); half precision becomes float32.
+    """Read the tensors of a state dict (.safetensors or from torch.save); half precision becomes
+    float32.
 
     No code in the file is executed (weights_only). Raises DamagedFile if it is not a state dict.
     """

@@ -1,4 +1,6 @@
-"""Reads glTF 2.0, as JSON (.gltf) or binary (.glb): the triangles of the default scene, not animated."""
+"""Reads glTF 2.0, as JSON (.gltf) or binary (.glb): the triangles of the default scene, not
+animated.
+"""
 
 import base64
 import re
@@ -83,7 +85,8 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
         raise ValueError(f"it is glTF {version}; version 2 is read")
     if length > len(content):
         raise EOFError(f"it has {len(content)} bytes; its header promises {length}")
-    chunks, at = {}, 12
+    chunks = {}
+    at = 12
     while at + 8 <= length:
         size, kind = struct.unpack_from("<I4s", content, at)
         chunks.setdefault(kind, content[at + 8 : at + 8 + size])
@@ -106,7 +109,9 @@ class _Accessors:
     def __init__(
         self, tree: dict[str, Any], binary: bytes | None, read_other: Callable[[str], bytes]
     ) -> None:
-        self.tree, self.binary, self.read_other = tree, binary, read_other
+        self.tree = tree
+        self.binary = binary
+        self.read_other = read_other
         self.buffers: dict[int, bytes] = {}
 
     def read(self, number: int) -> np.ndarray:
@@ -122,8 +127,10 @@ class _Accessors:
         else:
             values = np.zeros(shape, kind)
         if sparse is not None:
-            count, values = sparse["count"], values.copy()
-            rows, new = sparse["indices"], sparse["values"]
+            count = sparse["count"]
+            values = values.copy()
+            rows = sparse["indices"]
+            new = sparse["values"]
             kind_of_rows = _COMPONENTS[rows["componentType"]]
             at = self._view(
                 rows["bufferView"], rows.get("byteOffset", 0), kind_of_rows, (count, 1)
@@ -136,10 +143,12 @@ class _Accessors:
         return values.astype(np.float64) if values.dtype.kind == "f" else values
 
     def _view(self, number: int, offset: int, kind: str, shape: tuple[int, int]) -> np.ndarray:
-        view, dtype = self.tree["bufferViews"][_index(number)], np.dtype(kind)
+        view = self.tree["bufferViews"][_index(number)]
+        dtype = np.dtype(kind)
         _refuse(view)
         width = shape[1] * dtype.itemsize
-        stride, offset = view.get("byteStride") or width, _index(offset)
+        stride = view.get("byteStride") or width
+        offset = _index(offset)
         data = self._buffer(view.get("buffer", 0))
         start = _index(view.get("byteOffset", 0))
         needed = offset + stride * (shape[0] - 1) + width if shape[0] else 0
@@ -180,7 +189,8 @@ def _places(tree: dict[str, Any]) -> dict[int, np.ndarray]:
     roots = [number for number in range(len(nodes)) if number not in children]
     if tree.get("scenes"):
         roots = tree["scenes"][_index(tree.get("scene", 0))].get("nodes", [])
-    waiting, places = [(number, np.eye(4)) for number in reversed(roots)], {}
+    waiting = [(number, np.eye(4)) for number in reversed(roots)]
+    places = {}
     while waiting:
         number, parent = waiting.pop()
         if number in places:
@@ -199,7 +209,9 @@ def _skinned(
     accessors: _Accessors,
     places: dict[int, np.ndarray],
 ) -> np.ndarray:
-    """Points [N, 3] moved by the joints of their skin. The place of the mesh itself has no effect."""
+    """Points [N, 3] moved by the joints of their skin. The place of the mesh itself has no
+    effect.
+    """
     joints = np.stack([places[number] for number in skin["joints"]])
     if "inverseBindMatrices" in skin:
         joints = joints @ accessors.read(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(

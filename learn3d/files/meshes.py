@@ -70,7 +70,8 @@ def read_off(content: bytes) -> Triangles:
         raise ValueError("it does not begin with OFF (or COFF, NOFF, STOFF), as a text file does")
     first = 1
     if not counts:
-        first, counts = 2, lines[1].split()
+        first = 2
+        counts = lines[1].split()
     num_vertices, num_faces = int(counts[0]), int(counts[1])
     rows = lines[first : first + num_vertices + num_faces]
     if len(rows) < num_vertices + num_faces and head == b"OFF":
@@ -92,7 +93,8 @@ def read_off(content: bytes) -> Triangles:
 
 def _off_rows(words: list[bytes], num_vertices: int, num_faces: int) -> list[bytes]:
     """The words of a plain OFF file as rows of a corner or a face, as far as they go."""
-    at, rows = 0, []
+    at = 0
+    rows = []
     while len(rows) < num_vertices + num_faces and at < len(words):
         size = 3 if len(rows) < num_vertices else 1 + int(words[at])
         if at + size > len(words):
@@ -110,7 +112,8 @@ def read_ply(content: bytes) -> Triangles:
     header = re.match(rb".*?[\r\n]end_header[ \t]*(?:\r\n|\n|\r)", content, re.DOTALL)
     if header is None:
         raise EOFError("its header does not end")
-    kind, elements = "", []
+    kind = ""
+    elements = []
     for line in header[0].decode("latin-1").splitlines():
         words = line.split()
         if words[:1] == ["format"]:
@@ -127,7 +130,10 @@ def read_ply(content: bytes) -> Triangles:
         except ValueError:  # the last number may be cut in two
             numbers = np.fromstring(b" ".join(body.rsplit(None, 1)[:-1]), sep=" ")
         body = numbers.tobytes()
-    vertices, corners, sizes, at = np.empty((0, 3)), np.empty(0, np.int64), np.empty(0, np.int64), 0
+    vertices = np.empty((0, 3))
+    corners = np.empty(0, np.int64)
+    sizes = np.empty(0, np.int64)
+    at = 0
     for name, count, properties in elements:
         if name == "tristrips" and count:
             raise ValueError("it has triangle strips (element tristrips); save it with triangles")
@@ -147,7 +153,9 @@ def read_ply(content: bytes) -> Triangles:
 def _ply_element(
     body: bytes, at: int, name: str, count: int, columns: list[tuple[str, list[np.dtype]]]
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
-    """The values of each column with the length of each row's list (1 without a list), and the end of the element."""
+    """The values of each column with the length of each row's list (1 without a list), and the
+    end of the element.
+    """
     end = EOFError(f"it ends within its {count} elements `{name}`")
     if count < 0 or count * max(sum(types[0].itemsize for _, types in columns), 1) > len(body) - at:
         raise end
@@ -155,10 +163,12 @@ def _ply_element(
         starts, sizes = _ply_rows(body, at, count, [types for _, types in columns])
     except struct.error:
         raise end from None
-    found, offsets = {}, starts[:-1]
+    found = {}
+    offsets = starts[:-1]
     if starts[-1] > len(body):
         raise end
-    content, same = np.frombuffer(body, np.uint8), count > 0 and not np.ptp(sizes, axis=1).any()
+    content = np.frombuffer(body, np.uint8)
+    same = count > 0 and not np.ptp(sizes, axis=1).any()
     for (column, types), lengths in zip(columns, sizes, strict=True):
         item = types[-1].itemsize
         offsets = offsets + (types[0].itemsize if len(types) > 1 else 0)
@@ -179,7 +189,9 @@ def _ply_element(
 def _ply_rows(
     body: bytes, at: int, count: int, columns: list[list[np.dtype]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where each row starts and the last one ends, int64 [count + 1], and the lengths of its lists [columns, count]."""
+    """Where each row starts and the last one ends, int64 [count + 1], and the lengths of its
+    lists [columns, count].
+    """
 
     def row(at: int) -> tuple[int, list[int]]:
         lengths = []
@@ -202,7 +214,8 @@ def _ply_rows(
         size = row(at)[0] - at
         starts = at + size * np.arange(count + 1)
         lengths = np.array(row(at)[1], np.int64)
-        same, offset = starts[-1] <= len(body), at
+        same = starts[-1] <= len(body)
+        offset = at
         for types, length in zip(columns, lengths, strict=True):
             if same and len(types) > 1:
                 same = bool((np.ndarray(count, types[0], body, offset, (size,)) == length).all())
@@ -210,7 +223,8 @@ def _ply_rows(
             offset += length * types[-1].itemsize
         if same:
             return starts, np.broadcast_to(lengths[:, None], (len(lengths), count))
-    starts, rows = [at], []
+    starts = [at]
+    rows = []
     for _ in range(count):
         at, lengths = row(at)
         starts.append(at)

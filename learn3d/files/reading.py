@@ -1,7 +1,8 @@
-"""Opens and reads untrusted files, and collects their faults.
+"""Opens and reads untrusted files, and reports their faults.
 
 A fault is a `DamagedFile` (a ValueError) or `MissingFile` (a FileNotFoundError), whose message
-names the file.
+names the file. A reader gives every fault of a data set to a `FaultHandler`: in a training that is
+`refuse`, which raises it; `learn3d check-dataset` collects them.
 """
 
 import contextlib
@@ -9,9 +10,8 @@ import json
 import os
 import stat
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, TypeVar
+from typing import Any, BinaryIO, TypeAlias, TypeVar
 
 R = TypeVar("R")
 
@@ -24,11 +24,7 @@ class _FileError(Exception):
         self.path, self.message = path, message
 
     def __reduce__(self) -> tuple[type, tuple[Path, str]]:
-        # for pickle, which passes only the text by default
-        return type(self), (
-            self.path,
-            self.message,
-        )
+        return type(self), (self.path, self.message)  # pickle would pass only the text
 
 
 class DamagedFile(_FileError, ValueError):
@@ -39,60 +35,44 @@ class MissingFile(_FileError, FileNotFoundError):
     """A missing file or folder."""
 
 
-@dataclass(frozen=True)
-class Problem:
-    """One fault of a file. `load` raises errors and ignores warnings."""
-
-    path: str
-    message: str  # the fault, and what was expected
-    severity: Literal["error", "warning"] = "error"
+FAULTS = (DamagedFile, MissingFile)
 
 
-@dataclass
-class Findings:
-    """Collects the faults of a data set. With strict findings the first fault is raised; so the same code loads and
-    checks a data set.
+class OddFile(_FileError, UserWarning):
+    """A file or folder that can be read, but is probably not as it was meant."""
+
+
+#: Where a reader says what it finds. It may raise, or return; then the reader goes on without the faulty file.
+FaultHandler: TypeAlias = Callable[[_FileError], None]
+
+
+def refuse(found: _FileError) -> None:
+    """What readers that need every file do: raise a fault, and ignore what is odd."""
+    if not isinstance(found, OddFile):
+        raise found
+
+
+def attempt(on_fault: FaultHandler, function: Callable[..., R], *arguments: Any) -> R | None:
+    """The result of function(*arguments). If it raises a fault, the fault is reported, and the
+    result is None.
     """
-
-    strict: bool = False  # True: raise the first error, ignore warnings
-    problems: list[Problem] = field(default_factory=list)
-    objects: int = 0  # number of objects that the files list
-
-    def attempt(self, function: Callable[..., R], *arguments: Any) -> R | None:
-        """The result of function(*arguments). If it raises a fault, the fault is recorded, and the result is None."""
-        try:
-            return function(*arguments)
-        except (DamagedFile, MissingFile) as error:
-            return self.take(error)
-
-    def take(self, result: Any) -> Any:
-        """A result of `sandbox.read_all`. If it is a fault, the fault is recorded, and the result is None."""
-        if not isinstance(result, (DamagedFile, MissingFile)):
-            return result
-        if self.strict:
-            raise result
-        self.problems.append(Problem(str(result.path), result.message))
-        return None
-
-    def warn(self, path: Path, message: str) -> None:
-        """Record a warning."""
-        if not self.strict:
-            self.problems.append(Problem(str(path), message, "warning"))
-
-
-STRICT = Findings(strict=True)
+    try:
+        return function(*arguments)
+    except FAULTS as fault:
+        on_fault(fault)
 
 
 @contextlib.contextmanager
 def faults_of(path: Path | str, wanted: str, advice: str = FETCH_AGAIN) -> Iterator[None]:
-    """Turn errors into a DamagedFile or MissingFile: libraries raise various ones for damaged files.
+    """Turn errors into a DamagedFile or MissingFile: libraries raise various ones for damaged
+    files.
 
     wanted: description of the file, for messages. advice: what to do; after an EOFError always to
     fetch it again.
     """
     try:
         yield
-    except (DamagedFile, MissingFile):
+    except FAULTS:
         raise
     except (FileNotFoundError, NotADirectoryError):
         raise MissingFile(Path(path), f"is missing; expected {wanted}") from None
@@ -140,7 +120,9 @@ def read_bytes(path: Path | str, max_bytes: int, wanted: str) -> bytes:
 
 
 def read_text(path: Path | str, max_bytes: int, wanted: str, *, encoding: str = "utf-8") -> str:
-    """The content of a text file, with line ends \\n. Raises as `open_file`, and DamagedFile for another encoding."""
+    """The content of a text file, with line ends \\n. Raises as `open_file`, and DamagedFile for
+    another encoding.
+    """
     with faults_of(path, wanted):
         text = read_bytes(path, max_bytes, wanted).decode(encoding)
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -35,7 +35,9 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 @dataclass(frozen=True)
 class Call:
-    """One file to read: function(path, *arguments). The module of the function should not import torch."""
+    """One file to read: function(path, *arguments). The module of the function should not import
+    torch.
+    """
 
     function: Callable[..., Any]
     path: Path
@@ -62,7 +64,9 @@ def read_all(groups: Iterable[Sequence[Call]]) -> Iterator[list[Any]]:
     A worker takes a whole group, for example the files of one object. The result for a bad file
     is a DamagedFile or MissingFile. Two groups more than there are cores are read ahead, at most.
     """
-    groups, running, most = iter(groups), deque(), cores() + 2
+    groups = iter(groups)
+    running = deque()
+    most = cores() + 2
     try:
         while True:
             while len(running) < most and (calls := next(groups, None)) is not None:
@@ -87,7 +91,8 @@ class _Worker:
 
     def __init__(self) -> None:
         self.connection, theirs = Pipe()
-        paths, end = [str(Path(__file__).parents[2]), *sys.path], theirs.fileno()
+        paths = [str(Path(__file__).parents[2]), *sys.path]
+        end = theirs.fileno()
         code = f"import sys; sys.path[:] = {paths!r}; from learn3d.files import sandbox; sandbox._serve({end})"
         # libraries print warnings
         silent = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
@@ -133,7 +138,8 @@ def _finish(worker: _Worker, calls: list[Call]) -> list[Any]:
         status = worker.end()
     if len(calls) > 1:
         return [next(read_all([[call]]))[0] for call in calls]
-    fault, advice = f"crashed its process (status {status})", FETCH_AGAIN
+    fault = f"crashed its process (status {status})"
+    advice = FETCH_AGAIN
     if status == -signal.SIGPROF:
         fault = f"takes more than {calls[0].seconds:g} seconds of processor time"
         advice = "Make a smaller file of it, or leave it out"
@@ -153,14 +159,18 @@ _working = False  # True in a worker
 
 
 def allow(memory: int, seconds: float = 0.0) -> None:
-    """Raise the limits of the running call by bytes and seconds, for a file whose header shows an acceptable size."""
+    """Raise the limits of the running call by bytes and seconds, for a file whose header shows an
+    acceptable size.
+    """
     if _working:
         left, _ = signal.getitimer(signal.ITIMER_PROF)
         _limit(resource.getrlimit(resource.RLIMIT_DATA)[0] + memory, left + seconds)
 
 
 def _serve(end: int) -> None:
-    """Run the requests, each a current folder and a list of calls, until the connection is closed."""
+    """Run the requests, each a current folder and a list of calls, until the connection is
+    closed.
+    """
     global _working
     _working = True
     package = ModuleType("nmr")  # for nmr.obj: nmr's __init__ would import torch
@@ -173,7 +183,8 @@ def _serve(end: int) -> None:
         while True:
             folder, calls = connection.recv()
             os.chdir(folder)
-            results, buffers = [_attempt(call) for call in calls], []
+            results = [_attempt(call) for call in calls]
+            buffers = []
             # arrays are sent without copies
             data = pickle.dumps(results, 5, buffer_callback=buffers.append)
             buffers = [buffer.raw() for buffer in buffers]
@@ -199,7 +210,9 @@ def _attempt(call: Call) -> Any:
 
 
 def _limit(memory: int, seconds: float) -> None:
-    """Limit the private memory of this process in bytes, and its further processor time; RLIM_INFINITY, 0: no limit."""
+    """Limit the private memory of this process in bytes, and its further processor time;
+    RLIM_INFINITY, 0: no limit.
+    """
     signal.setitimer(signal.ITIMER_PROF, seconds)  # then SIGPROF ends the process
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     if memory == resource.RLIM_INFINITY or (hard != resource.RLIM_INFINITY and memory > hard):

@@ -14,7 +14,8 @@ from learn3d.terminal import stop_on_signal
 
 @contextlib.contextmanager
 def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[Path]:
-    """Yield a temporary path in the folder of `path`; at the end the file there is renamed to `path`.
+    """Yield a temporary path in the folder of `path`; at the end the file there is renamed to
+    `path`.
 
     After an exception the temporary file is removed; a killed process leaves it. sync: the file
     is complete even after a power failure. writer: part of the temporary name, if several
@@ -62,7 +63,8 @@ def _sync(path: Path) -> None:
 
 
 def check_target(path: Path, option: str, *, folder: bool = False) -> None:
-    """Raise OSError if `path` cannot be written. To be called before long computations; it leaves no files.
+    """Raise OSError if `path` cannot be written. To be called before long computations; it leaves
+    no files.
 
     folder: `path` is a folder, which need not exist. option: the command's option for the path,
     for the message.
@@ -81,7 +83,9 @@ def check_target(path: Path, option: str, *, folder: bool = False) -> None:
 
 
 def give_second_name(path: Path, name: Path) -> None:
-    """Make `name` a hard link to `path`, or a copy if the file system has no hard links. Replaces a file `name`."""
+    """Make `name` a hard link to `path`, or a copy if the file system has no hard links. Replaces
+    a file `name`.
+    """
     with replacing(name, sync=True) as temporary:
         try:
             os.link(path, temporary)
@@ -102,7 +106,8 @@ def write_json(path: Path, value: Any, *, sync: bool = False) -> None:
 
 @contextlib.contextmanager
 def publishing(folder: Path, paths: Sequence[str]) -> Iterator[Path]:
-    """Yield a temporary folder in `folder`; at the end its files and folders `paths` replace those of `folder`.
+    """Yield a temporary folder in `folder`; at the end its files and folders `paths` replace
+    those of `folder`.
 
     If one of `paths` is missing in it, it is removed from `folder`; all other files stay. After
     an exception nothing changes. Signals wait until all files are moved, so that files of two

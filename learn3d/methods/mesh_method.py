@@ -1,10 +1,9 @@
-"""Base classes of the methods that learn meshes from silhouettes; and `refine`, which fits meshes to masks."""
+"""Base classes of the methods that learn meshes from silhouettes."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
@@ -23,7 +22,7 @@ from learn3d.networks.resnet import load_pretrained
 from learn3d.settings import FilePath, Positive, Weight, checked
 
 # classes of the view classifier: the azimuth cells of `fitting.fit`
-AZIMUTHS = AngleBins(15.0, 180.0, -90.0, 90.0)
+AZIMUTH_BINS = AngleBins(15.0, 180.0, -90.0, 90.0)
 MIN_COMPACT_SOLIDITY = 0.8  # objects count as compact if the data's solidity is at least this
 CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts a face on the border (0.5) as outside
 
@@ -37,26 +36,27 @@ class MeshSettings(MethodSettings):
     adam_beta1 = 0.9
 
     encoder: EncoderName = "conv"
-    """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask. conv-light: half the channels,
-    and a fourth convolution (1x1) to 32 channels. conv-small: a fifteenth of the weights.
-    conv-centred: a tenth of the weights, for objects that are all scaled to one size (cameras at
-    unknown distances). resnet18: on 224-pixel RGB."""
+    """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask.
+    conv-light: half the channels, and a fourth convolution (1x1) to 32 channels. conv-small: a
+    fifteenth of the weights. conv-centred: a tenth of the weights, for objects that are all
+    scaled to one size (cameras at unknown distances). resnet18: on 224-pixel RGB."""
     generator: GeneratorName = "sphere"
-    """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same; neighbours learn to move
-    together first. auto: sphere-smooth if the training masks are compact, else sphere.
-    sphere-small: sphere with half the weights. cube-conv, cube-fc: 1352 vertices of a cube's
-    surface, from convolutions or from linear layers (Kato and Harada 2019)."""
+    """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same;
+    neighbours learn to move together first. auto: sphere-smooth if the training masks are
+    compact, else sphere. sphere-small: sphere with half the weights. cube-conv, cube-fc: 1352
+    vertices of a cube's surface, from convolutions or from linear layers (Kato and Harada 2019)."""
     symmetry: SymmetryOption = None
-    """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a camera that looks along
-    it (0 is x = 0). auto: found from the training masks, if they have one. Shapes are not mirrored if it is None."""
+    """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a
+    camera that looks along it (0 is x = 0). auto: found from the training masks, if they have
+    one. Shapes are not mirrored if it is None."""
     learning_rate: Positive = 1e-4
     """Adam's learning rate, the same for all networks."""
     clamp_to_cube: bool = False
-    """Clamp vertices to the cube of the data set, if it has one, in evaluation and reconstruction. The voxelizers find
-    no inside in a shape that exceeds their grid."""
+    """Clamp vertices to the cube of the data set, if it has one, in evaluation and
+    reconstruction. The voxelizers find no inside in a shape that exceeds their grid."""
     pretrained: FilePath | None = None
-    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18. If not given: random
-    weights. VPL then freezes its batch norms."""
+    """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18.
+    If not given: random weights. VPL then freezes its batch norms."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1 in Peng et al. 2020)."""
 
@@ -97,7 +97,8 @@ def is_compact(info: DatasetInfo) -> bool:
 
 
 class MeshMethod(Method):
-    """A method with an encoder of images and a generator of meshes, which learns from rendered silhouettes.
+    """A method with an encoder of images and a generator of meshes, which learns from rendered
+    silhouettes.
 
     A subclass may add a network that classifies the azimuth of an image
     (`create_view_classifier`, `view_loss`).
@@ -113,10 +114,8 @@ class MeshMethod(Method):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         # for the renderer
-        self.faces, self.edges = (
-            self.generator.faces.cpu(),
-            self.generator.edges.cpu(),
-        )
+        self.faces = self.generator.faces.cpu()
+        self.edges = self.generator.edges.cpu()
 
     def create_networks(self) -> dict[str, nn.Module]:
         encoder = ENCODERS[self.settings.encoder](self.info.inverted)
@@ -127,7 +126,7 @@ class MeshMethod(Method):
         """The network "view_classifier", if `lambda_view` is above 0."""
         if self.settings.lambda_view == 0:
             return {}
-        classifier = ViewClassifier(math.prod(AZIMUTHS.shape), self.info.inverted)
+        classifier = ViewClassifier(math.prod(AZIMUTH_BINS.shape), self.info.inverted)
         return {"view_classifier": classifier.to(memory_format=self.memory_format)}
 
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
@@ -135,7 +134,8 @@ class MeshMethod(Method):
         trained = {
             name: network for name, network in self.networks.items() if list(network.parameters())
         }
-        rate, betas = self.settings.learning_rate, (self.settings.adam_beta1, 0.999)
+        rate = self.settings.learning_rate
+        betas = (self.settings.adam_beta1, 0.999)
         return {name: adam(network, rate, betas) for name, network in trained.items()}
 
     def start_from_pretrained(self) -> None:
@@ -157,7 +157,9 @@ class MeshMethod(Method):
         return Meshes(vertices, self.faces)
 
     def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's device."""
+        """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's
+        device.
+        """
         with self.autocast():
             codes = self.encoder(self._pixels(images))
             vertices = self.generator(codes)
@@ -175,12 +177,14 @@ class MeshMethod(Method):
         """The loss of the network "view_classifier" on stored images of these poses."""
         logits = self._apply(self.view_classifier, images)
         return pose_classification_loss(
-            logits, AZIMUTHS.ids(poses).to(self.device, non_blocking=True)
+            logits, AZIMUTH_BINS.ids(poses).to(self.device, non_blocking=True)
         )
 
     @property
     def memory_format(self) -> torch.memory_format:
-        """Layout of the convolutions: channels last is faster in bf16, and 7 % of a step slower in fp32 (AVX2)."""
+        """Layout of the convolutions: channels last is faster in bf16, and 7 % of a step slower
+        in fp32 (AVX2).
+        """
         return torch.channels_last if self.precision == "bf16" else torch.contiguous_format
 
     def _pixels(self, images: Tensor) -> Tensor:
@@ -192,7 +196,8 @@ class MeshMethod(Method):
             return network(self._pixels(images)).float()
 
     def flip_every_second(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Flip every second image if shapes are symmetric: the images, and bool [B], whether each is flipped.
+        """Flip every second image if shapes are symmetric: the images, and bool [B], whether each
+        is flipped.
 
         A flipped image of a symmetric object shows the same shape, so mask and pose stay the same.
         """
@@ -213,52 +218,3 @@ class MeshMethod(Method):
                 nmr.losses.smoothness_loss(vertices, self.edges),
             )
         }
-
-
-CODE_STEPS, VERTEX_STEPS = 40, 40  # steps of `refine`
-CODE_LEARNING_RATE = 0.1  # in units of the root mean square of the codes' entries
-VERTEX_LEARNING_RATE = 0.002  # in units of the object frame
-SMOOTHNESS = 0.001  # weight of the smoothness loss, as in the proposed method
-
-
-@torch.no_grad()
-def refine(method: Method, images: Tensor, masks: Tensor, poses: Poses) -> Meshes:
-    """Meshes of stored images uint8 [B,4,S,S], fitted to masks float32 [B,64,64] at the B cameras of `poses`.
-
-    Adam minimises soft IoU loss + 0.001 smoothness over the codes, which keeps shapes plausible,
-    and then over the vertices. Symmetric shapes stay symmetric. Raises ValueError if the method
-    predicts voxels.
-    """
-    if not isinstance(method, MeshMethod):
-        raise ValueError(
-            "only meshes can be fitted to masks, and this run predicts voxels; leave out --refine"
-        )
-
-    def decode(codes: Tensor) -> Tensor:
-        with method.autocast():
-            return method.generator(codes.to(method.device, non_blocking=True)).float().cpu()
-
-    @torch.enable_grad()
-    def descend(
-        start: Tensor, shape: Callable[[Tensor], Tensor], learning_rate: float, steps: int
-    ) -> Tensor:
-        """The variables after some steps; `shape` computes vertices from them."""
-        values = start.clone().requires_grad_()
-        optimizer = torch.optim.Adam([values], lr=learning_rate)
-        for _ in range(steps):
-            vertices = shape(values)
-            silhouettes = nmr.render_silhouette(
-                vertices, method.faces, poses.cameras(), image_size=masks.shape[-1]
-            )
-            fit = nmr.losses.soft_iou_loss(silhouettes, masks)
-            loss = fit + SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
-            (values.grad,) = torch.autograd.grad(loss, values)
-            optimizer.step()
-        return values.detach()
-
-    codes, symmetrized = method.encode(images).cpu(), method.generator.symmetrized
-    codes = descend(
-        codes, decode, CODE_LEARNING_RATE * float(codes.square().mean().sqrt()), CODE_STEPS
-    )
-    vertices = descend(decode(codes), symmetrized, VERTEX_LEARNING_RATE, VERTEX_STEPS)
-    return Meshes(symmetrized(vertices), method.faces)

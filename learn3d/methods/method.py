@@ -1,4 +1,6 @@
-"""Base classes of every method: settings, losses of a training step, prediction of shapes from images."""
+"""Base classes of every method: settings, losses of a training step, prediction of shapes from
+images.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.methods.optimization import EMA, TrainingSchedule
-from learn3d.pictures.surfaces import Surface, grid_surface
+from learn3d.pictures import Surface, grid_surface
 from learn3d.settings import checked
 
 #: The losses of a batch by name: the weight of each, and its value before weighting, a scalar tensor.
@@ -24,7 +26,9 @@ Losses: TypeAlias = dict[str, tuple[float, Tensor]]
 
 @checked
 class MethodSettings:
-    """Settings of a method. A run also reads the values below, which subclasses override, some by properties."""
+    """Settings of a method. A run also reads the values below, which subclasses override, some by
+    properties.
+    """
 
     # These values have no annotation, so they are no fields: nobody can set them.
     image_size = 64  # side of the encoder's input images in pixels
@@ -40,7 +44,9 @@ class MethodSettings:
         """Raise ValueError if the settings do not fit a run of this length and batch size."""
 
     def for_iterations(self, iterations: int) -> MethodSettings:
-        """These settings for a run of another length: phases of the training keep their share of it."""
+        """These settings for a run of another length: phases of the training keep their share of
+        it.
+        """
         return self
 
     def for_data(self, info: DatasetInfo) -> MethodSettings:
@@ -81,7 +87,9 @@ class Grids:
         return [grid_surface(grid, level=self.threshold) for grid in self.occupancy]
 
     def occupied(self, size: int) -> Tensor:
-        """Bool [B, size, size, size], whether the mean of a larger cell is above the threshold; size divides s."""
+        """Bool [B, size, size, size], whether the mean of a larger cell is above the threshold;
+        size divides s.
+        """
         return (
             F.avg_pool3d(self.occupancy[:, None], self.occupancy.shape[-1] // size)[:, 0]
             > self.threshold
@@ -89,8 +97,8 @@ class Grids:
 
 
 class Method(abc.ABC):
-    """One method in training or in use. A subclass creates networks and optimizers and computes losses;
-    `training.take_step` takes the steps.
+    """One method in training or in use. A subclass creates networks and optimizers and computes
+    losses; `training.take_step` takes the steps.
 
     Losses depend only on the batch, the step, the parameters and buffers of `networks`, and
     torch's global random state. A run that is resumed from these, `optimizers` and `ema` is
@@ -109,9 +117,12 @@ class Method(abc.ABC):
         precision: Literal["bf16", "fp32"],
         schedule: TrainingSchedule = TrainingSchedule(),  # noqa: B008 (it is frozen)
     ) -> None:
-        self.settings, self.info, self.schedule = settings.for_data(info), info, schedule
+        self.settings = settings.for_data(info)
+        self.info = info
+        self.schedule = schedule
         self.image_size = settings.image_size
-        self.device, self.precision = torch.device(device), precision
+        self.device = torch.device(device)
+        self.precision = precision
         self.networks = nn.ModuleDict(self.create_networks()).to(device)
         vars(self).update(self.networks)
         if schedule.ema_decay > 0:
@@ -124,14 +135,19 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def create_networks(self) -> dict[str, nn.Module]:
-        """The networks by name, for `settings` and `info`. Raises ValueError if these contradict each other."""
+        """The networks by name, for `settings` and `info`. Raises ValueError if these contradict
+        each other.
+        """
 
     @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Optimizers by name, with the learning rates of the settings; the loop applies the schedule."""
+        """Optimizers by name, with the learning rates of the settings; the loop applies the
+        schedule.
+        """
 
     def losses(self, batch: Batch, step: int) -> Losses:
-        """The losses of training step `step` (from 1), whose weighted sum all optimizers minimise together.
+        """The losses of training step `step` (from 1), whose weighted sum all optimizers minimise
+        together.
 
         Parameters that no loss of the step depends on do not change.
         """
@@ -140,7 +156,8 @@ class Method(abc.ABC):
         )
 
     def phases(self, batch: Batch, step: int) -> Iterator[tuple[Losses, tuple[str, ...]]]:
-        """The phases of training step `step`: the losses of each, and the names of the optimizers that minimise them.
+        """The phases of training step `step`: the losses of each, and the names of the optimizers
+        that minimise them.
 
         A step has one phase, `losses` with all optimizers, unless a subclass yields others. The
         optimizers of a phase have stepped when the next one is computed.
@@ -149,21 +166,27 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
-        """Shape codes float32 [B, C], on the method's device, of stored images uint8 [B, 4, S, S]."""
+        """Shape codes float32 [B, C], on the method's device, of stored images uint8 [B, 4, S,
+        S].
+        """
 
     @abc.abstractmethod
     def decode(self, codes: Tensor) -> Meshes | Grids:
         """The shapes of codes [B, C], on the CPU."""
 
     def view_probabilities(self, images: Tensor) -> Tensor | None:
-        """Probability of each cell of `AZIMUTHS`, float32 [B, K], for stored images; None if they were not learnt."""
+        """Probability of each cell of `mesh_method.AZIMUTH_BINS`, float32 [B, K], for stored images; None if they
+        were not learnt.
+        """
         return None
 
     def start_from_pretrained(self) -> None:  # noqa: B027
-        """Load the file of pretrained weights that the settings name, if any; called at the start of a run."""
+        """Load the file of pretrained weights that the settings name, if any; called at the start
+        of a run."""
 
     def check_batch(self, batch: Batch) -> None:  # noqa: B027
-        """Raise ValueError if the method cannot learn from batches like this one; called at the start of a run."""
+        """Raise ValueError if the method cannot learn from batches like this one; called at the
+        start of a run."""
 
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
         """Context in which the networks have their EMA weights, if the run keeps an EMA."""
@@ -171,7 +194,9 @@ class Method(abc.ABC):
 
     @contextlib.contextmanager
     def in_use(self) -> Iterator[None]:
-        """Context for evaluation during a training: `ema_weights`, and networks in evaluation mode. Do not nest it."""
+        """Context for evaluation during a training: `ema_weights`, and networks in evaluation
+        mode. Do not nest it.
+        """
         was_training = self.networks.training
         self.networks.eval()
         try:
@@ -181,7 +206,9 @@ class Method(abc.ABC):
             self.networks.train(was_training)
 
     def autocast(self) -> torch.autocast:
-        """Context in which the networks run at the method's precision; losses and rendering belong outside it."""
+        """Context in which the networks run at the method's precision; losses and rendering
+        belong outside it.
+        """
         return torch.autocast(
             self.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16"
         )

@@ -32,8 +32,8 @@ class MultiView(MeshMethod):
     settings: MultiViewSettings
 
     def losses(self, batch: Batch, step: int) -> Losses:
-        """Render the shapes of both views, a and b, in both views. The loss is the mean of the four IoU losses plus
-        lambda_smooth times the mean smoothness of the shapes.
+        """Render the shapes of both views, a and b, in both views. The loss is the mean of the
+        four IoU losses plus lambda_smooth times the mean smoothness of the shapes.
         """
         pairs = len(batch) // 2
         vertices = self.predict(batch.images)[1].cpu()
@@ -46,7 +46,9 @@ class MultiView(MeshMethod):
 
 @checked
 class ManyViewsSettings(MeshSettings):
-    """Networks and weights of the losses; a loss with weight 0 is not computed, but depth and slope are together."""
+    """Networks and weights of the losses; a loss with weight 0 is not computed, but depth and
+    slope are together.
+    """
 
     sampling = "groups"
     encoder: EncoderName = "conv-light"
@@ -59,10 +61,11 @@ class ManyViewsSettings(MeshSettings):
     lambda_depth: Weight = 3.0
     """Weight of the depth loss, in views whose depth is known."""
     lambda_slope: Weight = 3.0
-    """Weight of the slope loss: how depth changes from pixel to pixel, which shows how surfaces are turned."""
+    """Weight of the slope loss: how depth changes from pixel to pixel, which shows how surfaces
+    are turned."""
     lambda_view: Weight = 0.0
-    """Weight of the loss of a small network that classifies the azimuth of an image; reconstruction places the camera
-    of a picture by it. 0: no such network."""
+    """Weight of the loss of a small network that classifies the azimuth of an image;
+    reconstruction places the camera of a picture by it. 0: no such network."""
 
 
 class ManyViews(MeshMethod):
@@ -75,11 +78,13 @@ class ManyViews(MeshMethod):
         return super().create_networks() | self.create_view_classifier()
 
     def losses(self, batch: Batch, step: int) -> Losses:
-        """Render the shape of the first view of each object in all its views. The loss is projection + lambda_depth
-        depth + lambda_slope slope + lambda_smooth smoothness + lambda_prior prior + lambda_view
-        view. Every second image of symmetric objects is flipped first, but not for the loss view.
+        """Render the shape of the first view of each object in all its views. The loss is
+        projection + lambda_depth depth + lambda_slope slope + lambda_smooth smoothness +
+        lambda_prior prior + lambda_view view. Every second image of symmetric objects is flipped
+        first, but not for the loss view.
         """
-        settings, count = self.settings, len(batch) // GROUP_SIZE
+        settings = self.settings
+        count = len(batch) // GROUP_SIZE
         images = batch.images[:count]
         codes, vertices = self.predict(self.flip_every_second(images)[0])
         losses: Losses = {}

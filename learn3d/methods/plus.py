@@ -1,4 +1,5 @@
-"""Plus: the pose-invariant method with mirror symmetry and a loss at novel views, from masks of other objects.
+"""Plus: the pose-invariant method with mirror symmetry and a loss at novel views, from masks of
+other objects.
 
 The supervision is that of Peng et al. 2020: single images, each with its mask and its pose.
 """
@@ -40,8 +41,8 @@ class PlusSettings(PoseInvariantSettings):
     bank_size: Count = 2048
     """Number of training masks in the mask bank of the loss at novel views."""
     lambda_view: Weight = 0.0
-    """Weight of the loss of a small network that classifies the azimuth of an image; reconstruction places the camera
-    of a picture by it. 0: no such network."""
+    """Weight of the loss of a small network that classifies the azimuth of an image;
+    reconstruction places the camera of a picture by it. 0: no such network."""
 
     @property
     def reads_view_ids(self) -> bool:
@@ -103,9 +104,10 @@ class Plus(PoseInvariant):
         return networks | self.create_view_classifier()
 
     def losses(self, batch: Batch, step: int) -> Losses:
-        """The losses of `PoseInvariant`, lambda_view times that of the azimuths, and lambda_novel_view times that at a
-        novel view once the mask bank is full. Every second image of symmetric objects is flipped.
-        For the discriminator it has another view class then: K + k instead of k.
+        """The losses of `PoseInvariant`, lambda_view times that of the azimuths, and
+        lambda_novel_view times that at a novel view once the mask bank is full. Every second
+        image of symmetric objects is flipped. For the discriminator it has another view class
+        then: K + k instead of k.
         """
         images, flipped = self.flip_every_second(batch.images)
         codes, vertices = self.predict(images)
@@ -120,8 +122,9 @@ class Plus(PoseInvariant):
         return losses | self.surface_losses(vertices, step) | on_codes
 
     def novel_view_loss(self, vertices: Tensor, batch: Batch) -> Losses:
-        """Render all shapes of the batch at one of its cameras. The loss is the energy distance between these
-        silhouettes and the masks of this view class in the mask bank, mostly of other objects.
+        """Render all shapes of the batch at one of its cameras. The loss is the energy distance
+        between these silhouettes and the masks of this view class in the mask bank, mostly of
+        other objects.
         """
         whole, _ = whole_batch(batch)
         self.mask_bank.add(all_gather(_reduced(batch.masks)), whole.view_ids)

@@ -1,4 +1,6 @@
-"""The pose-invariant method (Peng et al. 2020), and Vanilla-AE: the same without the losses on codes."""
+"""The pose-invariant method (Peng et al. 2020), and Vanilla-AE: the same without the losses on
+codes.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +26,11 @@ class PoseInvariantSettings(MeshSettings):
     """Networks, weights and forms of the losses in L_tot; a loss with weight 0 is not computed."""
 
     lambda_smooth_end: Positive | None = None
-    """Weight of the smoothness loss at the end of the run, reached by exponential decay. Without it the weight stays
-    lambda_smooth."""
+    """Weight of the smoothness loss at the end of the run, reached by exponential decay. Without
+    it the weight stays lambda_smooth."""
     lambda_area: Weight | Literal["auto"] = 0.0
-    """Weight of the area of the surface. It prevents folds and flattens sides that no camera sees. auto: 0.03 if the
-    training masks are compact, else 0."""
+    """Weight of the area of the surface. It prevents folds and flattens sides that no camera
+    sees. auto: 0.03 if the training masks are compact, else 0."""
     lambda_classification: Weight = 1.0
     """Weight of the discriminator's own loss (lambda_2)."""
     lambda_adversarial: Weight = 1.0
@@ -36,7 +38,8 @@ class PoseInvariantSettings(MeshSettings):
     lambda_prior: Weight = 1.0
     """Weight of the Gaussian prior on the codes (lambda_4)."""
     adversarial_form: Literal["log", "probability"] = "log"
-    """Confusion loss: squared differences of log-probabilities (log, published code) or of probabilities (eq. 4)."""
+    """Confusion loss: squared differences of log-probabilities (log, published code) or of
+    probabilities (eq. 4)."""
     prior_form: Literal["squared", "norm"] = "squared"
     """Prior: squared norm of the codes (squared, published code) or their norm (norm, eq. 5)."""
 
@@ -71,7 +74,9 @@ class PoseInvariantSettings(MeshSettings):
 
 
 class PoseInvariant(MeshMethod):
-    """Encoder, mesh generator and, unless it is Vanilla-AE, a pose discriminator on the shape codes."""
+    """Encoder, mesh generator and, unless it is Vanilla-AE, a pose discriminator on the shape
+    codes.
+    """
 
     settings: PoseInvariantSettings
 
@@ -82,8 +87,9 @@ class PoseInvariant(MeshMethod):
         return networks
 
     def losses(self, batch: Batch, step: int) -> Losses:
-        """Encoder and generator learn in every step from projection + lambda_1 smoothness + lambda_area area + lambda_4
-        prior; encoder and discriminator learn by turns (see `losses_on_codes`).
+        """Encoder and generator learn in every step from projection + lambda_1 smoothness +
+        lambda_area area + lambda_4 prior; encoder and discriminator learn by turns (see
+        `losses_on_codes`).
         """
         codes, vertices = self.predict(batch.images)
         on_codes = self.losses_on_codes(codes, batch.view_ids, step)
@@ -100,14 +106,17 @@ class PoseInvariant(MeshMethod):
         return losses
 
     def smoothness_weight(self, step: int) -> float:
-        """The weight of the smoothness loss in step `step`: it decays exponentially to `lambda_smooth_end`."""
+        """The weight of the smoothness loss in step `step`: it decays exponentially to
+        `lambda_smooth_end`.
+        """
         first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
         done = min(1.0, (step - 1) / max(1, self.schedule.iterations - 1))
         return first ** (1 - done) * last**done
 
     def losses_on_codes(self, codes: Tensor, view_ids: Tensor, step: int) -> Losses:
-        """The prior; in odd steps classification on detached codes, which trains the discriminator alone; in even steps
-        confusion, which trains the encoder through the discriminator, which itself does not learn.
+        """The prior; in odd steps classification on detached codes, which trains the
+        discriminator alone; in even steps confusion, which trains the encoder through the
+        discriminator, which itself does not learn.
         """
         settings = self.settings
         losses: Losses = {}

@@ -28,14 +28,16 @@ def update_steps(iterations: int, count: int) -> tuple[int, ...]:
 
 @torch.no_grad()
 def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
-    """Reweight the candidates of all images of `dataset`; returns the share of images whose best pose changed.
+    """Reweight the candidates of all images of `dataset`; returns the share of images whose best
+    pose changed.
 
     The weights are softmax(IoU / TEMPERATURE + log p + b) over the candidates, with masks and
     renderings of SIZE pixels. p is the candidate's probability in the table, at least
     _LEAST_PRIOR. b is a number for each 15 degrees of azimuth, chosen so that each such cell
     keeps its frequency in the table.
     """
-    candidates, logits = dataset.candidates, []
+    candidates = dataset.candidates
+    logits = []
     count = candidates.weights.shape[1]
     with method.in_use():
         for rows in torch.arange(len(dataset)).split(_IMAGES):
@@ -61,11 +63,14 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
 
 
 def _with_marginal(logits: Tensor, azimuth_deg: Tensor, prior: Tensor) -> Tensor:
-    """Softmax of logits [M, C] plus a number for each cell of azimuths, which gives the cell its share in `prior`."""
+    """Softmax of logits [M, C] plus a number for each cell of azimuths, which gives the cell its
+    share in `prior`.
+    """
     cells = 360 // _CELL_DEG
     cell = ((azimuth_deg / _CELL_DEG).round().long() % cells).flatten()
     wanted = torch.bincount(cell, prior.flatten(), minlength=cells).clamp_min(1e-6)
-    weights, shift = logits.softmax(1), torch.zeros(cells, dtype=torch.float64)
+    weights = logits.softmax(1)
+    shift = torch.zeros(cells, dtype=torch.float64)
     for _ in range(_ROUNDS):
         shift += (
             wanted / torch.bincount(cell, weights.flatten(), minlength=cells).clamp_min(1e-6)

@@ -1,4 +1,6 @@
-"""PrGAN (Gadelha et al. 2017): a GAN of voxel grids trained on silhouettes, and an encoder trained afterwards."""
+"""PrGAN (Gadelha et al. 2017): a GAN of voxel grids trained on silhouettes, and an encoder
+trained afterwards.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ from learn3d.networks.encoders import network_input
 from learn3d.networks.voxel_gan import (
     DISCRIMINATOR_CHANNELS,
     GENERATOR_CHANNELS,
-    IMAGE_SIZE,
     SHAPE_CODE,
+    SILHOUETTE_SIZE,
     TAU,
     InverseEncoder,
     SilhouetteDiscriminator,
@@ -29,7 +31,7 @@ from learn3d.networks.voxel_gan import (
     VoxelGenerator,
     project,
 )
-from learn3d.runs.distributed import all_reduce_mean, rank, size
+from learn3d.runs.distributed import all_reduce_mean, rank, world_size
 from learn3d.settings import Items, LayerChannels, Positive, Share, Step, checked
 
 BETAS = (0.5, 0.999)  # Adam's decays for the two networks of the GAN
@@ -38,9 +40,11 @@ FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerC
 
 @checked
 class PrGANSettings(MethodSettings):
-    """Learning rates, widths, phases and cameras; the defaults are the published code's for airplanes."""
+    """Learning rates, widths, phases and cameras; the defaults are the published code's for
+    airplanes.
+    """
 
-    image_size = IMAGE_SIZE
+    image_size = SILHOUETTE_SIZE
     reads_view_ids = True
 
     encoder_from_step: Step = 53_051
@@ -58,12 +62,14 @@ class PrGANSettings(MethodSettings):
     discriminator_channels: FourLayers = DISCRIMINATOR_CHANNELS
     """Channels at 32^2, 16^2, 8^2 and 4^2; fewer on a small machine."""
     occupancy_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Predicted voxels with a higher mean are occupied. Not published; Kato's grids hold every cell that a shape
-    touches, so even true shapes reach an IoU of only .35 at 0.5, but .74 at 0.1."""
+    """Predicted voxels with a higher mean are occupied. Not published; Kato's grids hold every
+    cell that a shape touches, so even true shapes reach an IoU of only .35 at 0.5, but .74 at
+    0.1."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 30.0
     """Elevation of the K views, whose azimuths are equally spaced."""
     distance: Positive = 2.732
-    """Distance of the data set's cameras; with the field of view it gives the size of objects in the images."""
+    """Distance of the data set's cameras; with the field of view it gives the size of objects in
+    the images."""
     half_fov_deg: Annotated[float, Field(gt=0, lt=90)] = 15.0
     """Half of the field of view of the data set's cameras."""
 
@@ -133,7 +139,9 @@ class PrGAN(Method):
         return ((z[:, -1] + 1) * (self.views.count / 2)).long().clamp(0, self.views.count - 1)
 
     def generate(self, z: Tensor) -> Tensor:
-        """Silhouettes [B, 64, 64] of generated shapes, for z [B, 201] on the CPU. In float32: bf16 is slow here."""
+        """Silhouettes [B, 64, 64] of generated shapes, for z [B, 201] on the CPU. In float32:
+        bf16 is slow here.
+        """
         codes = z[:, :SHAPE_CODE].to(self.device, non_blocking=True)
         with torch.autocast(self.device.type, enabled=False):
             return project(self.generator(codes), self.view_ids(z), self.views, TAU)
@@ -145,7 +153,7 @@ class PrGAN(Method):
         learns from the discriminator's logits, and then from statistics of the discriminator's
         first layer. All three use the same z, as in the published code.
         """
-        z = self.sample_z(size() * len(batch)).chunk(size())[rank()]
+        z = self.sample_z(world_size() * len(batch)).chunk(world_size())[rank()]
         if step >= self.settings.encoder_from_step:
             yield {"encoder": (1.0, self.encoder_loss(z))}, ("encoder",)
             return
@@ -179,8 +187,8 @@ class PrGAN(Method):
         )
 
     def encoder_loss(self, z: Tensor) -> Tensor:
-        """Summed squared error of the z that the encoder predicts from samples of the generator, which is in evaluation
-        mode.
+        """Summed squared error of the z that the encoder predicts from samples of the generator,
+        which is in evaluation mode.
         """
         self.networks.eval()
         with torch.no_grad():
@@ -189,11 +197,13 @@ class PrGAN(Method):
             estimate = self.encoder(images)
         difference = estimate.float() - z.to(self.device, non_blocking=True)
         # the sum over all ranks, whose losses are averaged
-        return size() * difference.square().sum()
+        return world_size() * difference.square().sum()
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> Tensor:
-        """Mean probability, in evaluation mode, that the discriminator assigns to the right answers: a scalar."""
+        """Mean probability, in evaluation mode, that the discriminator assigns to the right
+        answers: a scalar.
+        """
         self.networks.eval()
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
@@ -202,7 +212,9 @@ class PrGAN(Method):
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
-    """Sum over all features [B, ...] of the squared differences of their batch means and batch variances."""
+    """Sum over all features [B, ...] of the squared differences of their batch means and batch
+    variances.
+    """
     means, variances = [], []  # torch.var takes ten times as long over the first axis
     for features in (of_real, of_fake):
         mean = all_reduce_mean(features.mean(0))
@@ -212,7 +224,8 @@ def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
-    """Raise a ValueError unless every camera is that of its view class, as PrGAN has a fixed table of views.
+    """Raise a ValueError unless every camera is that of its view class, as PrGAN has a fixed
+    table of views.
 
     Tolerances: half a degree for angles, half a percent for the distance, 0.1 degrees for half
     the field of view.

@@ -1,4 +1,5 @@
-"""View prior learning (VPL; Kato and Harada 2019), as re-implemented by Peng et al. 2020 and as published.
+"""View prior learning (VPL; Kato and Harada 2019), as re-implemented by Peng et al. 2020 and as
+published.
 
 A discriminator learns to separate silhouettes of predicted shapes at the view of the input image
 ("real") from those at other views ("fake"); encoder and generator learn to fool it.
@@ -44,8 +45,9 @@ class VPLSettings(MeshSettings):
     """
 
     encoder: Literal["conv", "preact-resnet18", "resnet18"] = "conv"
-    """Network from images to codes. conv: three convolutions, 64-pixel RGB and mask. preact-resnet18: RGB on grey.
-    resnet18: RGB, may be pretrained. The last two take any multiple of 32 pixels (--image-size)."""
+    """Network from images to codes. conv: three convolutions, 64-pixel RGB and mask.
+    preact-resnet18: RGB on grey. resnet18: RGB, may be pretrained. The last two take any multiple
+    of 32 pixels (--image-size)."""
     image_size: Pixels = 64
     """Side of the input images in pixels."""
     vertex_scale: Positive = 0.01
@@ -53,21 +55,24 @@ class VPLSettings(MeshSettings):
     object_scale: Positive = 0.5
     """Cube generators only: factor of the vertices; they start on a sphere of half this radius."""
     discriminator: Literal["dcgan", "spectral-patch", "patch"] = "dcgan"
-    """dcgan: reads one-hot view planes. spectral-patch, patch: read the camera's pose (ShapeNet, Pascal3D+)."""
+    """dcgan: reads one-hot view planes. spectral-patch, patch: read the camera's pose (ShapeNet,
+    Pascal3D+)."""
     discriminator_channels: Channels = 128
-    """Channels of the discriminator's first layer; those of later layers are multiples (published: dcgan 128,
-    spectral-patch 32, patch 64)."""
+    """Channels of the discriminator's first layer; those of later layers are multiples
+    (published: dcgan 128, spectral-patch 32, patch 64)."""
     class_conditional: bool = False
-    """Give the discriminator the object's category (only with spectral-patch and data of several categories)."""
+    """Give the discriminator the object's category (only with spectral-patch and data of several
+    categories)."""
     adversary: Literal["alternating", "reversal"] = "alternating"
-    """alternating: odd steps train the discriminator, even ones the shapes against it. reversal: both in one step
-    through a gradient reversal layer (as published)."""
+    """alternating: odd steps train the discriminator, even ones the shapes against it. reversal:
+    both in one step through a gradient reversal layer (as published)."""
     other_views: Literal["random", "reversed", "next"] = "random"
-    """Sample of the batch that gives each sample its other view. random: one of another view class. reversed: the one
-    at the same place from the batch's end (published, ShapeNet). next: the next one of its
-    category (published, Pascal3D+)."""
+    """Sample of the batch that gives each sample its other view. random: one of another view
+    class. reversed: the one at the same place from the batch's end (published, ShapeNet). next:
+    the next one of its category (published, Pascal3D+)."""
     silhouette_size: Pixels = 64
-    """Side of rendered silhouettes: 64 (compared with the data's masks) or image_size (with the input's own mask)."""
+    """Side of rendered silhouettes: 64 (compared with the data's masks) or image_size (with the
+    input's own mask)."""
     anti_aliasing: bool = True
     """Render silhouettes with 2x2 samples per pixel."""
     renderer_gradient: Literal["nmr", "local"] = "nmr"
@@ -79,7 +84,8 @@ class VPLSettings(MeshSettings):
     lambda_inflation: Weight = 0.0
     """Weight of the inflation loss (internal pressure)."""
     lambda_discriminator: Weight = 1.0
-    """Weight of the adversarial loss on the shapes (lambda_D); the discriminator's own loss has weight 1."""
+    """Weight of the adversarial loss on the shapes (lambda_D); the discriminator's own loss has
+    weight 1."""
 
     @property
     def reads_view_ids(self) -> bool:
@@ -124,12 +130,15 @@ class VPLSettings(MeshSettings):
 
 
 class VPL(MeshMethod):
-    """Encoder, mesh generator and, unless it is the baseline, a discriminator of silhouettes and their views."""
+    """Encoder, mesh generator and, unless it is the baseline, a discriminator of silhouettes and
+    their views.
+    """
 
     settings: VPLSettings
 
     def create_networks(self) -> dict[str, nn.Module]:
-        settings, info = self.settings, self.info
+        settings = self.settings
+        info = self.info
         if settings.encoder == "preact-resnet18":
             encoder = PreactResNet18(settings.image_size)
         elif settings.encoder == "resnet18":
@@ -235,7 +244,9 @@ class VPL(MeshMethod):
         seen_at: Tensor,
         own: Tensor,
     ) -> Tensor:
-        """Logits for silhouettes [b,S,S] of the shapes `own` of a whole batch, seen at its views `seen_at`."""
+        """Logits for silhouettes [b,S,S] of the shapes `own` of a whole batch, seen at its views
+        `seen_at`.
+        """
         silhouettes = silhouettes.to(self.device, non_blocking=True)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
@@ -250,7 +261,8 @@ class VPL(MeshMethod):
 
 
 def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> Tensor:
-    """For each sample the index of the sample whose view is its other view, int64 [B]; see VPLSettings.other_views.
+    """For each sample the index of the sample whose view is its other view, int64 [B]; see
+    VPLSettings.other_views.
 
     "random" uses torch's global generator, and takes any sample if the batch has one view class.
     As published, "reversed" gives the middle sample of an odd batch its own view, and "next" does

@@ -49,7 +49,8 @@ class OneHotViewDiscriminator(nn.Module):
 
 
 class SpectralPatchDiscriminator(nn.Module):
-    """ "shapenet_patch" of Kato and Harada 2019: one logit per patch, [B,S/64,S/64] rounded up (4x4 for S = 224).
+    """ "shapenet_patch" of Kato and Harada 2019: one logit per patch, [B,S/64,S/64] rounded up
+    (4x4 for S = 224).
 
     5x5 convolutions of stride 2 with c, 2c, 4c, 8c, 8c channels (c = 32), each with spectral
     normalisation, batch norm without gain and leaky ReLU. After the first one, c channels of view
@@ -95,7 +96,8 @@ class SpectralPatchDiscriminator(nn.Module):
 
 
 class PatchDiscriminator(nn.Module):
-    """ "pascal_patch" of Kato and Harada 2019: one logit per patch, [B,h,w]; no normalisation of any kind.
+    """ "pascal_patch" of Kato and Harada 2019: one logit per patch, [B,h,w]; no normalisation of
+    any kind.
 
     4x4 convolutions with c (stride 2), 2c (2), 4c (2), 8c (1) and 1 (1) channels (c = 64), leaky
     ReLUs. After the first one, c channels of view features are appended (linear layer, leaky

@@ -45,7 +45,8 @@ class SmallConvEncoder(ConvEncoder):
 
 
 class LightConvEncoder(ConvEncoder):
-    """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear layers. Unpublished.
+    """ConvEncoder with half the channels and a 1x1 convolution to 32 channels before the linear
+    layers. Unpublished.
 
     3.9 million weights, not 19. With torch's initial weights the codes of the first hundred steps
     hardly depend on the image: mode collapse may follow, so the convolutions get He's. A white
@@ -55,7 +56,8 @@ class LightConvEncoder(ConvEncoder):
 
     def __init__(self, inverted: bool = True) -> None:
         nn.Module.__init__(self)
-        self.inverted, narrow = inverted, 32
+        self.inverted = inverted
+        narrow = 32
         self.convolutions = _convolutions(32, 64, 128).extend(
             [nn.Conv2d(128, narrow, 1), nn.ReLU()]
         )
@@ -69,7 +71,8 @@ class LightConvEncoder(ConvEncoder):
 
 
 class CentredConvEncoder(LightConvEncoder):
-    """LightConvEncoder with two more convolutions, one hidden layer and scaled input: all objects have one size.
+    """LightConvEncoder with two more convolutions, one hidden layer and scaled input: all objects
+    have one size.
 
     A cut-out picture does not show the camera's distance. With this encoder training images do
     not show it either, so the size of an object is learnt from its appearance. 2.0 million
@@ -90,7 +93,8 @@ class CentredConvEncoder(LightConvEncoder):
 
 
 class ViewClassifier(nn.Module):
-    """Images [B,4,64,64], as for an encoder -> logits [B,K] over K view classes. Objects are scaled to one size.
+    """Images [B,4,64,64], as for an encoder -> logits [B,K] over K view classes. Objects are
+    scaled to one size.
 
     0.2 million weights. Unpublished.
     """
@@ -110,9 +114,9 @@ class ViewClassifier(nn.Module):
 
 
 def centre(images: Tensor, object_size: float = CENTRED_SIZE) -> Tensor:
-    """Scale and shift images float [B,C,S,S], the mask last, so that the mask's bounding box is centred and its longer
-    side takes `object_size` of the image. Beyond the border, colours are repeated and the mask is
-    0. Images with an empty mask do not change.
+    """Scale and shift images float [B,C,S,S], the mask last, so that the mask's bounding box is
+    centred and its longer side takes `object_size` of the image. Beyond the border, colours are
+    repeated and the mask is 0. Images with an empty mask do not change.
     """
     size = images.shape[-1]
     inside = images[:, -1] > 0.5
@@ -175,7 +179,8 @@ def network_input(
 
 
 class PreactResNet18(nn.Module):
-    """Images [B,4,S,S] in [0,1] -> shape code [B,512], unbounded; S is a multiple of 32 (published: 224).
+    """Images [B,4,S,S] in [0,1] -> shape code [B,512], unbounded; S is a multiple of 32
+    (published: 224).
 
     As published by Kato and Harada 2019: colours in [-1,1], 0 (grey) if the mask is 0; 7x7
     convolution of stride 2, batch norm, ReLU, 3x3 maximum of stride 2; four stages of two blocks
@@ -203,9 +208,9 @@ class PreactResNet18(nn.Module):
 
 
 class _Block(nn.Module):
-    """x + f(x): f is two 3x3 convolutions, with batch norm and ReLU before each (except at the input of the first
-    block). If the number of channels changes, x passes a 1x1 convolution, and it and the first
-    one have stride 2.
+    """x + f(x): f is two 3x3 convolutions, with batch norm and ReLU before each (except at the
+    input of the first block). If the number of channels changes, x passes a 1x1 convolution, and
+    it and the first one have stride 2.
     """
 
     def __init__(self, before: int, after: int, first: bool = False) -> None:

@@ -1,4 +1,6 @@
-"""Mesh generators, shape codes -> vertices: deformed spheres and cubes, with mirror symmetry about a vertical plane."""
+"""Mesh generators, shape codes -> vertices: deformed spheres and cubes, with mirror symmetry
+about a vertical plane.
+"""
 
 import math
 from typing import Annotated, Literal
@@ -20,7 +22,8 @@ SymmetryOption = Symmetry | Literal["auto"] | None
 
 
 class MeshGenerator(nn.Module):
-    """Shape code [B,512] -> vertices float32 [B,V,3] in the object frame (y up), on faces of a fixed topology.
+    """Shape code [B,512] -> vertices float32 [B,V,3] in the object frame (y up), on faces of a
+    fixed topology.
 
     If `symmetry` is not None, a subclass computes vertices that are symmetric about z = 0, and
     `place` turns them about the vertical axis to the plane `symmetry`.
@@ -58,7 +61,9 @@ class MeshGenerator(nn.Module):
         return (vertices[..., None] * self.rotation).sum(-2)
 
     def symmetrized(self, vertices: Tensor) -> Tensor:
-        """The mean of placed vertices [B,V,3] and their mirror images; `vertices` without symmetry."""
+        """The mean of placed vertices [B,V,3] and their mirror images; `vertices` without
+        symmetry.
+        """
         if self.mirror is None:
             return vertices
         mirrored = vertices[:, self.mirror.to(vertices.device), :, None] * self.reflection.to(
@@ -68,7 +73,9 @@ class MeshGenerator(nn.Module):
 
     @property
     def reflection(self) -> Tensor | None:
-        """The reflection float32 [3,3] that maps placed shapes to themselves; None without symmetry."""
+        """The reflection float32 [3,3] that maps placed shapes to themselves; None without
+        symmetry.
+        """
         if self.mirror is None:
             return None
         turn = torch.eye(3) if self.rotation is None else self.rotation.cpu()
@@ -110,7 +117,8 @@ class SphereGenerator(MeshGenerator):
                 for side in (self.sphere[:, 2] == 0, self.sphere[:, 2] > 0)
             )
             self.outputs = 2 * len(middle) + 3 * len(right)
-            source, sign = torch.full(self.sphere.shape, self.outputs), torch.ones_like(self.sphere)
+            source = torch.full(self.sphere.shape, self.outputs)
+            sign = torch.ones_like(self.sphere)
             source[middle, :2] = torch.arange(2 * len(middle)).reshape(-1, 2)
             source[right] = torch.arange(2 * len(middle), self.outputs).reshape(-1, 3)
             source[self.mirror[right]] = source[right]
@@ -131,7 +139,8 @@ class SphereGenerator(MeshGenerator):
 
 
 class SmoothSphereGenerator(SphereGenerator):
-    """SphereGenerator with the displacements D = M U of its outputs U, M = a I + (1 - a) (I + b L)^-1.
+    """SphereGenerator with the displacements D = M U of its outputs U, M = a I + (1 - a) (I + b
+    L)^-1.
 
     L [642,642] is the graph Laplacian of the sphere, b = 3, a = 0.2. M keeps low frequencies over
     the sphere and reduces high ones to a fifth, so they are learnt more slowly: whole parts move
@@ -167,7 +176,9 @@ class SmoothSphereGenerator(SphereGenerator):
 
 
 class SmallSphereGenerator(SphereGenerator):
-    """SphereGenerator with hidden layers of 1024, half the weights, for the package's model and small data sets."""
+    """SphereGenerator with hidden layers of 1024, half the weights, for the package's model and
+    small data sets.
+    """
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:
         super().__init__(symmetry)
@@ -180,7 +191,8 @@ BOUND = 1.2  # coordinates lie between -BOUND and BOUND
 
 
 def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
-    """The surface of a grid of size^3 points: (points int64 [V,3], patches int64 [6,size,size], faces int64 [F,3]).
+    """The surface of a grid of size^3 points: (points int64 [V,3], patches int64 [6,size,size],
+    faces int64 [F,3]).
 
     patches[f, i, j] is the vertex at (i, j) of side f of the cube; sides share the vertices at
     edges and corners. Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and
@@ -219,7 +231,9 @@ class CubeGenerator(MeshGenerator):
         points, patches, faces = cube_surface()
         centred = 2 * points.double() / (GRID_SIZE - 1) - 1
         super().__init__(centred, faces, symmetry)
-        self.patches, self.scale, self.object_scale = patches, scale, object_scale
+        self.patches = patches
+        self.scale = scale
+        self.object_scale = object_scale
         sphere = centred / centred.norm(dim=1, keepdim=True)
         self.base = nn.Parameter(torch.atanh(INITIAL_RADIUS * sphere / BOUND).float())
         signs = torch.ones(len(points), 3)
@@ -236,7 +250,8 @@ class CubeGenerator(MeshGenerator):
 
 
 class ConvCubeGenerator(CubeGenerator):
-    """A stack of transposed convolutions for each side of the cube; shared vertices get the mean (ShapeNet).
+    """A stack of transposed convolutions for each side of the cube; shared vertices get the mean
+    (ShapeNet).
 
     Each stack: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64
     channels, batch norm and ReLU after each of the four; 3x3 convolution to 3@16x16.

@@ -21,7 +21,9 @@ def norm_relu(channels: int) -> list[nn.Module]:
 
 
 def initialize_he(network: nn.Module) -> None:
-    """He's normal distribution for the weights of all convolutions and linear layers, 0 for their biases."""
+    """He's normal distribution for the weights of all convolutions and linear layers, 0 for their
+    biases.
+    """
     for module in network.modules():
         if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)):
             nn.init.kaiming_normal_(module.weight)

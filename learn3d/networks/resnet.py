@@ -1,4 +1,5 @@
-"""ResNet-18 (He et al. 2016) as an image encoder, with the parameter names of torchvision's resnet18.
+"""ResNet-18 (He et al. 2016) as an image encoder, with the parameter names of torchvision's
+resnet18.
 
 torchvision itself is no dependency, as it has no build for every PyTorch that nmr supports.
 """
@@ -17,7 +18,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class _Block(nn.Module):
-    """Two 3x3 convolutions beside a shortcut: relu(f(x) + x); x passes a 1x1 convolution if its size changes."""
+    """Two 3x3 convolutions beside a shortcut: relu(f(x) + x); x passes a 1x1 convolution if its
+    size changes.
+    """
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()

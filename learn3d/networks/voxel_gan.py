@@ -1,4 +1,5 @@
-"""PrGAN's networks (Gadelha et al. 2017): voxel generator, projection, silhouette discriminator, inverse encoder.
+"""PrGAN's networks (Gadelha et al. 2017): voxel generator, projection, silhouette discriminator,
+inverse encoder.
 
 Layers, sizes and initial weights are those of the published TensorFlow code: weights of fully
 connected layers from N(0, 0.1), of convolutions from N(0, 0.02), biases 0. TensorFlow's momentum
@@ -23,7 +24,7 @@ from torch import Tensor, nn
 import nmr
 
 SHAPE_CODE = 200  # entries of z for the shape; one more entry decides the view
-IMAGE_SIZE = 64
+SILHOUETTE_SIZE = 64
 TAU = 0.5  # factor of the density in the projection; a full voxel has density 1 / TAU and lets exp(-1) of light pass
 GENERATOR_CHANNELS = (128, 64, 32, 1)
 DISCRIMINATOR_CHANNELS = (128, 256, 512, 1024)
@@ -43,7 +44,8 @@ class DoublingConvolution(nn.ConvTranspose3d):
 
 
 class _Double(torch.autograd.Function):
-    """DoublingConvolution to one channel. Each cell becomes eight, so it is a convolution with eight output channels.
+    """DoublingConvolution to one channel. Each cell becomes eight, so it is a convolution with
+    eight output channels.
 
     Along an axis, cell 2i is w[3] x[i-1] + w[1] x[i], and cell 2i + 1 is w[2] x[i] + w[0] x[i+1].
     """
@@ -51,7 +53,8 @@ class _Double(torch.autograd.Function):
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         ctx.save_for_backward(features, weight)
-        taps, n = torch.tensor([[3, 1], [2, 0]]), features.shape[-1]
+        taps = torch.tensor([[3, 1], [2, 0]])
+        n = features.shape[-1]
         for axis in (2, 4, 6):  # four weights become [2 cells, 2 neighbours]
             weight = weight.index_select(axis, taps.flatten()).unflatten(axis, (2, 2))
         kernel = weight[:, 0].permute(1, 3, 5, 0, 2, 4, 6).flatten(0, 2)
@@ -79,7 +82,8 @@ class _Double(torch.autograd.Function):
 
 
 class VoxelGenerator(nn.Module):
-    """Shape code [B, 200] -> density float32 [B, 64, 64, 64] in [0, 1 / TAU], axes (x, y, z) of the object frame.
+    """Shape code [B, 200] -> density float32 [B, 64, 64, 64] in [0, 1 / TAU], axes (x, y, z) of
+    the object frame.
 
     A linear layer to `channels[0]` features on 4^3 cells, then doubling convolutions to the other
     channels and to one at 64^3; batch norm and ReLU after all but the last, which has a sigmoid.
@@ -123,7 +127,7 @@ class SilhouetteDiscriminator(nn.Module):
             for before, after in itertools.pairwise((1, *channels))
         )
         self.others = nn.Sequential(*others)
-        self.last = nn.Linear(channels[-1] * (IMAGE_SIZE // 16) ** 2, 1)
+        self.last = nn.Linear(channels[-1] * (SILHOUETTE_SIZE // 16) ** 2, 1)
         self.apply(_initialise)
         self.to(memory_format=torch.channels_last)
 
@@ -141,7 +145,7 @@ class InverseEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(IMAGE_SIZE**2, 512),
+            nn.Linear(SILHOUETTE_SIZE**2, 512),
             nn.LeakyReLU(0.2),
             nn.Linear(512, 512),
             nn.Linear(512, SHAPE_CODE + 1),
@@ -166,7 +170,8 @@ def _initialise(module: nn.Module) -> None:
 
 @dataclass(frozen=True)
 class ViewCircle:
-    """K views at equal steps of azimuth, as in Kato's protocol: view k has azimuth -360 k / K degrees.
+    """K views at equal steps of azimuth, as in Kato's protocol: view k has azimuth -360 k / K
+    degrees.
 
     Rays are parallel, as PrGAN's. The image covers `half_width` to each side of the origin, so
     that objects have the same size as in the data set's perspective images.
@@ -187,7 +192,8 @@ class ViewCircle:
         return view_ids.float() * (-360.0 / self.count)
 
     def sample_points(self, azimuth_deg: float, size: int) -> Tensor:
-        """Sample points on the rays of one view, float32 [size, size, D, 3] in the object frame; row 0 is the top.
+        """Sample points on the rays of one view, float32 [size, size, D, 3] in the object frame;
+        row 0 is the top.
 
         Samples are as far apart as pixels; D of them cover the diagonal of the unit cube.
         """
@@ -210,7 +216,8 @@ class ViewCircle:
 
 
 def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) -> Tensor:
-    """Soft silhouettes P = 1 - exp(-tau * integral of the density along the ray), float32 [B, S, S], row 0 = top.
+    """Soft silhouettes P = 1 - exp(-tau * integral of the density along the ray), float32 [B, S,
+    S], row 0 = top.
 
     density: float32 [B, S, S, S] at the voxel centres of the box [-0.5, 0.5]^3, axes (x, y, z) of
     the object frame, trilinear in between, zero outside. view_ids: int64 [B] in 0 .. K-1, on the
@@ -221,7 +228,9 @@ def project(density: Tensor, view_ids: Tensor, views: ViewCircle, tau: float) ->
     # A quarter turn permutes the voxels, so a quarter of the views needs a matrix.
     quarter = views.count // 4 if views.count % 4 == 0 else views.count
     view_ids = view_ids.cpu()
-    volumes, parts, order = density.unbind(), [], []
+    volumes = density.unbind()
+    parts = []
+    order = []
     for base in (view_ids % quarter).unique().tolist():
         members = (view_ids % quarter == base).nonzero()[:, 0]
         turned = [
@@ -254,7 +263,8 @@ def ray_table(
     pixels = torch.arange(size**2).view(size, size, 1).expand_as(inside)[inside]
     voxels = ((cells[:, 0] * size + cells[:, 1]) * size + cells[:, 2])[inside]
     step = 2 * views.half_width  # distance of samples in voxels: (2 half_width / size) / (1 / size)
-    indices, weights = torch.stack([pixels, voxels]), shares[inside] * step
+    indices = torch.stack([pixels, voxels])
+    weights = shares[inside] * step
     with torch.sparse.check_sparse_tensor_invariants(False):  # older torch warns if nobody chooses
         matrix = torch.sparse_coo_tensor(indices, weights, (size**2, size**3)).coalesce()
         return _by_rows(matrix, device), _by_rows(matrix.t().coalesce(), device)

@@ -1,4 +1,5 @@
-"""Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its header. No pickle.
+"""Checkpoints: all tensors of a run in one safetensors file, everything else as JSON in its
+header. No pickle.
 
 The header has two entries: "learn3d", the JSON of `Metadata`, and "crc32", the CRC-32 of that
 JSON and of the names, dtypes, shapes and bytes of all tensors.
@@ -34,7 +35,9 @@ from learn3d.settings import Count, NonNegative, Share, checked, split_names
 
 @functools.cache
 def versions() -> dict[str, str | None]:
-    """Versions of the package and of torch, and the git commit of the code at the first call (None if unknown)."""
+    """Versions of the package and of torch, and the git commit of the code at the first call
+    (None if unknown).
+    """
     try:
         package = importlib.metadata.version("nmr-learn3d")
     except importlib.metadata.PackageNotFoundError:
@@ -43,8 +46,11 @@ def versions() -> dict[str, str | None]:
 
 
 def _git_commit() -> str | None:
-    """The commit that the package was built from, or of the checkout of this file ("-dirty" if it has changes)."""
-    built_from, sources = Path(__file__).parents[1] / "commit.txt", Path(__file__).parents[2]
+    """The commit that the package was built from, or of the checkout of this file ("-dirty" if it
+    has changes).
+    """
+    built_from = Path(__file__).parents[1] / "commit.txt"
+    sources = Path(__file__).parents[2]
     if built_from.exists():  # CMakeLists.txt wrote it
         return built_from.read_text().strip() or None
     if not (
@@ -170,7 +176,9 @@ def load_metadata(path: Path, which: str = "last") -> Metadata:
 
 
 def find(path: Path, which: str = "last") -> Path:
-    """The checkpoint file of a run folder (`which`: last or best), or `path` itself if it is a file."""
+    """The checkpoint file of a run folder (`which`: last or best), or `path` itself if it is a
+    file.
+    """
     path = Path(path)
     return path / f"{which}.safetensors" if path.is_dir() else path
 
@@ -200,7 +208,8 @@ def load_data(
     category: str | None = None,
     layout: Layout | None = None,
 ) -> ViewDataset:
-    """A split of a run's data, or of another folder, category or layout, in the form that its networks take.
+    """A split of a run's data, or of another folder, category or layout, in the form that its
+    networks take.
 
     The run's own data get its options `poses` and, in the training split, `views_per_object`.
     Raises ValueError if the layout inverts colours and the training layout does not, or the other
@@ -236,7 +245,8 @@ def network_tensors(method: Method) -> dict[str, Tensor]:
 def restore_networks(
     method: Method, tensors: dict[str, Tensor], source: Path, kind: str = "network"
 ) -> None:
-    """Copy the weights of a checkpoint ("network") or their averages ("ema") into the networks of a method.
+    """Copy the weights of a checkpoint ("network") or their averages ("ema") into the networks of
+    a method.
 
     Raises ValueError if they do not fit.
     """
@@ -257,7 +267,9 @@ def starting_with(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The state of an optimizer, named optimizer.<name>.<parameter's index>.<key>, without learning rates."""
+    """The state of an optimizer, named optimizer.<name>.<parameter's index>.<key>, without
+    learning rates.
+    """
     state = optimizer.state_dict()["state"]
     return {
         f"optimizer.{name}.{index}.{key}": value
@@ -269,7 +281,8 @@ def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, 
 def restore_optimizer(
     name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path
 ) -> None:
-    """Restore the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the parameters.
+    """Restore the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the
+    parameters.
 
     Fused kernels index parameter, gradient and state by position in memory, so each tensor must
     have its parameter's shape, and is copied to its parameter's memory layout.

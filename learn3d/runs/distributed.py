@@ -1,4 +1,5 @@
-"""One training in several ranks, the processes that torchrun starts: what a rank needs beside torch.distributed.
+"""One training in several ranks, the processes that torchrun starts: what a rank needs beside
+torch.distributed.
 
 Every rank holds the same networks and takes the same steps. It draws all random numbers of a step
 for the whole batch and computes the losses of its own rows. Its share of a loss is 1 / W of its
@@ -26,7 +27,7 @@ TIMEOUT = timedelta(seconds=50)  # time that a rank waits in a step for the othe
 PATIENCE = timedelta(minutes=30)
 
 
-def size() -> int:
+def world_size() -> int:
     """The number of ranks, W."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
@@ -38,7 +39,7 @@ def rank() -> int:
 
 def describe() -> str:
     """The number of ranks, for the first line of a run's log; "" for one."""
-    return f" in each of {size()} ranks ({dist.get_backend()})" if size() > 1 else ""
+    return f" in each of {world_size()} ranks ({dist.get_backend()})" if world_size() > 1 else ""
 
 
 @contextlib.contextmanager
@@ -89,17 +90,19 @@ def own_rows(batch_size: int, views: int) -> Tensor:
     divided so.
     """
     objects = batch_size // views
-    if size() > 1 and objects % (2 * size()):
-        wanted = f"batch_size must be a multiple of {2 * size() * views} for {size()} ranks"
+    if world_size() > 1 and objects % (2 * world_size()):
+        wanted = (
+            f"batch_size must be a multiple of {2 * world_size() * views} for {world_size()} ranks"
+        )
         raise ValueError(f"{wanted}, which take equal and even parts of a batch, got {batch_size}")
-    return torch.arange(objects * views).view(views, size(), -1)[:, rank()].flatten()
+    return torch.arange(objects * views).view(views, world_size(), -1)[:, rank()].flatten()
 
 
 def all_gather_objects(value: Any, *, patient: bool = False) -> list[Any]:
     """The values of all ranks, by rank. patient: wait for `PATIENCE`."""
-    if size() == 1:
+    if world_size() == 1:
         return [value]
-    found = [None] * size()
+    found = [None] * world_size()
     with _lost_ranks():
         dist.all_gather_object(found, value, group=_patient if patient else None)
     return found
@@ -118,14 +121,16 @@ def check_same(**values: Any) -> None:
 def mean_losses(losses: dict[str, float], stopped_by: str) -> tuple[dict[str, float], str]:
     """Means of the losses over all ranks, and the name of a signal that stops one of them or ""."""
     everywhere = all_gather_objects((losses, stopped_by))
-    means = {name: sum(found[name] for found, _ in everywhere) / size() for name in losses}
+    means = {name: sum(found[name] for found, _ in everywhere) / world_size() for name in losses}
     return means, max(name for _, name in everywhere)
 
 
 def whole_batch(batch: Batch) -> tuple[Batch, Tensor]:
-    """The batch with poses, view classes and categories of all ranks' rows; and the places of its own, int64 [b]."""
+    """The batch with poses, view classes and categories of all ranks' rows; and the places of its
+    own, int64 [b].
+    """
     own = torch.arange(len(batch)) + rank() * len(batch)
-    if size() == 1:
+    if world_size() == 1:
         return batch, own
     poses, view_ids, class_ids = zip(
         *all_gather_objects((batch.poses, batch.view_ids, batch.class_ids)), strict=True
@@ -143,7 +148,9 @@ def _all_reduce(values: Tensor) -> Tensor:
 
 
 class _AllReduce(torch.autograd.Function):
-    """The sum over all ranks. The loss of every rank depends on it, so its gradient is the sum of their gradients."""
+    """The sum over all ranks. The loss of every rank depends on it, so its gradient is the sum of
+    their gradients.
+    """
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
@@ -156,26 +163,27 @@ class _AllReduce(torch.autograd.Function):
 
 def all_reduce_mean(values: Tensor) -> Tensor:
     """The mean of a tensor over all ranks, differentiable."""
-    return values if size() == 1 else _AllReduce.apply(values / size())
+    return values if world_size() == 1 else _AllReduce.apply(values / world_size())
 
 
 def all_gather(rows: Tensor) -> Tensor:
     """float [B, ...]: the rows [b, ...] of all ranks, by rank; differentiable."""
-    if size() == 1:
+    if world_size() == 1:
         return rows
     empty = torch.zeros_like(rows)
     return _AllReduce.apply(
-        torch.cat([rows if number == rank() else empty for number in range(size())])
+        torch.cat([rows if number == rank() else empty for number in range(world_size())])
     )
 
 
 def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
-    """Let optimizers step on the sums of all ranks' gradients, and batch norms take the statistics of all rows.
+    """Let optimizers step on the sums of all ranks' gradients, and batch norms take the
+    statistics of all rows.
 
     `nn.SyncBatchNorm` works on GPUs only, and DistributedDataParallel with one backward pass a
     step.
     """
-    if size() == 1:
+    if world_size() == 1:
         return
     pending = []
 
@@ -199,7 +207,8 @@ def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]
 
 
 class _BatchNorm(torch.autograd.Function):
-    """Normalizes the channels of x [B, C, ...] with mean and variance [C] over the rows of all ranks.
+    """Normalizes the channels of x [B, C, ...] with mean and variance [C] over the rows of all
+    ranks.
 
     With y = w x' + b, x' = (x - mean) / s and N numbers of a channel in all ranks, the gradient
     of the sum of the ranks' losses is dx = w / s (dy - sum(dy) / N - x' sum(dy x') / N), with
@@ -222,7 +231,7 @@ class _BatchNorm(torch.autograd.Function):
         backward = torch.ops.aten.native_batch_norm_backward
         grad_x, grad_weight, grad_bias = backward(grad, x, weight, *statistics, [True, True, True])
         # what passes through mean and variance
-        count = size() * x.numel() / x.shape[1]
+        count = world_size() * x.numel() / x.shape[1]
         slope, offset = _all_reduce(torch.stack([grad_weight, grad_bias])) / count
         scale = (variance + ctx.eps).rsqrt()
         slope, offset = weight * scale.square() * slope, weight * scale * offset
@@ -244,9 +253,9 @@ def _batch_norm(norm: nn.Module, x: Tensor) -> Tensor:
         mean, variance = (
             values.double() for values in torch.batch_norm_update_stats(x, *running, 0.0)
         )
-        mean, square = _all_reduce(torch.stack([mean, variance + mean.square()])) / size()
+        mean, square = _all_reduce(torch.stack([mean, variance + mean.square()])) / world_size()
         variance = square - mean.square()
-        count = size() * x.numel() / x.shape[1]
+        count = world_size() * x.numel() / x.shape[1]
         norm.num_batches_tracked.add_(1)
         norm.running_mean.lerp_(mean.float(), norm.momentum)
         norm.running_var.lerp_((variance * count / max(1, count - 1)).float(), norm.momentum)

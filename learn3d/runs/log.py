@@ -31,7 +31,8 @@ _SILENT = dict.fromkeys(("add_scalar", "add_image", "flush", "close"), lambda *_
 
 
 class RunLog(contextlib.ExitStack):
-    """The log of a run, a context manager. Metrics of steps after `start`, from before an interruption, are dropped.
+    """The log of a run, a context manager. Metrics of steps after `start`, from before an
+    interruption, are dropped.
 
     On a terminal it shows a progress bar with the losses and the time left; elsewhere it prints a
     line now and then. Shown losses are means over the last steps that computed them. Raises
@@ -40,7 +41,8 @@ class RunLog(contextlib.ExitStack):
 
     def __init__(self, config: TrainConfig, *, start: int) -> None:
         super().__init__()
-        self.start, self.total = start, config.iterations
+        self.start = start
+        self.total = config.iterations
         self._recent: dict[str, deque[float]] = {}
         _drop_after(config.output / METRICS, start)
         self._metrics = self.enter_context(open(config.output / METRICS, "ab"))

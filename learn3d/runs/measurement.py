@@ -116,7 +116,9 @@ class Result(BaseModel, strict=True):
 
     @property
     def commit(self) -> str:
-        """First nine digits of the commit that trained the run, with its mark for changed sources; "-" if unknown."""
+        """First nine digits of the commit that trained the run, with its mark for changed
+        sources; "-" if unknown.
+        """
         commit = self.versions.get("commit") or "-"
         return commit[:9] + "-dirty" * commit.endswith("-dirty")
 
@@ -131,7 +133,8 @@ def evaluate_runs(
     layout: Layout | None = None,
     device: str = "cpu",
 ) -> list[Result]:
-    """Measure run folders (their checkpoint `which`) or checkpoint files, on each of their categories by itself.
+    """Measure run folders (their checkpoint `which`) or checkpoint files, on each of their
+    categories by itself.
 
     `data` and `category` default to those of the training. A model that learnt from estimated
     poses is measured with them only on its own data (`data` is None). Raises ValueError or
@@ -157,22 +160,24 @@ def evaluate_runs(
                 )
             if means["mmd"] is None:
                 note(f"warning: {NO_MMD}")
-            about = {
-                "checkpoint": str(file),
-                "method": label,
-                "preset": config.preset,
-                "category": name,
-            }
-            about |= {"data": str((data or config.data).resolve()), "command": command_line(config)}
-            about |= {
-                "iterations": config.iterations,
-                "seed": config.seed,
-                "versions": metadata.versions,
-            }
-            about |= {"step": metadata.progress.step, "seconds": metadata.progress.seconds}
-            about["images"] = len(evaluation.view_ids)
-            objects = _means_by_object(evaluation, dataset) if dataset.voxels is not None else []
-            results.append(Result(**about, **means, objects=objects))
+            results.append(
+                Result(
+                    checkpoint=str(file),
+                    method=label,
+                    preset=config.preset,
+                    category=name,
+                    data=str((data or config.data).resolve()),
+                    command=command_line(config),
+                    iterations=config.iterations,
+                    step=metadata.progress.step,
+                    seed=config.seed,
+                    seconds=metadata.progress.seconds,
+                    versions=metadata.versions,
+                    images=len(evaluation.view_ids),
+                    objects=[] if dataset.voxels is None else _means_by_object(evaluation, dataset),
+                    **means,
+                )
+            )
     return results
 
 
@@ -196,7 +201,9 @@ def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[Objec
 
 
 def format_table(results: Sequence[Result]) -> str:
-    """The results as a text table: a line per result, then the mean over categories of each method."""
+    """The results as a text table: a line per result, then the mean over categories of each
+    method.
+    """
     rows = [("class", "method", "seed", "iterations", "images", *HEADERS)]
     for r in results:
         about = (r.category, f"{r.method} ({r.preset})", str(r.seed), str(r.step), str(r.images))

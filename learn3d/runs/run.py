@@ -1,4 +1,6 @@
-"""A run: its state, saved and restored bit-identically, the first lines of its log and its summary."""
+"""A run: its state, saved and restored bit-identically, the first lines of its log and its
+summary.
+"""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -10,6 +12,7 @@ from torch import Tensor
 from learn3d.config import TrainConfig, check_resume, config_to_dict
 from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.poses import PoseCandidates
+from learn3d.device import ThreadTuner
 from learn3d.files import writing
 from learn3d.files.reading import DamagedFile
 from learn3d.methods.mesh_method import is_compact
@@ -20,7 +23,6 @@ from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress, versions
 from learn3d.runs.folder import BEST, CONFIG, LAST, PREVIOUS
 from learn3d.runs.log import RunLog
-from learn3d.runs.threads import ThreadTuner
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class Summary:
 
     def __str__(self) -> str:
         """One line for the terminal."""
-        done, minutes = self.progress, self.progress.seconds / 60
+        done = self.progress
+        minutes = self.progress.seconds / 60
         end = f"{'finished' if self.finished else 'stopped'} at step {done.step} after {self.seconds / 60:.1f} min"
         if done.seconds > self.seconds + 1:
             end += f" ({minutes:.1f} min of training in all)"
@@ -70,7 +73,8 @@ class Run:
 
         Returns the progress of the run, and warnings. The folder of a finished run does not change.
         """
-        config, folder = self.config, self.config.output
+        config = self.config
+        folder = self.config.output
         saved, notes = load_last(config) if resume else (None, ())
         if saved is not None:
             progress = self._restore(*saved)
@@ -94,8 +98,11 @@ class Run:
     def describe(
         self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner
     ) -> str:
-        """Method, data and device of a run that begins or continues; mirror plane and generator if masks decide."""
-        config, info = self.config, self.info
+        """Method, data and device of a run that begins or continues; mirror plane and generator
+        if masks decide.
+        """
+        config = self.config
+        info = self.info
         verb = f"resuming at step {progress.step}" if progress.step else "training"
         name = f"{config.label} ({config.preset})"
         data = f"{len(train_set)} images of {train_set.num_objects} objects; {config.val_split}: {len(val_set)} images"
@@ -112,8 +119,12 @@ class Run:
         return text
 
     def _restore(self, tensors: dict[str, Tensor], metadata: Metadata) -> Progress:
-        """Restore the state of a checkpoint. Raises a ValueError that names options or data that differ."""
-        config, before, path = self.config, metadata.config, self.config.output / LAST
+        """Restore the state of a checkpoint. Raises a ValueError that names options or data that
+        differ.
+        """
+        config = self.config
+        before = metadata.config
+        path = self.config.output / LAST
         check_resume(config, before)
         if self.data != metadata.data:
             raise ValueError(
@@ -145,7 +156,8 @@ class Run:
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog) -> None:
-        """Flush the metrics, then write last.safetensors: networks, EMA, optimizers, random state and `Metadata`.
+        """Flush the metrics, then write last.safetensors: networks, EMA, optimizers, random state
+        and `Metadata`.
 
         The checkpoint before it becomes previous.safetensors. Neither file is ever incomplete.
         """
@@ -153,7 +165,8 @@ class Run:
             distributed.wait_for_writer()
             return
         log.sync()
-        method, last = self.method, self.config.output / LAST
+        method = self.method
+        last = self.config.output / LAST
         tensors = checkpoint.network_tensors(method) | {"random.cpu": torch.get_rng_state()}
         if method.ema is not None:
             tensors |= {f"ema.{name}": tensor for name, tensor in method.ema.tensors.items()}
@@ -192,7 +205,8 @@ def load_last(
     if the folder has no run or one with other options; DamagedFile if all checkpoints are
     damaged; OSError if one cannot be read.
     """
-    folder, notes = config.output, []
+    folder = config.output
+    notes = []
     paths = run_folder.checkpoints(folder)
     if not paths:
         if not run_folder.is_run(folder):

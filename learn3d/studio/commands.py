@@ -9,7 +9,7 @@ import tyro
 from learn3d.commands.command import Command, DataFolder, OnDataset, Runs, Which
 from learn3d.data.layouts import Layout
 from learn3d.files.writing import check_target
-from learn3d.pictures.sheets import save_png
+from learn3d.pictures import save_png
 from learn3d.settings import Count
 from learn3d.studio.make_data.debian.models import fetch_debian_models
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset, make_shards

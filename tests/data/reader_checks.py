@@ -14,8 +14,7 @@ import torch
 
 import nmr
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.layouts import check_folder, reader
-from learn3d.files.reading import Problem
+from learn3d.data.layouts import Problem, check_folder, reader
 
 
 def problems(layout: str, folder: Path, split: str, category: str = "chair") -> tuple[Problem, ...]:

@@ -56,4 +56,4 @@ def test_the_loop_needs_few_modules(tmp_path: Path):
         words, capture_output=True, text=True, check=True, cwd=tmp_path
     ).stdout.split()
     assert not [name for name in loaded if ".studio" in name]
-    assert len(loaded) <= 52
+    assert len(loaded) <= 45

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import NoReturn
 
 from learn3d.data.view_bins import AngleBins
-from learn3d.files.reading import STRICT, Findings, MissingFile
+from learn3d.files.reading import FaultHandler, MissingFile, refuse
 
 BINS = AngleBins.parse("15x70:-10:60")
 
 
-def load(folder: Path | str, category: str, split: str, *, findings: Findings = STRICT) -> NoReturn:
+def load(
+    folder: Path | str, category: str, split: str, *, on_fault: FaultHandler = refuse
+) -> NoReturn:
     """Raise MissingFile, as only shards exist."""
     hint = "make them: learn3d make-dataset --layout around --shards"
     raise MissingFile(Path(folder), f"has no shards of {category}, {split}; {hint}")

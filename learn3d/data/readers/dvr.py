@@ -21,13 +21,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learn3d.data.categories import SPLITS, find_splits
-from learn3d.data.conventions import IMAGE_SIZE, NUM_VIEWS, view_poses
+from learn3d.data.conventions import (
+    IMAGE_SIZE,
+    NUM_VIEWS,
+    SPLITS,
+    find_splits,
+    synset_of,
+    view_poses,
+)
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
-from learn3d.data.readers.renderings import category_folder, check_lists, read_objects
-from learn3d.files import limits, npz, renderings
-from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile, read_text
+from learn3d.data.readers.objects import Files, check_lists, read_objects
+from learn3d.files import images, limits, npz
+from learn3d.files.reading import DamagedFile, FaultHandler, MissingFile, read_text, refuse
 from learn3d.files.sandbox import Call
 
 POINTS = 10_000  # points that are kept of each object's 100,000, which are in random order
@@ -40,43 +46,47 @@ _CLOUD = "an npz file with the array 'points' [P, 3]: finite, within the unit cu
 
 
 def load(
-    folder: Path | str, category: str, split: str, *, findings: Findings = STRICT
-) -> ViewDataset | None:
+    folder: Path | str, category: str, split: str, *, on_fault: FaultHandler = refuse
+) -> ViewDataset:
     """Read a split; the view classes are Kato's 24 views."""
-    root = category_folder(Path(folder), category)
+    root = _category_folder(Path(folder), category)
     paths = {s: path for s in SPLITS if (path := root / f"softras_{s}.lst").is_file()}
     path = root / f"softras_{split}.lst"
     if split not in paths:
-        raise MissingFile(
-            path, f"is missing; expected a list of ids. Splits here: {', '.join(paths) or 'none'}"
-        )
+        there = ", ".join(paths) or "none"
+        raise MissingFile(path, f"is missing; expected a list of ids. Splits here: {there}")
     lists = {
         s: read_text(path, limits.TEXT_BYTES, "a list of ids").split() for s, path in paths.items()
     }
-    ids = check_lists(path, lists, split, findings)
+    ids = check_lists(path, lists, split, on_fault)
 
-    def files(name: str) -> list[Call]:
-        images, masks = (
-            [root / name / part / f"{k:04d}.png" for k in range(NUM_VIEWS)]
-            for part in ("image", "mask")
-        )
-        return [
-            Call(npz.read_several, root / name / "cameras.npz", (_MATRICES, _CAMERAS, 16 * 8)),
-            Call(npz.read, root / name / "pointcloud.npz", ("points", _CLOUD, limits.OBJECT_BYTES)),
-            *(
-                Call(renderings.read_with_mask, i, (m, IMAGE_SIZE))
-                for i, m in zip(images, masks, strict=True)
-            ),
+    def files(name: str) -> Files:
+        of = root / name
+        pairs = [
+            (of / "image" / f"{k:04d}.png", of / "mask" / f"{k:04d}.png") for k in range(NUM_VIEWS)
         ]
+        return Files(
+            Call(npz.read_several, of / "cameras.npz", (_MATRICES, _CAMERAS, 16 * 8)),
+            Call(npz.read, of / "pointcloud.npz", ("points", _CLOUD, limits.OBJECT_BYTES)),
+            [Call(images.read_with_mask, image, (mask, IMAGE_SIZE)) for image, mask in pairs],
+        )
 
-    objects = read_objects(ids, files, _build, IMAGE_SIZE, findings, f"{category} {split}")
-    if objects is None:
-        return None
-    images, _, _, clouds = objects
+    objects = read_objects(ids, files, _build, IMAGE_SIZE, on_fault, f"{category} {split}")
+    clouds = objects.shapes
     points = np.stack([cloud[: min(map(len, clouds))] for cloud in clouds])
-    return dataclasses.replace(
-        kato.from_arrays(images, None, category, split), object_names=tuple(ids), points=points
-    )
+    dataset = kato.from_arrays(objects.images, None, category, split)
+    return dataclasses.replace(dataset, object_names=tuple(objects.names), points=points)
+
+
+def _category_folder(folder: Path, category: str) -> Path:
+    """The folder of a category (name or synset id) in `folder`. Raises MissingFile with the
+    existing ones.
+    """
+    path = folder / synset_of(category)
+    if not path.is_dir():
+        there = ", ".join(sorted(p.name for p in folder.glob("*/"))) or "none"
+        raise MissingFile(path, f"there is no folder of {category!r}; those here are: {there}")
+    return path
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -84,26 +94,25 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     return find_splits(folder, "*/softras_SPLIT.lst")
 
 
-def _build(
-    path: Path, cameras: list[np.ndarray], cloud: Path, points: np.ndarray
-) -> tuple[None, np.ndarray]:
-    to_object = _fit_world(path, cameras)
+def _build(files: Files, cameras: list[np.ndarray], points: np.ndarray) -> tuple[None, np.ndarray]:
+    to_object = _fit_world(files.cameras.path, cameras)
+    cloud = files.shape.path
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DamagedFile(cloud, f"has the shape {list(points.shape)}; expected {_CLOUD}")
     points = points[:POINTS].astype(np.float64)
     if not np.abs(points).max() < 1:
-        raise DamagedFile(
-            cloud, f"has coordinates up to {np.abs(points).max():.3g}; expected {_CLOUD}"
-        )
+        farthest = np.abs(points).max()
+        raise DamagedFile(cloud, f"has coordinates up to {farthest:.3g}; expected {_CLOUD}")
     return None, (points @ to_object.T).astype(np.float32)
 
 
 def _fit_world(path: Path, cameras: list[np.ndarray]) -> np.ndarray:
-    """Orthogonal matrix [3, 3] from the cameras' world to the object frame. DamagedFile if they are not Kato's."""
-    if wrong := [
-        name for name, matrix in zip(_MATRICES, cameras, strict=True) if matrix.shape != (4, 4)
-    ]:
-        raise DamagedFile(path, f"has no {wrong[0]} of 4x4 numbers; expected {_CAMERAS}")
+    """Orthogonal matrix [3, 3] from the cameras' world to the object frame. DamagedFile if they
+    are not Kato's.
+    """
+    for name, matrix in zip(_MATRICES, cameras, strict=True):
+        if matrix.shape != (4, 4):
+            raise DamagedFile(path, f"has no {name} of 4x4 numbers; expected {_CAMERAS}")
     matrices = np.stack(cameras)[:, :3].astype(np.float64)
     rotations = matrices[:, :, :3]
     skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))

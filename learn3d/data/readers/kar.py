@@ -24,13 +24,23 @@ import math
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import LAYOUTS, VOXEL_SIZE
+from learn3d.data.conventions import LAYOUTS, SPLITS, VOXEL_SIZE, synset_of
 from learn3d.data.dataset import ViewDataset
-from learn3d.data.readers.renderings import check_lists, check_poses, join_objects, read_objects
-from learn3d.files import formats, limits, renderings
-from learn3d.files.reading import STRICT, DamagedFile, Findings, faults_of, read_bytes, read_json
+from learn3d.data.poses import LookAtPoses
+from learn3d.data.readers.objects import Files, check_lists, read_objects
+from learn3d.data.view_bins import AngleBins
+from learn3d.files import formats, images, limits
+from learn3d.files.reading import (
+    DamagedFile,
+    FaultHandler,
+    attempt,
+    faults_of,
+    read_bytes,
+    read_json,
+    refuse,
+)
 from learn3d.files.sandbox import Call
 
 NUM_RENDERS = 20
@@ -54,53 +64,72 @@ def load(
     *,
     image_size: int = 64,
     views_per_object: int | None = None,
-    findings: Findings = STRICT,
-) -> ViewDataset | None:
+    on_fault: FaultHandler = refuse,
+) -> ViewDataset:
     """Read a split. View classes are cells of azimuth and elevation, see `VIEW_BINS`.
 
     image_size: side of the images in pixels, up to 224; masks always have 64. views_per_object:
-    use the first 1 .. 20 renders of each object; None: 1 for training, all for the other splits
-    and if the findings are not strict.
+    use at most the first so many renders of each object; None: 1 for training, else all.
     """
-    if views_per_object is not None and not 1 <= views_per_object <= NUM_RENDERS:
-        raise ValueError(f"views_per_object must lie in 1 .. {NUM_RENDERS}, got {views_per_object}")
-    folder, synset = Path(folder), synset_of(category)
-    path, lists = folder / "splits.json", read_splits(folder)
+    folder = Path(folder)
+    synset = synset_of(category)
+    path = folder / "splits.json"
+    lists = read_splits(folder)
     if synset not in lists:
-        raise DamagedFile(
-            path,
-            f"has no entry {synset} ({category}); it has: {', '.join(sorted(lists)) or 'none'}",
-        )
+        there = ", ".join(sorted(lists)) or "none"
+        raise DamagedFile(path, f"has no entry {synset} ({category}); it has: {there}")
     lists = {s: [name for name in lists[synset].get(s, []) if name not in BROKEN] for s in SPLITS}
-    ids = check_lists(path, lists, split, findings)
+    ids = check_lists(path, lists, split, on_fault)
     root = folder / "renders" / synset
-    views = views_per_object or 1
-    if views_per_object is None and (split != "train" or not findings.strict):
-        views = findings.attempt(_rows, root / ids[0] / "view.txt") or NUM_RENDERS
+    views = views_per_object or (1 if split == "train" else NUM_RENDERS)
+    if views > 1:
+        rows = attempt(on_fault, _count_rows, root / ids[0] / "view.txt")
+        views = min(views, rows or NUM_RENDERS)
 
-    def files(name: str) -> list[Call]:
+    def files(name: str) -> Files:
+        grid = folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat"
         paths = [
             (root / name / f"render_{k}.png", root / name / f"depth_{k}.png") for k in range(views)
         ]
-        grid = folder / "voxels" / "modelVoxels32" / synset / f"{name}.mat"
-        return [
-            Call(renderings.read_table, root / name / "view.txt", (views, 4, _TABLE), _TABLE),
+        return Files(
+            Call(formats.read_table, root / name / "view.txt", (views, 4, _TABLE), _TABLE),
             Call(formats.read_matlab, grid, ("Volume", VOXEL_SIZE)),
-            *(
-                Call(renderings.read_with_depth, path, (depth, image_size), "a rendering")
+            [
+                Call(images.read_with_depth, path, (depth, image_size), "a rendering")
                 for path, depth in paths
-            ),
-        ]
+            ],
+        )
 
-    def build(
-        path: Path, table: np.ndarray, _: Path, volume: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return check_poses(path, table[:, [0, 1, 3]], _TABLE), volume
+    def build(files: Files, table: np.ndarray, volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return check_poses(files.cameras.path, table[:, [0, 1, 3]], _TABLE), volume
 
-    objects = read_objects(ids, files, build, image_size, findings, f"{category} {split}")
-    return join_objects(
-        objects, ids, HALF_FOV_DEG, VIEW_BINS, LAYOUTS["kar"].about(category, split)
+    objects = read_objects(ids, files, build, image_size, on_fault, f"{category} {split}")
+    cameras = LookAtPoses(*np.concatenate(objects.poses).T, HALF_FOV_DEG)
+    bins = AngleBins.parse(VIEW_BINS)
+    return ViewDataset(
+        **LAYOUTS["kar"].about(category, split),
+        images=objects.images,
+        masks=objects.masks,
+        poses=cameras,
+        view_ids=bins.ids(cameras).numpy(),
+        view_names=tuple(bins.names()),
+        object_ids=np.repeat(np.arange(len(objects.names)), views),
+        object_names=tuple(objects.names),
+        voxels=np.stack(objects.shapes),
     )
+
+
+def check_poses(path: Path, poses: np.ndarray, wanted: str) -> np.ndarray:
+    """Return poses float64 [V, 3] (azimuth, elevation, distance). Raises DamagedFile if one is
+    out of range.
+    """
+    sound = LookAtPoses(*torch.from_numpy(poses.T), HALF_FOV_DEG).in_range().numpy()
+    if not sound.all():
+        row = sound.argmin()
+        azimuth, elevation, distance = poses[row]
+        found = f"azimuth {azimuth:g}, elevation {elevation:g} and distance {distance:g}"
+        raise DamagedFile(path, f"row {row} has {found}; expected {wanted}")
+    return poses
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -125,7 +154,7 @@ def read_splits(folder: Path) -> dict[str, dict[str, list[str]]]:
     return lists
 
 
-def _rows(path: Path) -> int:
-    """Number of rows of a table, or 20 if it has more."""
+def _count_rows(path: Path) -> int:
+    """Number of rows of a table."""
     lines = read_bytes(path, limits.TEXT_BYTES, _TABLE).splitlines()
-    return min(NUM_RENDERS, sum(bool(line.strip()) for line in lines))
+    return sum(bool(line.strip()) for line in lines)

@@ -1,4 +1,5 @@
-"""Kato's layout (Kato et al. 2018): 24 views of each object, 64x64, in two npz files per category and split.
+"""Kato's layout (Kato et al. 2018): 24 views of each object, 64x64, in two npz files per category
+and split.
 
 - Files are `{synset}_{split}_images.npz`, uint8 [N, 24, 4, 64, 64], and `{synset}_{split}_voxels.npz`, bool
   [N, 32, 32, 32]; each holds the single array 'arr_0'.
@@ -13,18 +14,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learn3d.data.categories import SYNSETS, find_splits, synset_of
 from learn3d.data.conventions import (
     AZIMUTH_STEP_DEG,
     IMAGE_SIZE,
     LAYOUTS,
     NUM_VIEWS,
+    SYNSETS,
     VOXEL_SIZE,
+    find_splits,
+    synset_of,
     view_poses,
 )
 from learn3d.data.dataset import ViewDataset
 from learn3d.files import npz
-from learn3d.files.reading import STRICT, DamagedFile, Findings, MissingFile
+from learn3d.files.reading import DamagedFile, FaultHandler, MissingFile, OddFile, attempt, refuse
 
 _KEY = "arr_0"
 _ARRAYS = {  # dtype and shape of one object
@@ -40,33 +43,33 @@ def split_paths(folder: Path | str, category: str, split: str) -> tuple[Path, Pa
 
 
 def load(
-    folder: Path | str, category: str, split: str, *, findings: Findings = STRICT
-) -> ViewDataset | None:
-    """Read a split. Sample `object * 24 + view` is one view of one object; the view classes are the 24 views."""
+    folder: Path | str, category: str, split: str, *, on_fault: FaultHandler = refuse
+) -> ViewDataset:
+    """Read a split. Sample `object * 24 + view` is one view of one object; the view classes are
+    the 24 views.
+    """
     paths = split_paths(folder, category, split)
-    images = findings.attempt(_read, paths[0], "images", None)
+    images = attempt(on_fault, _read, paths[0], "images", None)
     # Grids are mostly zeros, so their compression ratio is no sign of a zip bomb: the number of images bounds them.
-    voxels = findings.attempt(_read, paths[1], "voxels", None if images is None else len(images))
-    if images is None or voxels is None:
-        return None
-    if not findings.strict:
-        for index, view in np.argwhere(images[:, :, 3].max((2, 3), initial=0) < 128):
-            findings.warn(paths[0], f"the mask of object {index}, view {view}, is empty")
-        for index in np.flatnonzero(~voxels.any((1, 2, 3))):
-            findings.warn(paths[1], f"the grid of object {index} is empty")
-    if len(images) != len(voxels) or not len(images):
-        counts = f"{len(images)} objects and {paths[1].name} {len(voxels)}"
-        raise DamagedFile(
-            paths[0], f"holds {counts}; expected equal numbers above 0: fetch or make both again"
-        )
-    findings.objects = len(images)
+    voxels = attempt(on_fault, _read, paths[1], "voxels", None if images is None else len(images))
+    if images is None or voxels is None or len(images) != len(voxels) or not len(images):
+        counts = [0 if array is None else len(array) for array in (images, voxels)]
+        found = f"holds {counts[0]} objects and {paths[1].name} {counts[1]}"
+        wanted = "expected equal numbers above 0: fetch or make both again"
+        raise DamagedFile(paths[0], f"{found}; {wanted}")
+    for index, view in np.argwhere(images[:, :, 3].max((2, 3)) < 128):
+        on_fault(OddFile(paths[0], f"the mask of object {index}, view {view}, is empty"))
+    for index in np.flatnonzero(~voxels.any((1, 2, 3))):
+        on_fault(OddFile(paths[1], f"the grid of object {index} is empty"))
     return from_arrays(images, voxels, category, split)
 
 
 def from_arrays(
     images: np.ndarray, voxels: np.ndarray | None, category: str, split: str
 ) -> ViewDataset:
-    """The data set of images uint8 [N, 24, 4, 64, 64] (or [N * 24, ...]) and voxels bool [N, 32, 32, 32]."""
+    """The data set of images uint8 [N, 24, 4, 64, 64] (or [N * 24, ...]) and voxels bool [N, 32,
+    32, 32].
+    """
     images = images.reshape(-1, 4, IMAGE_SIZE, IMAGE_SIZE)
     count = len(images) // NUM_VIEWS
     view_ids = np.tile(np.arange(NUM_VIEWS), count)
@@ -83,7 +86,9 @@ def from_arrays(
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """The categories (synset ids or prefixes) of a folder and the splits of each, by the names of its files."""
+    """The categories (synset ids or prefixes) of a folder and the splits of each, by the names of
+    its files.
+    """
     return find_splits(folder, *(f"*_SPLIT_{kind}.npz" for kind in _ARRAYS))
 
 

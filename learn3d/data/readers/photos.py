@@ -12,7 +12,7 @@ import contextlib
 import csv
 import hashlib
 import math
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,17 +20,25 @@ import numpy as np
 from pydantic import Field
 from tqdm import tqdm
 
-from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import LAYOUTS
+from learn3d.data.conventions import LAYOUTS, SPLITS, synset_of
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import view_classes
 from learn3d.files import limits
-from learn3d.files.reading import STRICT, DamagedFile, Findings, faults_of, read_text
+from learn3d.files.reading import (
+    FAULTS,
+    DamagedFile,
+    FaultHandler,
+    OddFile,
+    attempt,
+    faults_of,
+    read_text,
+    refuse,
+)
 from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
-from learn3d.terminal import is_watched, note
+from learn3d.terminal import is_watched
 
 _SCALE_ODD = 1.7  # factor between sizes in images and table that gives a warning; half angles for whole ones give 2
 _SCALE_OFF = 5.0  # factor that is an error: distances are in another unit
@@ -66,8 +74,8 @@ def load(
     split: str,
     *,
     image_size: int = MASK_SIZE,
-    findings: Findings = STRICT,
-) -> ViewDataset | None:
+    on_fault: FaultHandler = refuse,
+) -> ViewDataset:
     """Read a split of the photographs in `folder/category`.
 
     image_size: side of the images in pixels. They have Kato's form (`framing.frame`), for which
@@ -76,69 +84,36 @@ def load(
     """
     synset_of(category)  # raises ValueError for a path, which would lead to other folders
     table = Path(folder) / category / TABLE
-    photos = read_photo_table(table, findings)
+    photos = read_photo_table(table, on_fault)
     splits = split_objects(table, photos)
     chosen, training = (
         [photo for photo in photos if splits[photo.object] == s] for s in (split, "train")
     )
-    names, object_ids = np.unique([photo.object for photo in chosen], return_inverse=True)
-    findings.objects = len(names)
     if not chosen or not training:
         there = ", ".join(sorted(set(splits.values())))
         raise DamagedFile(
             table, f"has no photograph for {'train' if chosen else split}; it has: {there}"
         )
-    read = read_all(
-        [Call(read_framed, photo.file, (photo.mask, image_size), "a photograph")]
-        for photo in chosen
-    )
-    framed = []
-    for photo, (result,) in zip(
-        chosen, tqdm(read, category, len(chosen), disable=not is_watched()), strict=True
-    ):
-        if isinstance(result, Exception):
-            result = type(result)(result.path, f"{result.message} ({TABLE}, line {photo.line})")
-        elif result.touches_border:
-            findings.warn(
-                photo.file, "its object touches the border; parts outside the image count as empty"
-            )
-        framed.append(findings.take(result))
-    left_out = {
-        photo.file: each.left_out
-        for photo, each in zip(chosen, framed, strict=True)
-        if each and each.left_out
-    }
-    for file, what in left_out.items():
-        findings.warn(file, what)
-    unlisted = _unlisted(table, photos)
-    if unlisted:
-        findings.warn(table, unlisted)
-    if findings.strict and unlisted and split == "train":
-        note(f"note: {table}: {unlisted}")
-    if findings.strict and left_out:
-        file, what = next(iter(left_out.items()))
-        note(
-            f"note: masks with more than the object: {len(left_out)}; the first is of {file}: {what}"
-        )
-    poses, view_ids, view_names = None, np.zeros(len(chosen), np.int64), ("unknown",)
+    if unlisted := _unlisted(table, photos):
+        on_fault(OddFile(table, unlisted))
+    pairs = list(_read_photos(chosen, image_size, category, on_fault))
+    if not pairs:
+        raise DamagedFile(table, f"no photograph for {split} is whole")
+    poses = None
+    view_ids = np.zeros(len(pairs), np.int64)
+    view_names = ("unknown",)
     if chosen[0].distance is None:
-        findings.warn(
-            table, "has no poses: learn3d estimate-poses --layout photos finds them from the masks"
-        )
+        advice = "learn3d estimate-poses --layout photos finds them from the masks"
+        on_fault(OddFile(table, f"has no poses: {advice}"))
     else:
-        _check_scales(
-            table,
-            [pair for pair in zip(chosen, framed, strict=True) if pair[1] is not None],
-            findings,
-        )
-        poses = _poses(chosen)
+        _check_scales(table, pairs, on_fault)
+        poses = _poses([photo for photo, _ in pairs])
         view_ids, view_names = view_classes(poses, _poses(training))
-    if not findings.strict:
-        return None
+    names, object_ids = np.unique([photo.object for photo, _ in pairs], return_inverse=True)
     return ViewDataset(
         **LAYOUTS["photos"].about(category, split),
-        images=np.stack([each.image for each in framed]),
-        masks=None if image_size == MASK_SIZE else np.stack([each.mask for each in framed]),
+        images=np.stack([framed.image for _, framed in pairs]),
+        masks=None if image_size == MASK_SIZE else np.stack([framed.mask for _, framed in pairs]),
         poses=poses,
         view_ids=view_ids,
         view_names=view_names,
@@ -146,6 +121,25 @@ def load(
         object_names=tuple(names.tolist()),
         voxels=None,
     )
+
+
+def _read_photos(
+    photos: list[Photo], size: int, title: str, on_fault: FaultHandler
+) -> Iterator[tuple[Photo, Framed]]:
+    """The sound ones of some photographs, framed."""
+    calls = ([Call(read_framed, p.file, (p.mask, size), "a photograph")] for p in photos)
+    read = tqdm(read_all(calls), title, len(photos), disable=not is_watched())
+    for photo, (found,) in zip(photos, read, strict=True):
+        if isinstance(found, FAULTS):
+            where = f"({TABLE}, line {photo.line})"
+            on_fault(type(found)(found.path, f"{found.message} {where}"))
+            continue
+        if found.touches_border:
+            cut = "its object touches the border; parts outside the image count as empty"
+            on_fault(OddFile(photo.file, cut))
+        if found.left_out:
+            on_fault(OddFile(photo.file, found.left_out))
+        yield photo, found
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
@@ -160,9 +154,8 @@ def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
     ):
         splits = {"train"}
         with contextlib.suppress(ValueError, OSError):  # `load` raises the same fault
-            splits = (
-                set(split_objects(table, read_photo_table(table, Findings())).values()) or splits
-            )
+            photos = read_photo_table(table, lambda found: None)
+            splits = set(split_objects(table, photos).values()) or splits
         found[table.parent.name] = tuple(name for name in SPLITS if name in splits)
     return found
 
@@ -172,26 +165,28 @@ def _poses(photos: list[Photo]) -> LookAtPoses:
     return LookAtPoses(*np.array(numbers).T)
 
 
-def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], findings: Findings) -> None:
+def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], on_fault: FaultHandler) -> None:
     """Compare the objects' sizes in the photographs with those from distances and fields of view."""
     scales = [
         2 * f.object_size * p.distance * math.tan(math.radians(p.fov_deg) / 2) for p, f in pairs
     ]
-    middle = float(np.median(scales)) if scales else 1.0
+    middle = float(np.median(scales))
     message = f"the objects are {middle:.2g} times as large in the photographs as in the table; distance must be in "
     message += "units of the object's longest side, fov_deg the full angle across the photograph's longer side"
     if not 1 / _SCALE_OFF < middle < _SCALE_OFF:
-        findings.take(DamagedFile(table, message))
+        on_fault(DamagedFile(table, message))
     elif not 1 / _SCALE_ODD < middle < _SCALE_ODD:
-        findings.warn(table, message)
+        on_fault(OddFile(table, message))
     for (photo, _), scale in zip(pairs, scales, strict=True):
         if not 1 / _SCALE_OFF < scale / middle < _SCALE_OFF:
             message = f"compared with the others, its object is {scale / middle:.2g} times as large as in the table"
-            findings.warn(photo.file, f"{message}; is the distance in line {photo.line} right?")
+            message += f"; is the distance in line {photo.line} right?"
+            on_fault(OddFile(photo.file, message))
 
 
-def read_photo_table(table: Path, findings: Findings) -> list[Photo]:
-    """The valid rows of a table; faults of the others go to the findings. Without a table, all images without poses.
+def read_photo_table(table: Path, on_fault: FaultHandler) -> list[Photo]:
+    """The valid rows of a table; faults of the others are reported. Without a table, all images
+    without poses.
 
     Raises MissingFile, and DamagedFile if the file is not a table of photographs.
     """
@@ -224,7 +219,7 @@ def read_photo_table(table: Path, findings: Findings) -> list[Photo]:
     photos: dict[Path, Photo] = {}
     with faults_of(table, _WANTED):  # csv.Error
         for row in reader:
-            if photo := findings.attempt(_photo, table, reader.line_num, row, masks, photos):
+            if photo := attempt(on_fault, _photo, table, reader.line_num, row, masks, photos):
                 photos[photo.file] = photo
     return list(photos.values())
 
@@ -239,7 +234,8 @@ def _unlisted(table: Path, photos: list[Photo]) -> str | None:
 
 
 def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
-    """The split of each object. Without splits in the table, a hash of the names selects 20 % test and 10 % val.
+    """The split of each object. Without splits in the table, a hash of the names selects 20 %
+    test and 10 % val.
 
     Raises DamagedFile if an object is in two splits or in none, or if there are too few objects
     to split.

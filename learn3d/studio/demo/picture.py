@@ -12,7 +12,8 @@ from PIL import Image
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.masks import check_mask, keep_object, mask_box
-from learn3d.pictures.photograph import PALETTES, natural_look, photograph
+from learn3d.pictures import photograph
+from learn3d.studio.make_data.looks import PALETTES, natural_look
 from learn3d.studio.picture_to_mesh.cutting import Box, Judge, Outline, correct, find_outline
 from learn3d.studio.picture_to_mesh.reconstruction import (
     Model,

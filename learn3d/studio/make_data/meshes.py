@@ -13,7 +13,7 @@ from pydantic import Field
 from trimesh import Trimesh
 
 from learn3d.data import conventions
-from learn3d.data.categories import SPLITS, synset_of
+from learn3d.data.conventions import SPLITS, synset_of
 from learn3d.files import npz
 from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
 from learn3d.settings import Count, FilePath, Weight, checked

@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import mesh_to_object, view_poses
+from learn3d.data.conventions import SPLITS, mesh_to_object, synset_of, view_poses
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.files.formats import RawMesh
 from learn3d.files.reading import MissingFile, read_json
 from learn3d.files.writing import publishing, write_json
-from learn3d.pictures.photograph import KEY_LIGHT, natural_look, photograph, studio_lights
-from learn3d.pictures.sheets import LEGEND, ROWS, draw_sheet, make_row
+from learn3d.pictures import KEY_LIGHT, photograph, studio_lights
+from learn3d.studio.make_data.contact_sheet import LEGEND, ROWS, draw_sheet, make_row
+from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import DatasetConfig, Item, check, fit_to_box, split_items
 from learn3d.studio.make_data.writers import WRITERS
 from learn3d.studio.make_data.writers.writer import RenderedObject, write_png

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 import nmr
-from learn3d.pictures.surfaces import Surface, Texture
+from learn3d.pictures import Surface, Texture
 from learn3d.studio.picture_to_mesh.fit import View
 from learn3d.studio.picture_to_mesh.smoothing import joined, sharpen
 

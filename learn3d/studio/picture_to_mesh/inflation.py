@@ -7,7 +7,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from learn3d.pictures.surfaces import Surface, Texture, grid_surface
+from learn3d.pictures import Surface, Texture, grid_surface
 from learn3d.studio.picture_to_mesh.fit import View, frame_view
 from learn3d.studio.picture_to_mesh.smoothing import smooth
 

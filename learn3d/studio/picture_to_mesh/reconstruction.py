@@ -1,6 +1,5 @@
 """Reconstruction: from images with masks to mesh files and pictures of them."""
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
@@ -13,17 +12,27 @@ from torch import Tensor, nn
 
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import mesh_to_object
+from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.data.framing import MEAN_OBJECT_SIZE, Crops, read_photo
+from learn3d.data.framing import MEAN_OBJECT_SIZE, frame, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.data.poses import Poses
 from learn3d.files import writing
-from learn3d.methods.mesh_method import MeshMethod, refine
+from learn3d.files.images import resample
+from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Method
 from learn3d.networks.encoders import CENTRED_SIZE, centre
-from learn3d.pictures.sheets import natural_colors, save_gif, save_png, tile
-from learn3d.pictures.surfaces import Surface, azimuths_deg, draw_around, turntable
+from learn3d.pictures import (
+    Surface,
+    azimuths_deg,
+    draw_around,
+    natural_colors,
+    save_gif,
+    save_png,
+    tile,
+    turntable,
+)
 from learn3d.runs import checkpoint
 from learn3d.settings import split_names
 from learn3d.studio.picture_to_mesh.coloring import color_mesh
@@ -31,6 +40,7 @@ from learn3d.studio.picture_to_mesh.cutting import Box, Judge, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
+from learn3d.studio.picture_to_mesh.refinement import refine
 from learn3d.studio.picture_to_mesh.several import (
     MOST_PICTURES,
     find_outliers,
@@ -45,8 +55,6 @@ MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
 SMALL_MODEL = Path(__file__).with_name("small.safetensors")  # the model in the package
 STRIP_SIZE = 192  # side of each picture in a strip, in pixels
-# pixels of a photograph, along each axis, per pixel of the prepared image, at least
-_OVERSAMPLING = 4
 # side in pixels to which a photograph is reduced before its object is searched
 _SEARCHED_SIDE = 1024
 _COLORED = 256  # side in pixels of the picture that gives the colours
@@ -320,43 +328,21 @@ def prepare_image(
     takes `object_size` of it; without, the picture must be framed like that already and is only
     padded to a square and scaled. Colours are inverted if the layout inverts them. Layouts with
     stretched images (Pascal3D+) keep the background, and `crop` cuts out the mask's box as their
-    reader does (`learn3d.data.framing`).
+    reader does (`learn3d.data.crops`).
 
     Raises ValueError if the mask has no pixel above half.
     """
-    if not (mask > 127).any():
-        raise ValueError("the mask has no pixel above half strength; is it the right mask?")
-    height, width = mask.shape
-    left, top, right, bottom = mask_box(mask) if crop else (0, 0, width, height)
     if LAYOUTS[layout].stretched:
+        height, width = mask.shape
+        left, top, right, bottom = mask_box(mask) if crop else (0, 0, width, height)
         box = np.array([[left, top, right - left, bottom - top]])
         planes = (colors, np.repeat(mask[..., None], 3, axis=2))
         cut, cut_mask = (
             Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes
         )
         return np.concatenate([cut, cut_mask[:1]])
-    side = max(right - left, bottom - top) / (max(object_size, _MIN_OBJECT_SIZE) if crop else 1)
-    reduction = max(1, int(side / (_OVERSAMPLING * size)))  # averaging blocks first is much faster
-    alpha = mask.astype(np.float32) / 255
-    planes = [(255 - colors[..., channel]) * alpha for channel in range(3)] + [255 * alpha]
-    planes = np.stack([np.asarray(Image.fromarray(plane).reduce(reduction)) for plane in planes])
-    x = (left + right) / 2 / reduction
-    y = (top + bottom) / 2 / reduction
-    half = side / 2 / reduction
-    pad = math.ceil(
-        max(0, half - x, half - y, x + half - planes.shape[2], y + half - planes.shape[1])
-    )
-    # 0 is the background of inverted colours
-    planes = np.pad(planes, ((0, 0), (pad, pad), (pad, pad)))
-    box = (x - half + pad, y - half + pad, x + half + pad, y + half + pad)
-    # mean of the covered pixels
-    filter = Image.Resampling.BOX if 2 * half >= size else Image.Resampling.BILINEAR
-    prepared = np.stack(
-        [np.asarray(Image.fromarray(plane).resize((size, size), filter, box)) for plane in planes]
-    )
-    if not LAYOUTS[layout].inverted:
-        prepared[:3] = 255 - prepared[:3]
-    return np.rint(prepared).clip(0, 255).astype(np.uint8)
+    object_size = max(object_size, _MIN_OBJECT_SIZE) if crop else None
+    return frame(colors, mask, size, object_size=object_size, inverted=LAYOUTS[layout].inverted)
 
 
 class Reconstruction(NamedTuple):
@@ -419,7 +405,7 @@ def reconstruct_guesses(
         azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
         yield Reconstruction(surface, stored, azimuth_deg)
         return
-    framed = frame(colors, mask)
+    framed = enlarge(colors, mask)
     mask = reduce_mask(framed[3])
     progress("camera", 0.0)
     predicted = predict(method, image, mask)
@@ -486,7 +472,7 @@ def reconstruct_several(
         check_category(model, category)
     progress("camera", 0.0)
     stored = [model.prepare(*picture, crop=crop) for picture in pictures]
-    framed = [frame(*picture) for picture in pictures]
+    framed = [enlarge(*picture) for picture in pictures]
     masks = torch.stack([reduce_mask(each[3]) for each in framed])
     predicted = []
     for number, image in enumerate(stored):
@@ -545,17 +531,14 @@ def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
     return kind, f"this looks like nothing that the model was trained on ({known}), {advice}"
 
 
-def frame(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def enlarge(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """A picture uint8 [H, W, 3] and its mask as uint8 [4, 256, 256] on white, with the object centred and large."""
-    # In the layout of Kar, colours are not inverted.
-    return prepare_image(colors, mask, object_size=CENTRED_SIZE, size=_COLORED, layout="kar")
+    return frame(colors, mask, _COLORED, object_size=CENTRED_SIZE, inverted=False)
 
 
 def reduce_mask(mask: np.ndarray) -> Tensor:
     """A mask uint8 [S, S] as float32 [64, 64] in 0 .. 1."""
-    return nn.functional.interpolate(
-        torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE, mode="area"
-    )[0, 0]
+    return torch.from_numpy(resample(mask[None].astype(np.float32), MASK_SIZE)[0]) / 255
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE
-from learn3d.pictures.surfaces import grid_surface
+from learn3d.pictures import grid_surface
 from learn3d.studio.picture_to_mesh.fit import (
     AZIMUTHS,
     ELEVATIONS_DEG,

@@ -12,7 +12,7 @@ from torch import Tensor
 from trimesh.smoothing import filter_taubin
 
 import nmr
-from learn3d.pictures.surfaces import Surface, grid_surface
+from learn3d.pictures import Surface, grid_surface
 
 CELLS = 128  # cells along each side of the grid of `outer_surface`
 _LEVEL = 0.15  # share of a cell that is filled at the surface

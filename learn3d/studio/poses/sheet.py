@@ -4,8 +4,7 @@ import numpy as np
 import torch
 
 from learn3d.data.poses import LookAtPoses
-from learn3d.pictures.sheets import natural_colors, tile
-from learn3d.pictures.surfaces import Surface, draw_surface, orbit
+from learn3d.pictures import Surface, draw_surface, natural_colors, orbit, tile
 from learn3d.studio.poses.views import EstimatedViews
 
 COLUMNS = 12  # azimuths on the sheet, at most

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from learn3d.config import TrainConfig
-from learn3d.data.categories import SYNSETS
+from learn3d.data.conventions import SYNSETS
 from learn3d.files import limits
 from learn3d.files.reading import read_json
 from learn3d.presets import command_line

@@ -1,6 +1,6 @@
 """Pictures of shapes in rows: the comparison of runs, and interpolations."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +9,18 @@ from torch import Tensor
 
 from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import AROUND, TURNS_DEG, spread_samples
-from learn3d.pictures.sheets import TILE, magnify, natural_colors, save_png, tile
-from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, grid_surface, orbit
+from learn3d.pictures import (
+    TILE,
+    Cameras,
+    Surface,
+    azimuths_deg,
+    draw_surface,
+    grid_surface,
+    natural_colors,
+    orbit,
+    save_png,
+    tile,
+)
 from learn3d.studio.tables.trained_models import TrainedModel
 
 TILE_SIZE = 128  # pixels of a picture in a comparison
@@ -147,3 +157,32 @@ def _save(blocks: Sequence[np.ndarray], output: Path) -> list[Path]:
     output.parent.mkdir(parents=True, exist_ok=True)
     save_png(path := output.with_suffix(".png"), np.concatenate(padded)[:-10])
     return [path]
+
+
+def magnify(pictures: np.ndarray, zoom: float) -> np.ndarray:
+    """The central part of pictures uint8 [N,h,w,3]: a share 1 / zoom of each side, in fewer pixels."""
+    height, width = pictures.shape[1:3]
+    top, left = (round(side * (1 - 1 / zoom) / 2) for side in (height, width))
+    return pictures[:, top : height - top, left : width - left]
+
+
+def common_zoom(shapes: Iterable[tuple[Surface, Cameras]], masks: Tensor) -> float:
+    """The largest magnification, at least 1, at which shapes and masks stay inside their pictures.
+
+    masks: float [B, S, S] of the input images. A mask that touches the border allows no
+    magnification.
+    """
+    inside = torch.nonzero(masks > 0.5)[:, 1:]
+    # 1 is the border
+    farthest = [
+        0.05,
+        *((2 * inside + 1) / masks.shape[-1] - 1).abs().flatten().tolist(),
+    ]
+    for surface, cameras in shapes:
+        corners = surface.vertices[surface.faces.unique()][None]
+        farthest += [
+            float(camera.transform(corners)[..., :2].abs().max())
+            for camera in cameras
+            if corners.numel()
+        ]
+    return max(1.0, 0.95 / max(farthest))

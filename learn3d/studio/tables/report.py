@@ -18,8 +18,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.files import limits, writing
 from learn3d.files.reading import read_bytes
-from learn3d.pictures.sheets import natural_colors
-from learn3d.pictures.surfaces import Surface, azimuths_deg, eyes, grid_surface
+from learn3d.pictures import Surface, azimuths_deg, eyes, grid_surface, natural_colors
 from learn3d.presets import command_line
 from learn3d.runs.folder import METRICS
 from learn3d.runs.log import read_records

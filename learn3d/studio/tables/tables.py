@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from learn3d.data.categories import SYNSETS
+from learn3d.data.conventions import SYNSETS
 from learn3d.data.layouts import Layout
 from learn3d.data.sampling import GROUP_SIZE
 from learn3d.methods.plus import PlusSettings

@@ -17,7 +17,7 @@ from sklearn.neighbors import KNeighborsClassifier
 
 from learn3d.evaluation import spread_samples
 from learn3d.files import writing
-from learn3d.pictures.surfaces import azimuths_deg
+from learn3d.pictures import azimuths_deg
 from learn3d.studio.tables.trained_models import TrainedModel
 
 MOST_CODES, FEWEST_CODES = 2000, 10  # images in a map; one of fewer means nothing

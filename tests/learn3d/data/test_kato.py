@@ -10,8 +10,7 @@ import pytest
 import torch
 from reader_checks import cut_short, problems
 
-from learn3d.data.categories import synset_of
-from learn3d.data.conventions import mesh_to_object
+from learn3d.data.conventions import mesh_to_object, synset_of
 from learn3d.data.readers import kato
 
 IMAGES, VOXELS = "03001627_test_images.npz", "03001627_test_voxels.npz"

@@ -12,7 +12,7 @@ from reader_checks import cut_short
 from shapenet_files import CHAIR, write_dvr
 
 from learn3d.data.layouts import LAYOUTS, Layout, check_folder, check_options, load_dataset, reader
-from learn3d.data.readers import renderings
+from learn3d.data.readers import objects
 
 TABLE = "04379243"
 
@@ -53,7 +53,7 @@ def test_a_folder_that_is_not_there_or_of_another_layout_is_named(
 def test_progress_is_shown_on_a_terminal_only(folder, capsys, monkeypatch) -> None:
     load_dataset("dvr", folder, "chair", "test")
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(renderings, "is_watched", lambda: True)
+    monkeypatch.setattr(objects, "is_watched", lambda: True)
     load_dataset("dvr", folder, "chair", "test")
     assert "chair" in capsys.readouterr().err
 

@@ -14,9 +14,9 @@ from reader_checks import cut_short, expect, problems, silhouette_iou
 from shapenet_files import CHAIR, COLOR, box_mesh, save, shapes, swap_frames, write_dvr, write_kar
 
 from learn3d.data.conventions import KAR, KATO, PASCAL3D, view_poses
-from learn3d.data.layouts import reader
+from learn3d.data.layouts import load_dataset, reader
 from learn3d.data.readers import dvr, kar
-from learn3d.data.readers.renderings import check_poses
+from learn3d.data.readers.kar import check_poses
 from learn3d.files.reading import DamagedFile
 from nmr.metrics import voxel_iou
 
@@ -102,7 +102,7 @@ def test_kar_has_the_protocol_of_the_published_code(copy) -> None:
     folder = copy("kar")
     train = kar.load(folder, "chair", "train")
     with pytest.raises(ValueError, match=r"views_per_object must lie in 1 \.\. 20, got 21"):
-        kar.load(folder, "chair", "train", views_per_object=21)
+        load_dataset("kar", folder, "chair", "train", views_per_object=21)
     everything = kar.load(folder, "chair", "train", views_per_object=20)
     assert (len(train), len(kar.load(folder, "chair", "val"))) == (1, 20)  # render 0 alone, or all
     np.testing.assert_array_equal(train.images[0], everything.images[0])
@@ -290,7 +290,7 @@ def test_everything_wrong_is_found_in_one_walk(copy) -> None:
     lists = {"name": "chair", **LISTS, "test": ["a0", "gone"], "val": ["c2", "b1"]}
     (folder / "splits.json").write_text(json.dumps({CHAIR: lists}))
     found = problems("kar", folder, "test")
-    names = ["gone", "view.txt", "render_3.png", "render_4.png"]
+    names = ["view.txt", "render_3.png", "render_4.png", "gone"]
     assert [Path(p.path).name for p in found] == names
     (shared,) = problems("kar", folder, "train")
     assert shared.message == "train shares 1 objects with val, such as b1"

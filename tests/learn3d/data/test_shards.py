@@ -21,6 +21,7 @@ from safetensors.numpy import load_file, save_file
 
 from learn3d.commands import data
 from learn3d.data import shards
+from learn3d.data.conventions import shards_folder
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import check_folder, load_dataset
 from learn3d.data.readers import kato
@@ -240,7 +241,7 @@ def test_another_layout_or_set_file(stored) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is measured on Linux only")
 def test_memory_does_not_grow_with_the_data(tmp_path) -> None:
     """200 MB of images, of which batches are read, take a few megabytes."""
-    where = shards.split_folder(tmp_path, "chair", "train")
+    where = shards_folder(tmp_path, "chair", "train")
     for number in range(4):
         images = np.full((128, 24, 4, 64, 64), 128 + number, np.uint8)
         part = kato.from_arrays(images, np.zeros((128, 32, 32, 32), bool), "chair", "train")

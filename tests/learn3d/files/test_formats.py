@@ -13,16 +13,10 @@ import scipy.io
 from PIL import Image
 
 from learn3d.data.framing import read_photo
-from learn3d.files import formats, limits, renderings, sandbox
+from learn3d.files import formats, images, limits, sandbox
+from learn3d.files.formats import read_table
+from learn3d.files.images import PHOTOGRAPHS, RENDERINGS, open_image, resample, split_alpha
 from learn3d.files.reading import DamagedFile
-from learn3d.files.renderings import (
-    PHOTOGRAPHS,
-    RENDERINGS,
-    open_image,
-    read_table,
-    shrink,
-    split_alpha,
-)
 
 
 def png(width: int, height: int) -> bytes:
@@ -41,7 +35,10 @@ def png(width: int, height: int) -> bytes:
 )
 def test_images_that_promise_too_many_pixels_are_not_decoded(tmp_path, size):
     (tmp_path / "a.png").write_bytes(png(*size))
-    for read in (read_photo, lambda path: sandbox.read(renderings.read_with_alpha, path, 64)):
+    for read in (
+        read_photo,
+        lambda path: sandbox.read(images.read_with_depth, path, path.with_name("none"), 64),
+    ):
         with pytest.raises(ValueError, match=r"a\.png: .*(make it smaller|DecompressionBomb)"):
             read(tmp_path / "a.png")
 
@@ -71,17 +68,16 @@ def test_shrinking_takes_the_mean_over_each_pixels_area():
     color = rng.integers(0, 256, (128, 128, 3), np.uint8)
     mask = rng.integers(0, 256, (128, 128), np.uint8)
     pixels = np.dstack([color, mask])
-    image, small = shrink(pixels.transpose(2, 0, 1).astype(np.float32), 64)
+    image = resample(pixels.transpose(2, 0, 1).astype(np.float32), 64)
     blocks = pixels.reshape(64, 2, 64, 2, 4).mean((1, 3)).transpose(2, 0, 1)
     assert image.dtype == np.uint8 and np.abs(image - blocks).max() <= 0.51
-    np.testing.assert_array_equal(small, image[3])
 
 
 def test_shrinking_by_three_and_a_half_keeps_the_covered_area():
     mask = np.zeros((224, 224), np.uint8)
     mask[10:101, 50:171] = 255
-    image, small = shrink(np.float32([mask] * 4), 224)
-    np.testing.assert_array_equal(image[3], mask)
+    np.testing.assert_array_equal(resample(mask[None].astype(np.float32), 224)[0], mask)
+    small = resample(mask[None].astype(np.float32), 64)[0]
     assert small.sum() * 3.5**2 == pytest.approx(mask.sum(), rel=1e-3)
     assert small[:, 10].max() == 0 and small[20, 20] == 255
 

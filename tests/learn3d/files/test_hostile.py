@@ -23,7 +23,7 @@ from python2_pickles import npy
 
 import nmr.neural_renderer as nr
 from learn3d.data.framing import read_photo
-from learn3d.files import formats, npz, renderings, sandbox
+from learn3d.files import formats, images, npz, sandbox
 
 SECONDS, BYTES = 10.0, 700e6
 if sys.gettrace() is not None:  # the coverage of lines is measured, which slows Python down
@@ -68,7 +68,7 @@ def read_mat(path: Path) -> np.ndarray:
 
 
 def read_image(path: Path, seconds: float = sandbox.SECONDS) -> object:
-    return sandbox.read(renderings.read_with_alpha, path, 64, seconds=seconds)
+    return sandbox.read(images.read_with_depth, path, path.with_name("none"), 64, seconds=seconds)
 
 
 def read_npz(path: Path) -> object:

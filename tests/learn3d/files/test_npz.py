@@ -73,9 +73,11 @@ def test_names_and_arrays_with_items(tmp_path):
 
 
 HEADERS = {
-    UINT8 % 10**12: "must be numbers that take 4 bytes",
-    b"{'descr': '|u1', 'fortran_order': False, 'shape': (-4,), }": "must be numbers",
-    b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }": "must be numbers",
+    UINT8 % 10**12: "memory|EOF",
+    UINT8 % 5: "EOF",
+    UINT8 % 3: "must be numbers, and as many as its header says",
+    b"{'descr': '|u1', 'fortran_order': False, 'shape': (-4,), }": "negative",
+    b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }": "Object arrays",
     b"{'descr': '<U1', 'fortran_order': False, 'shape': (1,), }": "must be numbers",
     b"{'descr': '|b1', 'fortran_order': False, 'shape': (4,), }": "bools",
     b"{'descr': " + b"(" * 5000 + b"}": "",

@@ -10,8 +10,8 @@ import pytest
 
 from learn3d.files import npz, sandbox, writing
 from learn3d.files.formats import read_matlab, read_mesh, read_state_dict
+from learn3d.files.images import PHOTOGRAPHS, open_image
 from learn3d.files.reading import parse_json, read_bytes, read_json, read_text
-from learn3d.files.renderings import PHOTOGRAPHS, open_image
 
 
 def test_only_regular_files_below_a_limit_are_read(tmp_path):

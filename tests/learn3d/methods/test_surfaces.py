@@ -9,10 +9,10 @@ import torch
 from steps import INFO, make_method
 
 import nmr
-from learn3d.methods import mesh_method
-from learn3d.methods.mesh_method import refine
-from learn3d.pictures.surfaces import grid_surface
+from learn3d.pictures import grid_surface
+from learn3d.studio.picture_to_mesh import refinement
 from learn3d.studio.picture_to_mesh.reconstruction import reconstruct_dataset
+from learn3d.studio.picture_to_mesh.refinement import refine
 
 
 def test_surface_of_a_ball_is_where_the_ball_is() -> None:
@@ -47,8 +47,8 @@ def make(plane: float | None):
 
 def take_steps(monkeypatch: pytest.MonkeyPatch, code: int, vertices: int) -> None:
     """Let `refine` take this many steps."""
-    monkeypatch.setattr(mesh_method, "CODE_STEPS", code)
-    monkeypatch.setattr(mesh_method, "VERTEX_STEPS", vertices)
+    monkeypatch.setattr(refinement, "STEPS_OF_CODES", code)
+    monkeypatch.setattr(refinement, "STEPS_OF_VERTICES", vertices)
 
 
 @pytest.mark.parametrize("steps", [(60, 0), (0, 30), (15, 15)])

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from learn3d import training
+from learn3d.device import SLOWER, TRIAL, WINDOW, ThreadTuner
 from learn3d.runs import checkpoint
-from learn3d.runs.threads import SLOWER, TRIAL, WINDOW, ThreadTuner
 from learn3d.training import train
 
 

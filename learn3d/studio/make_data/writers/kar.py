@@ -10,8 +10,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 import nmr
-from learn3d.data.categories import SPLITS, synset_of
-from learn3d.data.conventions import KAR
+from learn3d.data.conventions import KAR, SPLITS, synset_of
 from learn3d.data.dataset import DEPTH_REACH
 from learn3d.data.readers.kar import read_splits
 from learn3d.files.writing import write_json

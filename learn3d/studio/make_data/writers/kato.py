@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import nmr
-from learn3d.data.categories import SPLITS
-from learn3d.data.conventions import LAYOUTS
+from learn3d.data.conventions import LAYOUTS, SPLITS
 from learn3d.data.dataset import ViewDataset, depth_levels
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.readers import around, kato

@@ -16,7 +16,7 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.masks import keep_object
 from learn3d.data.poses import wrap_deg
-from learn3d.pictures.surfaces import Surface
+from learn3d.pictures import Surface
 from learn3d.studio.demo import picture as pictures
 from learn3d.studio.picture_to_mesh import reconstruction
 from learn3d.studio.picture_to_mesh.cutting import threshold_mask

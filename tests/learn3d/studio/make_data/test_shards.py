@@ -17,7 +17,7 @@ import stub_work
 import torch
 from lopsided_meshes import write_meshes
 
-from learn3d.data import shards
+from learn3d.data.conventions import has_shards
 from learn3d.data.layouts import load_dataset
 from learn3d.studio.make_data import render
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
@@ -182,7 +182,7 @@ def test_a_killed_call_is_continued(config, here, tmp_path, monkeypatch) -> None
                     os.killpg(process.pid, kind)
                 else:
                     process.send_signal(kind)
-    assert not shards.holds(config.output, "chair", "train")
+    assert not has_shards(config.output, "chair", "train")
     assert (
         subprocess.run([sys.executable, tmp_path / "make.py", *words], timeout=300).returncode == 0
     )

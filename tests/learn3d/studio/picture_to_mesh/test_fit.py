@@ -16,7 +16,7 @@ from learn3d.data.layouts import load_dataset
 from learn3d.methods import create_method
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import centre
-from learn3d.pictures.photograph import photograph
+from learn3d.pictures import photograph
 from learn3d.presets import PRESETS
 from learn3d.studio.picture_to_mesh.coloring import _nearest_clear, color_mesh
 from learn3d.studio.picture_to_mesh.export import export

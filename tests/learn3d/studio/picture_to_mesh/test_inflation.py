@@ -8,10 +8,10 @@ import torch
 import trimesh
 from PIL import Image
 
-from learn3d.pictures.surfaces import draw_around
+from learn3d.pictures import draw_around
 from learn3d.studio.picture_to_mesh.inflation import CELLS, DEPTH, inflate
 from learn3d.studio.picture_to_mesh.reconstruction import (
-    frame,
+    enlarge,
     load_model,
     reconstruct_picture,
     reduce_mask,
@@ -31,7 +31,7 @@ MASKS = {
 
 def framed(mask: np.ndarray) -> np.ndarray:
     colors = np.stack([128 + X, 128 + Y, 0 * X + 90], -1).astype(np.uint8)
-    return frame(colors, 255 * mask.astype(np.uint8))
+    return enlarge(colors, 255 * mask.astype(np.uint8))
 
 
 @pytest.mark.parametrize("name", MASKS)

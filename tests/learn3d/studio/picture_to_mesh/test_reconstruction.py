@@ -14,8 +14,8 @@ from scipy.ndimage import maximum_filter
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.data.framing import Crops
-from learn3d.pictures.surfaces import Surface
+from learn3d.data.crops import Crops
+from learn3d.pictures import Surface
 from learn3d.studio.demo.picture import example
 from learn3d.studio.picture_to_mesh.reconstruction import (
     _read,

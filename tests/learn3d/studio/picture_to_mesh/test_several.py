@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import nmr
-from learn3d.pictures.photograph import photograph
+from learn3d.pictures import photograph
 from learn3d.studio.picture_to_mesh.reconstruction import load_model, reconstruct_several
 from learn3d.studio.picture_to_mesh.templates import template
 

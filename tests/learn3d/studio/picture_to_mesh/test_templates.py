@@ -14,8 +14,7 @@ import trimesh
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.layouts import load_dataset
-from learn3d.pictures.photograph import photograph
-from learn3d.pictures.surfaces import Surface
+from learn3d.pictures import Surface, photograph
 from learn3d.studio.make_data.render import DatasetConfig, make_shards
 from learn3d.studio.picture_to_mesh.coloring import paint
 from learn3d.studio.picture_to_mesh.reconstruction import (

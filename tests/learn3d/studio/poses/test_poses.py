@@ -14,7 +14,7 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.data.pose_table import PoseTable, fingerprints
 from learn3d.data.readers import kato
 from learn3d.methods.pose_updates import SIZE
-from learn3d.pictures.sheets import HEADER, MARGIN
+from learn3d.pictures import HEADER, MARGIN
 from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import (
     CandidatePoses,

@@ -15,11 +15,10 @@ from torch import Tensor
 import nmr
 from learn3d.evaluation import picture_grid
 from learn3d.methods.method import Grids, Meshes
-from learn3d.pictures.sheets import HEADER, MARGIN, TILE, magnify, natural_colors
-from learn3d.pictures.surfaces import azimuths_deg, common_zoom, draw_surface, orbit
+from learn3d.pictures import HEADER, MARGIN, TILE, azimuths_deg, draw_surface, natural_colors, orbit
 from learn3d.runs import checkpoint
 from learn3d.studio.tables import grids
-from learn3d.studio.tables.grids import comparison_grid, interpolate
+from learn3d.studio.tables.grids import common_zoom, comparison_grid, interpolate, magnify
 from learn3d.studio.tables.trained_models import TrainedModel, name_runs, open_runs
 
 pytest.importorskip("matplotlib")

@@ -13,26 +13,24 @@ import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.methods.method import Grids
-from learn3d.pictures.photograph import BACK_LIGHT, photograph, studio_lights
-from learn3d.pictures.sheets import (
+from learn3d.pictures import (
+    BACK_LIGHT,
     HEADER,
     MARGIN,
-    draw_sheet,
-    magnify,
-    make_row,
-    natural_colors,
-    save_gif,
-    save_png,
-    tile,
-)
-from learn3d.pictures.surfaces import (
     Surface,
     azimuths_deg,
-    common_zoom,
     draw_surface,
+    natural_colors,
     orbit,
+    photograph,
+    save_gif,
+    save_png,
+    studio_lights,
+    tile,
     turntable,
 )
+from learn3d.studio.make_data.contact_sheet import draw_sheet, make_row
+from learn3d.studio.tables.grids import common_zoom, magnify
 
 WHITE = np.ones(3, np.float32)
 FRONT = nmr.LookAt.from_angles(2.732, 0.0, 0.0, half_fov_deg=15.0)

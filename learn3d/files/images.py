@@ -1,7 +1,8 @@
-"""Decodes untrusted images with Pillow in the sandbox, and reads the renderings of data sets."""
+"""Decodes untrusted images with Pillow in the sandbox, reads the renderings of data sets, and
+resamples pictures.
+"""
 
 import functools
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from learn3d.files import limits, sandbox
-from learn3d.files.reading import DamagedFile, MissingFile, faults_of, open_file, read_text
+from learn3d.files.reading import DamagedFile, MissingFile, faults_of, open_file
 
 # TIFF is not supported: a small file can list millions of strips, for which Pillow makes objects before it decodes.
 RENDERINGS = ("PNG", "JPEG")
@@ -25,7 +26,8 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
     wanted = f"an image in the format {', '.join(formats)}"
     with faults_of(path, wanted), open_file(path, limits.IMAGE_FILE_BYTES, wanted) as file:
         image = Image.open(file, formats=formats)
-        pixels, most = image.width * image.height, limits.IMAGE_PIXELS
+        pixels = image.width * image.height
+        most = limits.IMAGE_PIXELS
         if max(image.size) > max_side or pixels > most:
             size = f"{image.width}x{image.height} pixels"
             raise DamagedFile(
@@ -37,19 +39,13 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
 
 
 # image uint8 [4, S, S], mask uint8 [64, 64], largest value of the mask
-View = tuple[np.ndarray, np.ndarray, int]
+Rendering = tuple[np.ndarray, np.ndarray, int]
 
 
-def read_with_alpha(path: Path, size: int) -> View:
-    """A square rendering, reduced to `size`: colours over white, and its alpha channel as the mask."""
-    color, alpha = _read_square(path, size)
-    if alpha is None:
-        raise DamagedFile(path, "has no alpha channel; expected RGBA, whose alpha is the mask")
-    return _view(color, alpha, size)
-
-
-def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
-    """A square rendering, reduced to `size`. Mask: depth below 250 in 8 bits, or alpha if there is no depth file."""
+def read_with_depth(path: Path, depth_path: Path, size: int) -> Rendering:
+    """A square rendering, reduced to `size`. Mask: depth below 250 in 8 bits, or alpha if there
+    is no depth file.
+    """
     color, mask = _read_square(path, size)
     if depth_path.exists():
         depth = open_image(depth_path, RENDERINGS, limits.RENDER_SIDE)
@@ -65,10 +61,12 @@ def read_with_depth(path: Path, depth_path: Path, size: int) -> View:
             depth_path,
             f"is missing, and {path.name} has no alpha channel; expected the depth image",
         )
-    return _view(color, mask, size)
+    planes = np.stack([*color.transpose(2, 0, 1), mask]).astype(np.float32)
+    small = resample(planes[3:], limits.MASK_SIZE)[0]
+    return resample(planes, size), small, int(mask.max())
 
 
-def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
+def read_with_mask(path: Path, mask_path: Path, size: int) -> Rendering:
     """A rendering and its mask, both size x size; colours are inverted, as in Kato's files."""
     images = []
     for each in (path, mask_path):
@@ -81,7 +79,8 @@ def read_with_mask(path: Path, mask_path: Path, size: int) -> View:
 
 
 def _read_square(path: Path, size: int) -> tuple[np.ndarray, np.ndarray | None]:
-    image, least = open_image(path, RENDERINGS, limits.RENDER_SIDE), max(size, limits.MASK_SIZE)
+    image = open_image(path, RENDERINGS, limits.RENDER_SIDE)
+    least = max(size, limits.MASK_SIZE)
     if image.width != image.height or image.width < least or image.mode.startswith(("I", "F", "C")):
         raise DamagedFile(
             path, f"is {_kind(image)}; expected a square image of at least {least}x{least}, 8 bits"
@@ -93,13 +92,10 @@ def _kind(image: Image.Image) -> str:
     return f"{image.width}x{image.height} pixels of the format {image.mode}"
 
 
-def _view(color: np.ndarray, mask: np.ndarray, size: int) -> View:
-    planes = np.stack([*color.transpose(2, 0, 1), mask]).astype(np.float32)
-    return *shrink(planes, size), int(mask.max())
-
-
 def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None if the image has none."""
+    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None if the
+    image has none.
+    """
     if not image.has_transparency_data:
         return np.asarray(image.convert("RGB")), None
     image = image.convert("RGBA")
@@ -109,39 +105,32 @@ def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
     return np.asarray(white), np.asarray(alpha)
 
 
-def shrink(planes: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image uint8 [4, size, size] and its mask uint8 [64, 64] of colours and mask float32 [4, H, W], 0 .. 255.
+def resample(
+    planes: np.ndarray, size: int, square: tuple[float, float, float] | None = None
+) -> np.ndarray:
+    """What a square shows of planes float32 [C, H, W] with values 0 .. 255: uint8 [C, size, size].
 
-    The planes are padded with 0 to a square. Each pixel is the mean over its area, fractions of
-    pixels included.
+    Each pixel is the mean over its area, fractions of pixels included. If the planes are magnified,
+    it is interpolated linearly. The planes are 0 beyond their border.
+    square: left, top and side in pixels; default: the planes padded to a square on both sides.
     """
-    image = _shrink(planes, size)
-    return image, image[3] if size == limits.MASK_SIZE else _shrink(planes[3:], limits.MASK_SIZE)[0]
-
-
-def _shrink(planes: np.ndarray, size: int) -> np.ndarray:
-    if planes.shape[1:] == (size, size):
-        return planes.astype(np.uint8)
-    side = max(planes.shape[1:])
-    rows, columns = (
-        _area_weights(side, size)[:, (side - n) // 2 :][:, :n] for n in planes.shape[1:]
-    )
+    height, width = planes.shape[1:]
+    side = max(height, width)
+    left, top, side = square or (-((side - width) // 2), -((side - height) // 2), side)
+    rows = _weights(height, top, side, size)
+    columns = _weights(width, left, side, size)
     return np.rint(rows @ planes @ columns.T).astype(np.uint8)
 
 
-@functools.cache
-def _area_weights(source: int, size: int) -> np.ndarray:
-    """Share of each of `source` pixels in each of `size` larger ones, float32 [size, source]; rows sum to 1."""
-    edges = np.arange(size + 1) * (source / size)
-    pixels = np.arange(source)
+@functools.lru_cache(16)
+def _weights(count: int, start: float, side: float, size: int) -> np.ndarray:
+    """Weight of each of `count` pixels for each of the `size` pixels of a line from `start`:
+    float32 [size, count].
+    """
+    pixels = np.arange(count) - start
+    edges = np.arange(size + 1) * (side / size)
+    if side < size:
+        centres = (edges[1:] + edges[:-1]) / 2
+        return (1 - np.abs(centres[:, None] - (pixels + 0.5))).clip(0).astype(np.float32)
     overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
-    return (overlap.clip(0) * (size / source)).astype(np.float32)
-
-
-def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
-    """The first rows and columns of a table of numbers in a text file: float64 [rows, columns], all finite."""
-    text = io.StringIO(read_text(path, limits.TEXT_BYTES, wanted))
-    table = np.loadtxt(text, comments=None, usecols=range(columns), max_rows=rows, ndmin=2)
-    if (found := np.isfinite(table).all(axis=1).sum()) < rows:
-        raise ValueError(f"{found} rows of finite numbers, {rows} are needed")
-    return table
+    return (overlap.clip(0) * (size / side)).astype(np.float32)
