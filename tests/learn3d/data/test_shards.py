@@ -87,7 +87,7 @@ def shard_file(stored: Path, number: int = 0, split: str = "train") -> Path:
 
 
 def set_file(stored: Path) -> Path:
-    return stored / "02691156" / "train" / shards.SET_FILE
+    return stored / "02691156" / "train" / SET_FILE
 
 
 def change_set_file(stored: Path, **changes: int) -> None:
