@@ -21,7 +21,7 @@ from safetensors.numpy import load_file, save_file
 
 from learn3d.commands import data
 from learn3d.data import shards
-from learn3d.data.conventions import shards_folder
+from learn3d.data.conventions import SET_FILE, shards_folder
 from learn3d.data.disk_array import DiskArray
 from learn3d.data.layouts import check_folder, load_dataset
 from learn3d.data.readers import kato
