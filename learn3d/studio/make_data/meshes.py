@@ -1,4 +1,4 @@
-"""Settings of `learn3d make-dataset`, and the meshes of each split: of a folder, of a mesh pack, or generated."""
+"""Settings of `learn3d make-dataset`, and the meshes of each split: from files, or generated."""
 
 import itertools
 import re
@@ -157,7 +157,7 @@ def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
 
 
 def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
-    """A function that reads it for each mesh of a folder (by relative path, sorted) or of a mesh pack (by number).
+    """A reading function for each mesh of a folder (by relative path, sorted) or pack (by number).
 
     A pack is an npz file with v0 float [V, 3], f0 int [F, 3], v1, f1, ... Raises ValueError if
     there is no mesh.
@@ -243,6 +243,6 @@ def check(mesh: RawMesh | Trimesh) -> RawMesh:
 
 
 def fit_to_box(vertices: np.ndarray) -> np.ndarray:
-    """Vertices [V, 3], moved and scaled so that their bounding box is centred at 0 and its longest side is 1."""
+    """Vertices [V, 3] in a bounding box that is centred at 0 and has the longest side 1."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return (vertices - (low + high) / 2) / (high - low).max()

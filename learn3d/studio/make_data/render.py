@@ -35,7 +35,7 @@ class DatasetReport:
     """The outcome of `make_dataset`. Raises ValueError if no mesh is left for training."""
 
     def __init__(self, config: DatasetConfig, meshes: Sequence[dict]) -> None:
-        """meshes: each with name, split, and either objects (names, with those of scaled copies) or reason."""
+        """meshes: each with name, split, and either objects (names, also of copies) or reason."""
         self.config, self.skipped = config, [mesh for mesh in meshes if "reason" in mesh]
         self.used = [mesh for mesh in meshes if "objects" in mesh]
         names = {
@@ -187,7 +187,7 @@ def _render(config: DatasetConfig, mesh: RawMesh, item: Item, copy: int) -> Rend
 
 
 def make_shards(config: DatasetConfig) -> int:
-    """Make the data set that `config` describes as shards in `output/SYNSET/SPLIT`, each by a worker.
+    """Make the data set that `config` describes as shards in `output/SYNSET/SPLIT`, by workers.
 
     A shard depends on the settings and its meshes alone, so those of a killed call are kept. The
     report has the same files as that of `make_dataset`. Returns the exit status: 0, 1 if a shard
@@ -254,7 +254,7 @@ def make_shard(
 
 
 def _parts(items: Sequence[Item]) -> list[list[Item]]:
-    """The meshes of each shard: as many as make `OBJECTS_PER_SHARD` objects at most, and at least one."""
+    """The meshes of each shard: at most `OBJECTS_PER_SHARD` objects, and at least one mesh."""
     parts, room = [], 0
     for item in items:
         if item.copies > room:

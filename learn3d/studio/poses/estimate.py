@@ -169,7 +169,7 @@ def _common_frame(posteriors: list[Tensor], rng: torch.Generator) -> list[int]:
 
 
 def _near(mass: Tensor, azimuth: Tensor) -> Tensor:
-    """The part [N] of the masses [N, A] of all azimuths that is within NEAR_DEG of the azimuths of index int64 [N]."""
+    """The mass [N], of [N, A], within NEAR_DEG of the azimuths of index int64 [N]."""
     reach = math.floor(NEAR_DEG * mass.shape[1] / 360)
     return mass.gather(1, (azimuth[:, None] + torch.arange(-reach, reach + 1)) % mass.shape[1]).sum(
         1
@@ -183,7 +183,7 @@ def _estimate_once(
     of_fitted: Neighbours,
     of_all: Neighbours,
 ) -> tuple[Tensor, Tensor, Shapes, Tensor, float]:
-    """Steps 1 to 4 on the masks of the shapes that `create` makes, then the posteriors of all masks `data`.
+    """Steps 1 to 4 on the masks of the shapes of `create`, then posteriors of all masks `data`.
 
     of_fitted, of_all: the neighbours of the shapes' masks and of `data` among the shapes' masks.
     Returns, in a frame of its own, the posteriors [N, A, E] of `data` and the added probabilities
@@ -217,7 +217,7 @@ def _estimate_once(
 
 
 class Shapes:
-    """M shapes, symmetric about x = 0: a generator network, a code for each shape, and one offset for all.
+    """M shapes, symmetric about x = 0: a generator, a code for each shape, one offset for all.
 
     They are fitted to the masks `data`.
     """
@@ -247,7 +247,7 @@ class Shapes:
         return self.network(self.codes) + self.base
 
     def distances(self, masks: Tensor, vertices: Tensor, elevations: slice = slice(None)) -> Tensor:
-        """1 - soft IoU of masks [B, SIZE^2] with all shapes at all azimuths and the given elevations: [B, M, A, E].
+        """1 - soft IoU of masks [B, SIZE^2] with all shapes at these elevations: [B, M, A, E].
 
         Views from azimuths above 180 degrees are mirror images.
         """
@@ -278,7 +278,7 @@ class Shapes:
     def fit(
         self, *, start: float, smoothness_weight: float, log_prior: Tensor | None = None
     ) -> None:
-        """EM: the posteriors over shapes and poses follow from the IoU, then a gradient step fits the shapes.
+        """EM: the IoU gives posteriors over shapes and poses, then a gradient step fits the shapes.
 
         The temperature falls from `start` to `TEMPERATURE`. log_prior: [N, A, E].
         """
@@ -332,7 +332,7 @@ class Shapes:
 
 
 def _turned(values: Tensor, turns: Tensor) -> Tensor:
-    """Values [B, M, A, E] of M shapes at A azimuths when shape m is turned by `turns[m]` quarter turns, int64 [M]."""
+    """Values [B, M, A, E] when shape m is turned by `turns[m]` quarter turns, int64 [M]."""
     azimuths = values.shape[2]
     before = (torch.arange(azimuths) - turns[:, None] * (azimuths // TURNS)) % azimuths
     return values.gather(2, before[None, :, :, None].expand_as(values))
@@ -369,7 +369,7 @@ class Neighbours(NamedTuple):
     def of(
         cls, data: Masks, known: Masks, kinds: Tensor | None = None, count: int = _NEIGHBOURS
     ) -> Neighbours:
-        """Neighbours of `data` among `known`: masks of other objects, and of other `kinds` (int64 [N]) if given."""
+        """Neighbours of `data` among `known`: other objects, and other `kinds` (int64 [N])."""
         found = []
         for source in (data.masks, data.masks.reshape(-1, SIZE, SIZE).flip(2).flatten(1)):
             for part in torch.arange(len(source)).split(512):
@@ -385,7 +385,7 @@ class Neighbours(NamedTuple):
         return cls(rows, torch.exp(-values / _NEIGHBOUR_SCALE))
 
     def message(self, posterior: Tensor) -> Tensor:
-        """The weighted sum of the neighbours' posteriors [N', A, E], mirrored ones with azimuth -a: [N, A, E]."""
+        """Weighted sum of the neighbours' posteriors [N', A, E], mirrored ones at -a: [N, A, E]."""
         back = (-torch.arange(posterior.shape[1])) % posterior.shape[1]
         total = 0
         for mirrored, (rows, weights) in enumerate(zip(self.rows, self.weights, strict=True)):
@@ -428,7 +428,7 @@ def _turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, f
 
 
 def _solve_turns(couplings: Tensor, rng: torch.Generator) -> np.ndarray:
-    """The turns t, int64 [M], that maximize the sum of couplings[t_i, t_j, i, j] over all pairs i, j."""
+    """The turns t, int64 [M], with the largest sum of couplings[t_i, t_j, i, j] over all i, j."""
     count = couplings.shape[-1]
     coupling = ((couplings + couplings.permute(1, 0, 3, 2)) * (1 - torch.eye(count))).numpy()
     draw = np.random.default_rng(int(torch.randint(2**31, (), generator=rng)))
@@ -476,7 +476,7 @@ def _mask_votes(
 def _peak_votes(
     data: Masks, prototype: Tensor, azimuth: Tensor, count: int, azimuths: int
 ) -> Tensor:
-    """Votes float64 [TURNS, TURNS, M, M] of the peaks of upper outlines: an airplane's fin, a chair's back.
+    """Votes float64 [TURNS, TURNS, M, M] of peaks of upper outlines: a fin, a chair's back.
 
     The vote of two turned prototypes is the inner product of their mean peaks at all azimuths,
     each azimuth weighted by the roots of its numbers of masks. prototype, azimuth: int64 [N].
@@ -503,7 +503,7 @@ def _peak_votes(
 
 
 def _peaks(masks: Tensor) -> Tensor:
-    """White top-hat of each mask's upper outline, its parts narrower than _PEAK_WIDTH pixels: float32 [N, SIZE].
+    """Parts of each mask's upper outline narrower than _PEAK_WIDTH pixels: float32 [N, SIZE].
 
     The outline is the height of the topmost pixel of each column above the centre of mass, 0 in
     empty columns.

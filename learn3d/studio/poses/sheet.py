@@ -13,7 +13,7 @@ PICTURE_SIZE = 64  # side of a picture in pixels
 
 
 def draw_pose_sheet(views: EstimatedViews, offset_deg: float = 0.0) -> np.ndarray:
-    """Uint8 [H, W, 3]: the most frequent prototypes, and below each azimuth images with about that estimate.
+    """Uint8 [H, W, 3]: frequent prototypes, and below each azimuth images with that estimate.
 
     offset_deg: added to the azimuths of images and prototypes, as by `PoseTable.turned`.
     """

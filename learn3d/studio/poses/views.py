@@ -161,7 +161,7 @@ def estimate_views(
 def _cameras(
     datasets: Sequence[ViewDataset], cameras: CameraOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Elevation, distance and half field of view of every image: the given ones, the data set's, or defaults."""
+    """Elevation, distance and half field of view of all images: given, the data's, or defaults."""
     given = cameras.elevations() or (DEFAULT_ELEVATION_DEG,) * 2
     half_fov = torch.full((sum(map(len, datasets)),), (cameras.fov_deg or DEFAULT_FOV_DEG) / 2)
     largest = max(float(dataset.object_sizes().max()) for dataset in datasets)

@@ -1,4 +1,4 @@
-"""Procedural airplanes, in lengths of the fuselage, nose towards +z: fuselages, wings, tails, engines, landing gear."""
+"""Procedural airplanes, in lengths of the fuselage, nose towards +z."""
 
 from dataclasses import dataclass
 
@@ -115,7 +115,7 @@ def fin(
 
 
 def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
-    """Fin and stabiliser of a kind: "conventional", "cross" (stabiliser half-way up the fin), "T", "V" or "twin"."""
+    """Fin and stabiliser: "conventional", "cross" (half-way up the fin), "T", "V" or "twin"."""
     height = draw(0.14, 0.21)
     sweep = draw(28, 45) if swept else draw(5, 20)
     root = draw(0.13, 0.19)
@@ -192,12 +192,12 @@ def along_z(
     sides: int,
     hollow: bool = False,
 ) -> Part:
-    """The solid of revolution about the z axis of a profile [(share of the radius, share of the length)]."""
+    """The solid of revolution about z of a profile [(share of the radius, of the length)]."""
     return revolve(np.array(profile) * [radius, length], sides, hollow).rotated("x", 90)
 
 
 def nacelle(radius: float, length: float) -> Part:
-    """A jet engine along z, centred: an open cowl around a core with a spinner in front and a cone behind."""
+    """A jet engine along z, centred: an open cowl around a core with spinner and cone."""
     cowl = [
         (0.78, -0.5),
         (0.97, -0.1),
@@ -347,7 +347,7 @@ def airliner(draw: Draw, *, radius, freighter, tall, nose, nose_power, tail_star
 def _wing_engine(
     draw: Draw, plan: Planform, share: float, size: float, *, length, drop, forward
 ) -> Part:
-    """A jet engine of radius `size` on a pylon under the right wing, at a share of its half span."""
+    """A jet engine of radius `size` on a pylon under the right wing, at a share of the span."""
     x, y, z, chord = plan.at(share)
     length *= size
     low = y - drop * size
@@ -391,7 +391,7 @@ def business_jet(draw: Draw, *, radius, nose) -> Part:
     shape={"delta": 2.5, "swept": 2, "trapezoid": 2, "forward": 0.3},
 )
 def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
-    """A jet fighter: delta, swept or trapezoid wings, one or two fins, canards, stores under the wings."""
+    """A jet fighter: wings of four forms, one or two fins, canards, stores under the wings."""
     root, tip, sweep, z = {
         "delta": (draw(0.42, 0.52), draw(0.02, 0.06), draw(46, 58), 0.1),
         "swept": (draw(0.2, 0.28), draw(0.08, 0.12), draw(35, 50), 0.12),

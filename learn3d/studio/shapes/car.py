@@ -1,4 +1,4 @@
-"""Procedural cars, in metres: a body lofted from front to rear, wheels, mirrors, perhaps a roof box or a spoiler."""
+"""Procedural cars, in metres: a body, wheels, mirrors, perhaps a roof box or a spoiler."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -93,7 +93,7 @@ def _spoiler(draw: Draw, body: SimpleNamespace, *, inset, high) -> Part:
 
 
 def _hull(body: SimpleNamespace) -> Part:
-    """The body: cross-sections from front to rear, with the wheel arches cut into their lower corners."""
+    """The body: cross-sections from front to rear, the wheel arches cut into lower corners."""
     length = body.length
     belt = body.shoulder
     boot = min(body.window * length, length - 0.12)

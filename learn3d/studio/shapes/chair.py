@@ -1,4 +1,4 @@
-"""Procedural chairs, in metres: a seat on a support with a back and arms, moulded shells, armchairs, barrel chairs."""
+"""Procedural chairs, in metres: jointed chairs, moulded shells, barrel chairs, stools, benches."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -97,7 +97,7 @@ _BACKS = {
 
 
 def jointed_chair(draw: Draw, family: Family) -> Part:
-    """A dining, office, lounge or bar chair, put together from a seat, a support, a back and arms."""
+    """A dining, office, lounge or bar chair: a seat, a support, a back and perhaps arms."""
     return _join_chair(
         draw, family, **draw.measures(**_MEASURES) | draw.measures(**family.measures)
     )
@@ -173,7 +173,7 @@ def _arm(
     size,
     width,
 ) -> Part:
-    """The arm at x > 0, from a point of the back to the front, `rise` above a seat with its edge at x = edge."""
+    """The arm at x > 0, from the point `back` to the front, `rise` above the seat."""
     x, y, rear = back
     front *= depth
     foot_z = min(front, depth * 0.3)
@@ -210,7 +210,7 @@ def _arm(
 def _back(
     draw: Draw, family: Family, half: float, height: float, curve: float
 ) -> tuple[Part, float]:
-    """A back in the plane z = 0, from y = 0 to `height`, between stiles at x = +-half; and the z of its front."""
+    """A back at z = 0, from y = 0 to `height`, between stiles at x = +-half; z of its front."""
     top = height + 0.02
     if not draw.maybe(family.padded):
         kind = draw.pick(_BACKS)
@@ -238,7 +238,7 @@ def _back(
 def _frame(
     draw: Draw, half: float, height: float, curve: float, kind: str, *, stile, thick, rounded, taper
 ) -> Part:
-    """Two stiles and a rail on top, filled with boards, slats, spindles, a splat, a cross, a lattice, or open."""
+    """Two stiles and a rail on top, open or filled with boards, slats, a splat, a cross ..."""
     top = height + 0.02
     high = height > 0.3
     outline = ellipse(stile, stile, 8) if rounded else rectangle(stile, stile, segments=1)
@@ -313,7 +313,7 @@ def _bow(x: np.ndarray, half: float, curve: float) -> np.ndarray:
 def _rail(
     half: float, y: float, height: float, thickness: float, curve: float, arch: float = 0.0
 ) -> Part:
-    """A horizontal board between the stiles, following the bow of the back, its middle lifted by `arch`."""
+    """A horizontal board between the stiles, bent as the back, its middle lifted by `arch`."""
     x = np.linspace(-half, half, 9)
     return strip(
         points(x, y + arch * (1 - (x / half) ** 2), _bow(x, half, curve)), thickness, height
@@ -324,7 +324,7 @@ def _rail(
 def _plate(
     draw: Draw, half: float, top: float, curve: float, thickness: float, *, flare, power, wave
 ) -> Part:
-    """A one-piece back: straight or flared, its upper corners rounded, bowed and with a lumbar bulge."""
+    """A one-piece back: straight or flared, its upper corners rounded, with a lumbar bulge."""
     t = np.concatenate([np.linspace(0, 0.7, 4), 1 - 0.3 * np.linspace(0.75, 0, 5) ** 1.8])[:, None]
     v = np.linspace(-1, 1, 11)[None]
     rounding = (1 - np.clip((t - 0.4) / 0.605, 0, 1) ** power) ** (1 / power)
@@ -437,7 +437,7 @@ def barrel_chair(
     cushion,
     exponent,
 ) -> Part:
-    """A round seat with a back that wraps around it and falls towards the arms, perhaps with a gap over the seat."""
+    """A round seat with a back that wraps around it, perhaps with a gap over the seat."""
     reach = np.radians(reach_deg)
     angle = np.linspace(-reach, reach, 25)
     thickness *= thicker

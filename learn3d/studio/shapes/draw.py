@@ -51,14 +51,14 @@ class Draw(np.random.Generator):
         return self.random() < probability
 
     def pick(self, options: dict[Any, float] | list) -> Any:
-        """One of the options: of a list with equal probability, of a dict's keys in proportion to the values."""
+        """One of a list with equal probability, or of a dict's keys in proportion to the values."""
         weights = list(options.values()) if isinstance(options, dict) else np.ones(len(options))
         ends = np.cumsum(weights)
         return list(options)[np.searchsorted(ends, self.random() * ends[-1], side="right")]
 
 
 class Perhaps(NamedTuple):
-    """The space of a measure that is drawn from `space` with a probability, and else is `otherwise`."""
+    """The space of a measure: drawn from `space` with a probability, else `otherwise`."""
 
     probability: float
     space: Any
@@ -66,7 +66,7 @@ class Perhaps(NamedTuple):
 
 
 def recipe(**spaces: Any) -> Callable[[Callable], Callable]:
-    """A decorator of `make(draw, ..., *, <names>)`, whose keyword arguments are the named random measures.
+    """A decorator of `make(draw, ..., *, <names>)`: its keyword arguments are random measures.
 
     They are drawn in this order, before the body draws others. A measure that the caller gives is
     not drawn.
@@ -102,7 +102,7 @@ def points(x: float | np.ndarray, y: float | np.ndarray, z: float | np.ndarray) 
 
 
 def ellipse(width: float, depth: float, count: int = 20, exponent: float = 2.0) -> np.ndarray:
-    """A (super)ellipse outline [count, 2]; exponent 2 is an ellipse, larger ones approach a rectangle."""
+    """A (super)ellipse [count, 2]: exponent 2 is an ellipse, larger ones approach a rectangle."""
     angle = np.arange(count) * (2.0 * np.pi / count)
     cosine, sine = np.cos(angle), np.sin(angle)
     power = 2.0 / exponent
@@ -143,7 +143,7 @@ def inset(outline: np.ndarray, distance: float) -> np.ndarray:
 def rounded_path(
     points: Sequence[Point], radius: float, segments: int = 4, closed: bool = False
 ) -> np.ndarray:
-    """The polyline [P, 3] with each corner replaced by an arc-like curve that starts `radius` before the corner."""
+    """The polyline [P, 3] with rounded corners; the curves start `radius` before them."""
     points = np.asarray(points, dtype=float)
     t = np.linspace(0.0, 1.0, segments + 1)[:, None]
     sides = np.stack([np.roll(points, 1, 0), np.roll(points, -1, 0)]) - points

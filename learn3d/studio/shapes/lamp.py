@@ -7,7 +7,7 @@ from .parts import Part, bar, crossbar, ellipsoid, join, pole, revolve, slab, tu
 
 
 def _shell(radius: np.ndarray, y: np.ndarray, sides: int = 20) -> Part:
-    """A thin wall around the y axis, open below and above: its outer radius [N] at the heights y [N]."""
+    """A thin wall around the y axis, open at both ends: outer radius [N] at heights y [N]."""
     inner = radius - 0.03 * radius.max()
     return revolve(np.r_[np.c_[radius, y], np.c_[inner, y][::-1]], sides, hollow=True)
 

@@ -187,7 +187,7 @@ def tube(
 def bar(
     start: Point, end: Point, width: float, height: float | None = None, side: Point = Z
 ) -> Part:
-    """A straight bar: round with diameter `width`, or rectangular, width (along `side`) by height."""
+    """A straight bar: round of diameter `width`, or `width` (along `side`) by `height`."""
     if height is None:
         section = ellipse(width, width, 6)
     else:
@@ -198,7 +198,7 @@ def bar(
 def strip(
     path: ArrayLike, width: float, height: float, scale: ArrayLike = 1.0, side: Point = Z
 ) -> Part:
-    """A flat bar along a path: its section is `width` (along `side`) by `height`, times `scale` (a number or [P])."""
+    """A flat bar along a path: `width` (along `side`) by `height`, times `scale` ([P])."""
     return tube(path, scale, rectangle(width, height, segments=1), side=side)
 
 
@@ -220,7 +220,7 @@ def crossbar(start: Point, width: float, height: float | None = None) -> Part:
 
 
 def sheet(surface: np.ndarray, thickness: float) -> Part:
-    """A curved plate: the surface grid [U, V, 3] thickened by `thickness` along its normals (to both sides)."""
+    """A curved plate: the surface grid [U, V, 3] thickened to both sides."""
     normal = np.cross(*np.gradient(surface, axis=(0, 1)))
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
     half = 0.5 * thickness * normal
@@ -228,7 +228,7 @@ def sheet(surface: np.ndarray, thickness: float) -> Part:
 
 
 def wing(sections: Sequence[Sequence[float]], upright: bool = False) -> Part:
-    """A wing through airfoil sections (span, rise, leading edge z, chord, thickness / chord), nose towards +z.
+    """A wing through airfoil sections (span, rise, z of the front, chord, thickness / chord).
 
     The span is along x and the rise along y; `upright` swaps them, for a fin. The airfoil is a
     symmetric four-digit NACA profile with a blunt trailing edge.
@@ -247,7 +247,7 @@ def wing(sections: Sequence[Sequence[float]], upright: bool = False) -> Part:
 
 @lru_cache(maxsize=1024)
 def _loft_faces(rings: int, size: int, ends: str) -> np.ndarray:
-    """Faces int64 [F, 3] of a loft of `rings` rings of `size` points each, then the two centre points of a fan."""
+    """Faces int64 [F, 3] of a loft: `rings` rings of `size` points, then two centres of a fan."""
     a = np.arange(rings * size).reshape(rings, size)
     b, c = np.roll(a, -1, 1), np.roll(a, -1, 0)
     d = np.roll(b, -1, 0)
@@ -264,7 +264,7 @@ def _loft_faces(rings: int, size: int, ends: str) -> np.ndarray:
 
 
 def _refine(rings: np.ndarray, ends: str) -> np.ndarray:
-    """Interpolate rings of a thin bar so that they are at most STEP apart; other rings are returned unchanged."""
+    """Interpolate rings of a thin bar so that they are at most STEP apart; keep other rings."""
     if np.linalg.norm(np.ptp(rings, axis=1), axis=1).max() > THIN:
         return rings
     track = np.concatenate([rings, rings[:1]]) if ends == "ring" else rings
@@ -278,7 +278,7 @@ def _refine(rings: np.ndarray, ends: str) -> np.ndarray:
 
 
 def assemble(part: Part) -> trimesh.Trimesh:
-    """The mesh of a part: closed components, oriented outwards; box centred at the origin, longest side 1."""
+    """The mesh of a part: closed components, oriented outwards; box centred, longest side 1."""
     lower = np.min([rings.min((0, 1)) for rings, _ in part], 0)
     upper = np.max([rings.max((0, 1)) for rings, _ in part], 0)
     vertices, faces, offset = [], [], 0

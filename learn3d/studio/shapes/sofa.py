@@ -28,7 +28,7 @@ def _cushions(
     seat=(0.36, 0.46),
 )
 def upholstered(draw: Draw, *, seats, half, depth, foot, seat) -> Part:
-    """An armchair (one seat, perhaps with wings) or a sofa: a block, cushions, a leaning back, perhaps arms."""
+    """An armchair (one seat) or a sofa: a block, cushions, a leaning back, perhaps arms."""
     half *= seats
     high = draw(0.66, 0.95 if seats > 1 else 1.1)
     back = draw(0.14, 0.24)
@@ -85,7 +85,7 @@ def upholstered(draw: Draw, *, seats, half, depth, foot, seat) -> Part:
 def corner_sofa(
     draw: Draw, *, half, depth, reach, foot, seat, high, back, arm, wing, level, count, chaise, side
 ) -> Part:
-    """An L-shaped sofa: a long side along x, and a chaise or a second side towards +z, left or right."""
+    """An L-shaped sofa: a long side along x, a chaise or second side towards +z."""
     low = seat - 0.14
     inner = half - wing
     sofa = board(half, (foot, low + 0.005), (0, depth), 0.02)

@@ -1,4 +1,4 @@
-"""Supports of seats and table tops, in metres: legs, pedestals, loops of tube, crossed bars, panels, rockers.
+"""Supports of seats and table tops, in metres: legs, pedestals, loops, panels, rockers.
 
 A support reaches from the floor (y = 0) to `height`, and to about x = +-half_x and z = +-half_z.
 """
@@ -38,7 +38,7 @@ def legs(
     splay,
     hairpin,
 ) -> Part:
-    """Four legs, straight or splayed, perhaps with stretchers and an apron; or bent-wire (hairpin) legs.
+    """Four legs, straight or splayed, perhaps with stretchers and an apron; or hairpin legs.
 
     size: width of a leg. splay: how far the feet stand out, as a share of the height. plain:
     tapered legs, no apron.
@@ -84,7 +84,7 @@ def _hairpin_legs(half_x: float, half_z: float, height: float, splay: float) -> 
 
 
 def _leg_profile(draw: Draw) -> tuple[list[tuple[float, float]], bool]:
-    """The profile [(height, scale)] of a leg, 0 = floor, 1 = top, and whether the leg is turned (round)."""
+    """The profile [(height, scale)] of a leg, 0 = floor, 1 = top; True if the leg is round."""
     kind = draw.pick({"straight": 2, "tapered": 3, "turned": 1.5, "baluster": 1, "stepped": 0.7})
     if kind == "straight":
         return [(0, 1), (1, 1)], False
@@ -249,7 +249,7 @@ def cantilever(
 
 @recipe(size=(0.022, 0.035), deep=(1.2, 1.8), at_sides=0.6)
 def cross(draw: Draw, half_x: float, half_z: float, height: float, *, size, deep, at_sides) -> Part:
-    """Legs that cross like scissors, at the sides (folding chair) or at front and rear, joined by bars."""
+    """Legs that cross like scissors, at the sides or at front and rear, joined by bars."""
     x, z = (half_x, half_z) if at_sides else (half_z, half_x)
     part = Part()
     for s in (-1, 1):

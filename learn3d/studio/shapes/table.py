@@ -78,7 +78,7 @@ def pedestal_table(draw: Draw) -> Part:
 
 
 def _pedestal(draw: Draw, reach: float, under: float) -> Part:
-    """A disc, a star, an hourglass, a block on a plate, or a column on curved feet; about the y axis."""
+    """A disc, a star, an hourglass, a block on a plate, or a column on feet; about the y axis."""
     kind = draw.pick({disc: 1, star: 1, "hourglass": 1, "block": 1, "claw": 2})
     if kind in (disc, star):
         return kind(draw, reach, reach, under)

@@ -1,1 +1,1 @@
-"""The tables and figures of the paper, and the HTML report: runs are planned, trained, measured and shown."""
+"""Tables and figures of the paper, and the HTML report: runs are planned, measured, shown."""

@@ -1,4 +1,4 @@
-"""The report of a table from stored results: the paper's figures beside ours, with confidence intervals.
+"""The report of a table from stored results: the paper's figures beside ours, intervals.
 
 Our values are not subtracted from the paper's, which are for other meshes. Intervals over test
 objects are by bootstrap, intervals over seeds by Student's t.
@@ -69,7 +69,7 @@ def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
 def make_report(
     request: Request, runs: Sequence[TrainConfig], results: Mapping[Path, Result]
 ) -> tuple[dict[str, Cells], str]:
-    """The tables "main", "differences", "runs", "curves" and, if poses were estimated, "poses"; the report as Markdown.
+    """The tables "main", "differences", "runs", "curves", perhaps "poses"; and their Markdown.
 
     "curves" has the validations of each run. The Markdown leaves them out.
     results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has
@@ -106,7 +106,7 @@ def make_report(
 def _compare_methods(
     table: Table, rows: Mapping[str, Row], runs: Sequence[TrainConfig], done: MeasuredRuns
 ) -> tuple[Cells, Cells]:
-    """Printed and measured values of each row by category, and the differences to the table's baseline."""
+    """Printed and measured values of each row by category, and differences to the baseline."""
     measured: dict[tuple[str, str], dict[int, Result]] = {}
     for run, result in done:
         measured.setdefault((variant_of(run), run.category), {})[run.seed] = result
@@ -196,7 +196,7 @@ def _format_printed(printed: Mapping[str, float], column: str, categories: Seque
 
 
 def _compare(measure: str, *sides: Side) -> str:
-    """The mean of one method, or the difference of two, with its intervals; "-" if a result is missing."""
+    """The mean of a method, or the difference of two, with intervals; "-" without results."""
     values = [
         [[getattr(r, measure) for r in by_seed.values()] for by_seed in side] for side in sides
     ]
@@ -252,7 +252,7 @@ def read_pose_errors(poses: Path) -> dict[str, float]:
 
 
 def _pose_rows(runs: Sequence[TrainConfig], results: Mapping[Path, Result]) -> Cells:
-    """A header; errors of the estimated poses of each run, and its IoU beside that of the run on known poses."""
+    """A header; errors of each run's estimated poses, and its IoU beside that on known poses."""
     known = {(run.category, run.seed): results.get(run.output) for run in runs if run.poses is None}
     by_category: dict[str, dict[str, Sequence[float]]] = {}
     for run in runs:
@@ -285,7 +285,7 @@ def _pose_rows(runs: Sequence[TrainConfig], results: Mapping[Path, Result]) -> C
 
 
 def _markdown(table: Cells) -> str:
-    """The table as Markdown, with HTML escaped, because names in results come from untrusted files."""
+    """The table as Markdown. HTML is escaped: names in results come from untrusted files."""
     cells = [
         [html.escape(" ".join(c.splitlines()), quote=False).replace("|", "\\|") for c in row]
         for row in table

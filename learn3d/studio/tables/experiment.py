@@ -1,4 +1,4 @@
-"""`learn3d experiment`: plan the runs of a table, train and test the missing ones, write the report."""
+"""`learn3d experiment`: plan a table's runs, train and test missing ones, write the report."""
 
 import dataclasses
 import functools
@@ -31,7 +31,7 @@ LOG_FILE, RESULT_FILE = "log.txt", "test.json"  # files in a run's folder
 
 
 def estimate_poses(config: TrainConfig) -> None:
-    """Write the table of estimated poses that a run needs, unless it exists, and a JSON file with its errors.
+    """Write the estimated poses that a run needs, unless they exist, and their errors as JSON.
 
     The estimate has the run's seed. It is turned into the frame of the data by the angle that
     fits the training and validation images best.
@@ -53,7 +53,7 @@ def estimate_poses(config: TrainConfig) -> None:
 
 
 def _measure_updated_poses(config: TrainConfig) -> None:
-    """Add the share of azimuths that were right to 30 degrees at the end of the training to the JSON file of errors."""
+    """Add the share of azimuths that the training ended with right to 30 degrees to the errors."""
     weights = checkpoint.load(checkpoint.find(config.output, "last"))[0]["poses.weights"]
     load = functools.partial(load_dataset, config.layout, config.data, config.category, "train")
     known = load(views_per_object=config.views_per_object)
@@ -66,7 +66,7 @@ def _measure_updated_poses(config: TrainConfig) -> None:
 
 
 def train_and_test(config: TrainConfig) -> bool:
-    """Estimate poses if the run needs them, train, measure and write test.json; False if a signal stopped the training.
+    """Estimate poses if needed, train, measure, write test.json; False if a signal stopped it.
 
     An existing run continues; `train` checks that it has the same options and data. Raises as
     `train` and `evaluate_runs` do.
@@ -158,7 +158,7 @@ def read_results(runs: Sequence[TrainConfig]) -> dict[Path, Result]:
 
 
 def find_conflict(run: TrainConfig) -> str:
-    """A sentence with the options in which the run in the folder differs from the planned one; "" if there are none."""
+    """A sentence with the options in which the run in the folder differs; "" without any."""
     if not (run.output / run_folder.CONFIG).is_file():
         return ""
     asked, saved = (  # a run saves the precision that "auto" stands for

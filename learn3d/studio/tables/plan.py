@@ -61,7 +61,7 @@ class Request:
 
 
 def variant_of(run: TrainConfig) -> str:
-    """The name of the variant that a planned run trains; its folder is OUTPUT/runs/<category>/<variant>-seed<k>."""
+    """The variant that a planned run trains, in OUTPUT/runs/<category>/<variant>-seed<k>."""
     return run.output.name.removesuffix(f"-seed{run.seed}")
 
 
@@ -71,7 +71,7 @@ def name_run(run: TrainConfig) -> str:
 
 
 def select_rows(request: Request) -> dict[str, Row]:
-    """The rows of the table that the request asks for by label or variant, by label; all if it names no methods.
+    """The rows that the request asks for by label or variant, by label; without methods all.
 
     Quoted rows are always included. Raises ValueError for a method that the table does not have.
     """

@@ -1,4 +1,4 @@
-"""Writes one HTML file about trained runs: their settings and curves, their IoU, and meshes to turn by hand."""
+"""Writes one HTML file about trained runs: settings, curves, IoU, and meshes to turn."""
 
 import base64
 import io
@@ -76,7 +76,7 @@ def write_report(
     which: Literal["last", "best"] = "last",
     objects: int = 12,
 ) -> int:
-    """Measure runs on a split as `learn3d evaluate` does, and write the page; returns its size in bytes.
+    """Measure runs as `learn3d evaluate` does, and write the page; returns its size in bytes.
 
     objects: number of objects whose shapes are shown, from the best to the worst, each in an
     image of typical IoU. The other options are those of `open_runs`. Raises ValueError or
@@ -213,7 +213,7 @@ def _describe(
 def _typical_images(
     of_images: np.ndarray, of_objects: np.ndarray, ids: np.ndarray, ranked: np.ndarray, count: int
 ) -> list[int]:
-    """Of `count` objects, spread from the best to the worst, the image whose IoU is nearest to the object's mean."""
+    """Of `count` objects, from the best to the worst, the image with the most typical IoU."""
     order = np.nan_to_num(np.abs(of_images - of_objects[ids]), nan=9.0).argsort(kind="stable")
     typical = dict(zip(ids[order[::-1]], order[::-1], strict=True))
     places = np.unique(np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int))
@@ -221,7 +221,7 @@ def _typical_images(
 
 
 def mean_by_azimuth(azimuths_deg: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuths float64 [D] of the sectors that have images, and the mean of their values, NaN if none is known.
+    """Azimuths float64 [D] of the sectors that have images, and means of their values, or NaN.
 
     Sectors have 15 degrees and are centred at 0, 15, 30 ... azimuths_deg, values: float [M].
     """
@@ -240,7 +240,7 @@ def _mean(values: np.ndarray, axis: int | None = None) -> np.ndarray:
 
 @torch.no_grad()
 def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[dict[str, Any]]:
-    """For each image the picture and its meshes: one of each run, then the true shape if it is known.
+    """For each image the picture and its meshes: one of each run, then the true shape, if known.
 
     "reach" is the largest radius of the meshes, "eye" the direction of the camera (an oblique one
     if it is unknown).
@@ -296,7 +296,7 @@ def _mesh(surface: Surface) -> dict[str, Any]:
 
 
 def read_metrics(folder: Path) -> Log:
-    """The curves in a run folder's metrics.jsonl, but for damaged lines: the run may be writing the last one.
+    """The curves in a run folder's metrics.jsonl, without damaged lines.
 
     Raises FileNotFoundError without such a file, and ValueError for one above 256 MiB or without
     numbers.
@@ -322,7 +322,7 @@ def read_metrics(folder: Path) -> Log:
 
 
 def draw_curves(logs: Sequence[Log]) -> list[dict[str, Any]]:
-    """A plot for each number in the logs, with a line per run: those of the validation first, then the losses."""
+    """A plot for each number in the logs, with a line per run; those of the validation first."""
     keys = dict.fromkeys(key for log in logs for key in log)
     plots = []
     for split, name in sorted(

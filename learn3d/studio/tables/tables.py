@@ -1,4 +1,4 @@
-"""The tables of the paper (Peng et al. 2020), and three of our own: tables.csv, and rows.csv with the printed figures.
+"""The tables of the paper, and three of our own: tables.csv, rows.csv with printed figures.
 
 A new table is a line of tables.csv, and a line of rows.csv for each row. Rows of several tables
 that name the same variant share their runs. Categories have the names of this package: the

@@ -36,7 +36,7 @@ def open_runs(
     split: str = "test",
     which: Literal["last", "best"] = "last",
 ) -> list[TrainedModel]:
-    """Open run folders (their checkpoint `which`) or checkpoint files, each with a split of its data.
+    """Open run folders (checkpoint `which`) or checkpoint files, each with a split of its data.
 
     `data` and `category` default to those of the training, `labels` to `name_runs`. Raises
     ValueError without runs, for a wrong number of labels, and if a checkpoint or data set cannot
@@ -75,7 +75,7 @@ def open_runs(
 def name_runs(
     configs: Sequence[TrainConfig], paths: Sequence[Path], labels: Sequence[str] = ()
 ) -> list[str]:
-    """The names of runs in a figure: `labels`, else those of the presets, with the category if there are several.
+    """Names of runs in a figure: `labels`, else presets' names, with the category if several.
 
     Runs of the same preset and category get the names of their folders. Raises ValueError for a
     wrong number of labels.

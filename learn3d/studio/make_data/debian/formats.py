@@ -12,7 +12,7 @@ from nmr.obj import triangulate
 
 
 def read_ac3d(text: str, skip: Callable[[str], object]) -> list[RawMesh]:
-    """Objects of an AC3D text with at least one polygon, placed by the `loc` and `rot` of their ancestors.
+    """Objects of an AC3D text with polygons, placed by the `loc` and `rot` of their ancestors.
 
     Skips lines (surface types 1 and 2), and objects with a name that `skip` accepts, with their
     children. Frame of FlightGear's models: nose towards -x, y up, left wing towards +z. Raises

@@ -1,4 +1,4 @@
-"""Real meshes from Debian packages: chairs, tables, cabinets, sofas, lamps (Sweet Home 3D) and airplanes (FlightGear).
+"""Real meshes from Debian packages: furniture (Sweet Home 3D) and airplanes (FlightGear).
 
 `fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the
 origin, of length 1. OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the
@@ -120,7 +120,7 @@ def get_package(name: str, folder: Path) -> Path:
 
 
 def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    """The regular files of a .deb file whose paths (relative to /) end in one of `suffixes`: path -> content.
+    """The files of a .deb file whose paths (relative to /) end in `suffixes`: path -> content.
 
     Raises ValueError for a damaged file, OSError if dpkg-deb is not installed.
     """
@@ -189,7 +189,7 @@ def clean_mesh(raw: RawMesh) -> trimesh.Trimesh:
 
 
 def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
-    """Grid bool [size, size, size] of the cells with a surface sample; samples are at most a third of a cell apart.
+    """Cells with a surface sample, bool [size, size, size]; samples are a third of a cell apart.
 
     The grid is the cube -0.5 .. 0.5, in which all vertices lie.
     """

@@ -1,4 +1,4 @@
-"""What is taken from Debian's packages: furniture from Sweet Home 3D's catalogues, airplanes from FlightGear's models.
+"""Models in Debian's packages: Sweet Home 3D's furniture, FlightGear's airplanes.
 
 A catalogue (.sh3f) is a zip archive with a properties file (name#N, model#N, modelRotation#N,
 ...) and one OBJ per model. AI aircraft are AC3D files (.ac) with XML files beside them.
@@ -55,7 +55,7 @@ SKIPPED_SECTIONS = ("Characters", "Doors and windows", "Staircases", "Vehicles")
 
 
 def furniture_category(name: str, section: str = "") -> str | None:
-    """Category of a catalogue entry from its English name and its section; None if the entry is skipped."""
+    """Category of a catalogue entry from its English name and its section; None to skip it."""
     if section in SKIPPED_SECTIONS:
         return None
     return next(
@@ -65,7 +65,7 @@ def furniture_category(name: str, section: str = "") -> str | None:
 
 
 def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
-    """The general properties and the entries (`key#N`, in the order of N) of a Sweet Home 3D furniture catalogue."""
+    """General properties and entries (`key#N`, in the order of N) of a furniture catalogue."""
     # N -> entry; general properties under 0
     entries: defaultdict[int, dict[str, str]] = defaultdict(dict)
     for key, number, value in re.findall(
@@ -78,7 +78,7 @@ def read_catalogue(text: str) -> tuple[dict[str, str], list[dict[str, str]]]:
 
 
 def place_furniture(vertices: np.ndarray, entry: Mapping[str, str]) -> np.ndarray:
-    """Vertices [V, 3] turned by the entry's modelRotation (nine numbers by rows, p' = R p) and stretched to its box.
+    """Vertices [V, 3] turned by modelRotation (nine numbers, p' = R p) and stretched to the box.
 
     The box is width x height x depth along x, y, z, as Sweet Home 3D draws it: y up, the front
     towards +z.
@@ -148,7 +148,7 @@ DETACHED = 2e-3
 
 
 def remove_effects(parts: list[RawMesh]) -> list[RawMesh]:
-    """Leave out propeller discs and detached quadrilaterals, whose textures are pictures of motion, light or vapour.
+    """Leave out propeller discs and detached quadrilaterals: pictures of motion, light or vapour.
 
     A disc, or the square with its texture, is a part with a round or square outline that is wider
     than MIN_DISC. Its depth along the flight direction x is below 3 % of its diameter. A detached

@@ -20,7 +20,7 @@ KAR_HALF_FOV_DEG = 14.9314  # 60 mm lens, 32 mm sensor
 
 
 def _write_kar(objects: Iterable[RenderedObject], category: str, root: Path, output: Path) -> None:
-    """Write a folder of renderings and a voxel grid for each object, and `splits.json` for all categories.
+    """Write renderings and a voxel grid for each object, and `splits.json` for all categories.
 
     `depth_{i}.png` has 0 .. 240 over 1.8 units around the object's centre (nearer is darker), and
     255 for background. `camera_{i}.mat` has K [3, 3] in pixels, extrinsic [3, 4], and its

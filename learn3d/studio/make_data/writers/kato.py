@@ -16,7 +16,7 @@ from learn3d.studio.make_data.writers.writer import RenderedObject, Writer, rand
 
 
 def _write_kato(objects: Iterable[RenderedObject], category: str, folder: Path, _: Path) -> None:
-    """Write `{synset}_{split}_images.npz` and `{synset}_{split}_voxels.npz`; all objects are in memory until then."""
+    """Write `{synset}_{split}_images.npz` and `..._voxels.npz`; all objects are in memory."""
     arrays: dict[Path, list[np.ndarray]] = {}
     for item in objects:
         paths = kato.split_paths(folder, category, item.split)
@@ -30,7 +30,7 @@ def _write_kato(objects: Iterable[RenderedObject], category: str, folder: Path, 
 
 
 def _images(item: RenderedObject) -> np.ndarray:
-    """Images of an object, uint8 [n, 4, 64, 64]: inverted colours (255 - composite over white) and alpha."""
+    """Images of an object, uint8 [n, 4, 64, 64]: 255 - composite over white, and alpha."""
     return np.concatenate([255 - item.rgb, item.alpha[..., None]], axis=-1).transpose(0, 3, 1, 2)
 
 

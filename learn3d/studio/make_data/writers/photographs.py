@@ -1,4 +1,4 @@
-"""Writes renderings on photo-like backgrounds: Pascal3D+ as packed by Kato and Harada 2019, and photo folders."""
+"""Writes renderings on photo-like backgrounds: Pascal3D+ as packed in 2019, photo folders."""
 
 import csv
 import functools
@@ -29,7 +29,7 @@ SHARES = (0.5, 0.9)  # range of the side of the rendering over the shorter side 
 def _write_pascal3d(
     objects: Iterable[RenderedObject], category: str, folder: Path, _: Path
 ) -> None:
-    """Write `{class}_{train,imagenet,val}.npz`, with renderings on out-of-focus backgrounds as photographs.
+    """Write `{class}_{train,imagenet,val}.npz`: renderings on out-of-focus backgrounds.
 
     Training images go to the first two files alternately. Raises ValueError if there is only one.
     """
@@ -57,7 +57,7 @@ def _write_pascal3d(
 
 
 def _pascal3d_views(vertices: np.ndarray, count: int, rng: np.random.Generator) -> RotationPoses:
-    """Any azimuth, elevations in -10 .. 40, tilts up to 15 degrees: the poses of hand-held cameras."""
+    """Poses of hand-held cameras: any azimuth, elevations in -10 .. 40, tilts up to 15 degrees."""
     ranges = ((-180.0, 180.0), (-10.0, 40.0), (-15.0, 15.0))
     azimuth_deg, elevation_deg, tilt_deg = (uniform(rng, limits, count) for limits in ranges)
     look = nmr.LookAt.from_angles(
@@ -122,7 +122,7 @@ PASCAL3D_WRITER = Writer(
 
 
 def _write_photos(objects: Iterable[RenderedObject], category: str, root: Path, _: Path) -> None:
-    """Write objects on out-of-focus backgrounds as RGB images, with anti-aliased masks and `poses.csv`; no voxels."""
+    """Write RGB images with out-of-focus backgrounds, anti-aliased masks and `poses.csv`."""
     folder, size = root / category, PHOTOS_WRITER.image_size
     folder.mkdir()
     table = [("file", "azimuth_deg", "elevation_deg", "distance", "fov_deg", "object", "split")]
@@ -153,7 +153,7 @@ PHOTOS_WRITER = Writer(
 
 
 def over(item: RenderedObject, backgrounds: np.ndarray) -> np.ndarray:
-    """Composite the images of an object over backgrounds instead of white; all are uint8 [n, S, S, 3]."""
+    """The images of an object over backgrounds instead of white; all are uint8 [n, S, S, 3]."""
     clear = 1 - item.alpha[..., None] / np.float32(255)
     return (
         np.rint(item.rgb + (backgrounds.astype(np.float32) - 255) * clear)

@@ -1,4 +1,4 @@
-"""The description of a layout that can be written, and shared functions: random cameras, PNG files."""
+"""A layout that can be written, and what all layouts share: random cameras, PNG files."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ class RenderedObject:
         return np.concatenate([color, self.alpha[..., None]], axis=-1)
 
     def world_to_camera(self) -> np.ndarray:
-        """Extrinsics [R | t] float64 [n, 3, 4], from ShapeNet's coordinates to x right, y down, z away."""
+        """Extrinsics [R | t] float64 [n, 3, 4], ShapeNet to x right, y down, z away."""
         matrices = self.poses.cameras().projection().plain().matrix.numpy().astype(np.float64)
         matrices[:, :, :3] = matrices[:, :, :3] @ WORLD_FROM_OBJECT.T
         return matrices
@@ -50,7 +50,7 @@ class RenderedObject:
 
 @dataclass(frozen=True, kw_only=True)
 class Writer:
-    """How a category is rendered and written in one layout; `learn3d.data.readers` describes the files.
+    """How a category is rendered and written in a layout; `learn3d.data.readers` has the files.
 
     Images, cameras and voxel axes are Kato's unless a field says otherwise.
     """
@@ -87,7 +87,7 @@ def random_views(
     count: int,
     rng: np.random.Generator,
 ) -> LookAtPoses:
-    """Draw `count` cameras with any azimuth whose images hold the whole bounding sphere of vertices [V, 3] around 0."""
+    """Draw `count` cameras whose images hold the bounding sphere of vertices [V, 3] around 0."""
     azimuth_deg = uniform(rng, (-180.0, 180.0), count)
     elevation_deg = uniform(rng, elevations_deg, count)
     half_fov_deg = (
