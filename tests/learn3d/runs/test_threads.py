@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import pytest
 import torch
 
-from learn3d import training
 from learn3d.device import SLOWER, TRIAL, WINDOW, ThreadTuner
 from learn3d.runs import checkpoint
 from learn3d.training import train
@@ -81,14 +79,13 @@ def test_a_resumed_run_keeps_its_number(tiny_run, run_folder, monkeypatch, capsy
     """The number is in the checkpoint, and is not tried again while the machine has as many cores."""
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    used, take_step = [], training.take_step
+    used, after_step = [], ThreadTuner.after_step
     monkeypatch.setattr(torch, "set_num_threads", used.append)
 
-    def slow_with_two(method, batch, step: int):
-        time.sleep(0.3 if used[-1] == 2 else 0.0)
-        return take_step(method, batch, step)
+    def slow_with_two(tuner: ThreadTuner, seconds: float) -> str:
+        return after_step(tuner, seconds + 100 * (used[-1] == 2))
 
-    monkeypatch.setattr(training, "take_step", slow_with_two)
+    monkeypatch.setattr(ThreadTuner, "after_step", slow_with_two)
     train(tiny_run(run_folder, iterations=2 * TRIAL, threads=None))
     assert used == [2, 1, 1]
     assert checkpoint.load_metadata(run_folder).progress.threads == 1
