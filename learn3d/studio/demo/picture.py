@@ -116,15 +116,16 @@ def make_meshes(
                 "left_out": left_out,
             }
             send(found | {"how": outline.how} | of)
+            doubt = None
             try:
                 check_mask(outline.mask, cropped=True)
             except ValueError:
-                raise ValueError(
-                    f"No object was found{which}. Draw a box around it, or paint it with Add."
-                ) from None
+                doubt = f"No object was found{which}"
             if outline.doubt:
-                doubt = f"{outline.doubt.capitalize()}. Draw a box around it (Box)."
-                raise ValueError(f"Is this the object{which}? {doubt}")
+                doubt = f"Is this the object{which}? {outline.doubt.capitalize()}"
+            if doubt:
+                send({"error": f"{doubt}. Drag a box around it.", "tool": "box"} | of)
+                return
             masks.append(outline.mask)
 
         def progress(text: str, part: float) -> None:

@@ -303,6 +303,8 @@ async function handle(message, mine) {
   if (message.progress) { say(WORDS[message.progress]); busy(0.1 + 0.85 * message.part); }
   if (message.error) {
     $("views").innerHTML = '<div class="card view empty"><p class="quiet">The mesh appears here.</p></div>';
+    if (message.of !== undefined) turnTo(message.of);
+    if (message.tool) choose(message.tool); // the server asks for a box
     say(message.error, true);
   }
   if (message.meshes) {

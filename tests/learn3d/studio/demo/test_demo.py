@@ -103,9 +103,8 @@ def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> Non
     assert len(trimesh.load(io.BytesIO(glb), "glb", force="mesh").faces) > 100
     for mask in (np.zeros_like(alpha[..., 0]), np.full_like(alpha[..., 0], 254)):
         pictures.make_meshes(models, [pictures.Picture(colors, mask)], sent.append)
-        assert sent[-1] == {
-            "error": "No object was found. Draw a box around it, or paint it with Add."
-        }
+        error = "No object was found. Drag a box around it."
+        assert sent[-1] == {"error": error, "tool": "box"}
 
 
 def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> None:
@@ -118,11 +117,12 @@ def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> Non
     shown, error = sent
     assert shown["how"] == "as all that differs from the plain background"
     assert np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)).sum() == 8 * 120
-    asked = "Is this the object? Its outline touches 2 sides of the picture. Draw a box around it (Box)."
-    assert error == {"error": asked}
+    asked = "Is this the object? Its outline touches 2 sides of the picture. Drag a box around it."
+    assert error == {"error": asked, "tool": "box"}
     picture = pictures.Picture(colors, unknown)
     pictures.make_meshes(models, [picture, picture], sent.append)
-    assert sent[-1] == {"error": asked.replace("object?", "object in picture 1?")}
+    of_first = asked.replace("object?", "object in picture 1?")
+    assert sent[-1] == {"error": of_first, "tool": "box", "of": 0}
 
 
 def test_the_side_of_the_input_is_found() -> None:
