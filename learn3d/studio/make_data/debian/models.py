@@ -25,7 +25,7 @@ from learn3d.studio.make_data.debian.packages import PACKAGES
 from learn3d.studio.make_data.meshes import check, fit_to_box
 from learn3d.terminal import is_watched, note
 
-PACKAGED = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
+PACKAGED_CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side of the grids that are compared to find duplicates
 MAX_SAMPLES = 2_000_000  # surface points in memory at a time
 DUPLICATE_IOU = 0.85  # two models whose surface grids have a larger IoU are duplicates
@@ -65,7 +65,7 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Fetch
         raise ValueError(f"{output} already exists; remove it, or give another folder")
     output.parent.mkdir(parents=True, exist_ok=True)
     with publishing(output.parent, [output.name]) as scratch:
-        folder, kept = scratch / output.name, {category: {} for category in PACKAGED}
+        folder, kept = scratch / output.name, {category: {} for category in PACKAGED_CATEGORIES}
         (folder / "licences").mkdir(parents=True)
         for name, find_models in PACKAGES.items():
             try:
@@ -91,7 +91,9 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Fetch
                     )
                 except ValueError as reason:
                     report.dropped[facts["source"]] = str(reason)
-        report.models.sort(key=lambda row: (PACKAGED.index(row["category"]), row["file"]))
+        report.models.sort(
+            key=lambda row: (PACKAGED_CATEGORIES.index(row["category"]), row["file"])
+        )
         with (folder / "index.csv").open("w", newline="", encoding="utf-8") as file:
             rows = [[row[column] for column in INDEX] for row in report.models]
             csv.writer(file, lineterminator="\n").writerows([INDEX, *rows])
