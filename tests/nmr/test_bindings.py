@@ -186,7 +186,6 @@ def test_more_faces_than_a_face_index_map_can_name():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory that is promised and never touched")
-@pytest.mark.parametrize("packed", [False, True])
 def test_more_vertices_than_the_set_up_of_faces_can_name(packed):
     vertices = promised(6, np.float32).reshape(-1, 3)
     table = ARRAYS | NUMBERS | dict(faces=np.array([[0, 1, 2]]), face_index=integers(1, 8, 8))

@@ -285,7 +285,6 @@ def project(vertices, matrix, intrinsics, distortion, origin, extent, perspectiv
     return ops.project(vertices, torch.cat(rows, dim=1), distortion, None, perspective)
 
 
-@pytest.mark.parametrize("perspective", [True, False])
 @pytest.mark.parametrize("distorted", [True, False])
 @pytest.mark.parametrize("shared", [False, True])
 def test_project_is_the_chain_and_its_gradient(perspective, distorted, shared):

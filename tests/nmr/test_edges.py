@@ -28,8 +28,6 @@ def resolve(image, vertices, faces, face_index, anti_aliasing=False, background=
 
 
 @pytest.mark.parametrize("seed, channels", [(0, 1), (1, 2), (2, 3), (3, 4), (4, 7)])
-@pytest.mark.parametrize("anti_aliasing", [False, True])
-@pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, channels, anti_aliasing, fill_back):
     vertices, faces = random_soup(seed)
     face_index = face_index_of(vertices, faces, 20 if anti_aliasing else 19, fill_back)
@@ -48,7 +46,6 @@ def test_equals_the_slow_definition(seed, channels, anti_aliasing, fill_back):
     assert grad[..., :2].any() and not grad[..., 2].any()
 
 
-@pytest.mark.parametrize("anti_aliasing", [False, True])
 def test_gradient_in_the_image_is_the_mean_s(anti_aliasing):
     mesh = random_soup(0)
     face_index = face_index_of(*mesh, 6)
@@ -65,7 +62,6 @@ def test_not_a_number_in_a_pixel_gives_none_in_a_vertex():
     assert grad.any() and not grad.isnan().any()
 
 
-@pytest.mark.parametrize("per_image", [False, True])
 def test_background_is_the_colour_of_pixels_without_a_face(per_image):
     """The same as an image that holds it, in values and gradients."""
     vertices, faces = random_soup(0)

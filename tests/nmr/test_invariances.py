@@ -9,7 +9,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import for_threads
+from scenes import (
+    any_number,
+    assert_near,
+    bumpy_sphere,
+    double,
+    for_threads,
+    leaf_of,
+    same_bits,
+    uniform,
+    value_and_gradients,
+)
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import nmr
@@ -18,12 +29,12 @@ from nmr import _C
 
 
 def noise(*shape, seed=0):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+    return uniform(*shape, seed=seed, dtype=torch.float32)
 
 
 def bumpy(subdivisions, seed, scale):
-    vertices, faces = nmr.icosphere(subdivisions)
-    return scale * (0.6 + 0.4 * noise(len(vertices), 1, seed=seed)) * vertices, faces
+    vertices, faces = bumpy_sphere(subdivisions, seed, 0.6, torch.float32)
+    return scale * vertices, faces
 
 
 MESHES = [
@@ -49,55 +60,38 @@ def of_fragments(v, f, eyes, size, **how):
     return fragments.weights, fragments.depth, fragments.face_index
 
 
-def of_colors(make, smooth=False):
+def of_colors(make, smooth=False, **options):
     def draw(v, f, eyes, size, *values):
-        how = dict(
-            lights=nmr.Lights(smooth=smooth, **LIGHTS), smooth=smooth, interpolation_gradient=True
-        )
+        lights = nmr.Lights(smooth=smooth, **LIGHTS)
+        how = dict(lights=lights, smooth=smooth, interpolation_gradient=True, background=0.3)
         each = [f] * len(v) if isinstance(v, list) and not isinstance(f, list) else f
-        how |= dict(
-            colors=make(*values, each) if make == seams else make(*values),
-            background=0.3,
-            image_size=size,
-        )
-        return tuple(
-            nmr.render(v, f, nmr.LookAt(eyes), outputs=("rgb", "alpha", "depth", "normals"), **how)
-        )
+        colors = make(*values, each) if make == seams else make(*values)
+        outputs = "rgb", "alpha", "depth", "normals"
+        how |= dict(colors=colors, outputs=outputs, image_size=size)
+        return tuple(nmr.render(v, f, nmr.LookAt(eyes), **how, **options))
 
     return draw
 
 
 def of_soft_rgb(v, f, eyes, size, colors):
-    how = dict(
-        colors=nmr.VertexColors(colors),
-        sigma=1e-3,
-        gamma=0.02,
-        faces_per_pixel=5,
-        near=0.1,
-        image_size=size,
-    )
-    return tuple(nmr.render_soft(v, f, nmr.LookAt(eyes), lights=nmr.Lights(**LIGHTS), **how))
+    how = dict(sigma=1e-3, gamma=0.02, faces_per_pixel=5, near=0.1, image_size=size)
+    how |= dict(colors=nmr.VertexColors(colors), lights=nmr.Lights(**LIGHTS))
+    return tuple(nmr.render_soft(v, f, nmr.LookAt(eyes), **how))
 
 
 def of_transparent(v, f, eyes, size, colors, opacity):
-    how = dict(
-        colors=nmr.VertexColors(colors),
-        opacity=nmr.FaceColors(opacity),
-        faces_per_pixel=3,
-        image_size=size,
-    )
+    how = dict(colors=nmr.VertexColors(colors), opacity=nmr.FaceColors(opacity), image_size=size)
     lights = nmr.Lights(harmonics=HARMONICS, normals=Outward(), **LIGHTS)
-    return tuple(nmr.render_transparent(v, f, nmr.LookAt(eyes), lights=lights, **how))
+    camera = nmr.LookAt(eyes)
+    return tuple(nmr.render_transparent(v, f, camera, lights=lights, faces_per_pixel=3, **how))
 
 
 class Outward:
     """Normals of pixels: the directions of their places."""
 
     def sample(self, fragments):
-        return torch.stack(
-            [fragments.weights[..., 0] - 0.5, fragments.weights[..., 1], 1 + 0 * fragments.depth],
-            -1,
-        )
+        weights, one = fragments.weights, 1 + 0 * fragments.depth
+        return torch.stack([weights[..., 0] - 0.5, weights[..., 1], one], -1)
 
 
 def seams(image, uv, faces):
@@ -116,7 +110,7 @@ FUNCTIONS = {
     "transparent": (of_transparent, lambda v, f: [noise(len(v), 3), noise(len(f), 1)]),
     "white": (of_colors(lambda: None), None),
     "vertices": (of_colors(nmr.VertexColors, True), lambda v, f: [noise(len(v), 3)]),
-    "faces": (of_colors(nmr.FaceColors), lambda v, f: [noise(len(f), 3)]),
+    "faces": (of_colors(nmr.FaceColors, gradient="local"), lambda v, f: [noise(len(f), 3)]),
     "cubes": (of_colors(nmr.TextureCubes), lambda v, f: [noise(len(f), 3, 3, 3, 3)]),
     "uv": (of_colors(nmr.UVTexture), lambda v, f: [noise(8, 6 + len(v) % 5, 3), 1.5 * v[:, :2]]),
     "mipmaps": (
@@ -133,7 +127,7 @@ def values_of(name, *mesh):
 
 
 def leaves(x):
-    return [leaves(y) for y in x] if isinstance(x, list) else x.detach().clone().requires_grad_()
+    return [leaves(y) for y in x] if isinstance(x, list) else leaf_of(x)
 
 
 def flat(x):
@@ -150,10 +144,6 @@ def outcome(name, vertices, faces, values, eyes, size=20):
         real, flat(given), upstream, allow_unused=True, materialize_grads=True
     )
     return [x.detach() for x in outputs], grads
-
-
-def same_bits(a, b):
-    return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 @NAMES
@@ -177,12 +167,9 @@ def test_a_list_has_the_bits_of_each_mesh(name, eyes):
 @pytest.mark.parametrize("batch, size", [(4, 24), (2, (150, 90))])
 def test_a_batch_has_the_bits_of_each_mesh_with_any_number_of_threads(name, batch, size):
     """Few large images are cut into blocks. Faces may be shared, or those of each image."""
-    vertices = torch.stack([s * MESHES[0][0] for s in (1.0, 0.8, 0.5, 0.7)[:batch]])
-    faces = MESHES[0][1]
-    values = [
-        torch.stack([x, *(0.5 * x for _ in range(batch - 1))])
-        for x in values_of(name, vertices[0], faces)
-    ]
+    mesh, faces = MESHES[0]
+    vertices = torch.stack([s * mesh for s in (1.0, 0.8, 0.5, 0.7)[:batch]])
+    values = [torch.stack([x] + [0.5 * x] * (batch - 1)) for x in values_of(name, mesh, faces)]
 
     def draw(faces=faces):
         return outcome(name, vertices, faces, values, EYES[:batch], size)
@@ -192,8 +179,7 @@ def test_a_batch_has_the_bits_of_each_mesh_with_any_number_of_threads(name, batc
         assert same_bits(images, result[0]) and same_bits(grads, result[1])
     own_images, own_grads = draw(faces.expand(batch, -1, -1).int())
     assert same_bits(images, own_images)
-    for a, b in zip(grads, own_grads, strict=True):  # the kernel adds up in another order
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5 * float(a.abs().max()))
+    assert_near(own_grads, grads, 1e-5)  # the kernel adds up in another order
     for b in range(batch):
         alone, own = outcome(name, vertices[b], faces, [x[b] for x in values], EYES[b], size)
         assert same_bits([x[b] for x in images], [x[0] for x in alone])
@@ -202,15 +188,12 @@ def test_a_batch_has_the_bits_of_each_mesh_with_any_number_of_threads(name, batc
 
 @NAMES
 def test_values_of_a_list_of_equal_sizes_equal_those_of_a_batch(name):
-    vertices, faces = torch.stack([MESHES[0][0], 0.7 * MESHES[0][0]]), MESHES[0][1]
-    values = [torch.stack([x, 0.5 * x]) for x in values_of(name, vertices[0], faces)]
+    mesh, faces = MESHES[0]
+    vertices = torch.stack([mesh, 0.7 * mesh])
+    values = [torch.stack([x, 0.5 * x]) for x in values_of(name, mesh, faces)]
     images, _ = outcome(name, vertices, faces, values, EYES[:2])
-    lists = [list(x) for x in values]
-    for v, f in (
-        (list(vertices), [faces, faces]),
-        (list(vertices), faces),
-        (vertices, [faces, faces]),
-    ):
+    lists, both = [list(x) for x in values], [faces, faces]
+    for v, f in ((list(vertices), both), (list(vertices), faces), (vertices, both)):
         assert same_bits(outcome(name, v, f, lists, EYES[:2])[0], images)
 
 
@@ -219,13 +202,10 @@ def test_one_mesh_and_many_poses(name):
     mesh = MESHES[1]
     values = values_of(name, *mesh)
     images, grads = outcome(name, *mesh, values, EYES)
-    sums = [torch.zeros_like(x) for x in grads]
-    for b, eye in enumerate(EYES):
-        alone, own = outcome(name, *mesh, values, eye)
+    each = [outcome(name, *mesh, values, eye) for eye in EYES]
+    for b, (alone, _) in enumerate(each):
         assert same_bits([x[b] for x in images], [x[0] for x in alone])
-        sums = [x + y for x, y in zip(sums, own, strict=True)]
-    for a, b in zip(grads, sums, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4 * float(b.abs().max()))
+    assert_near(grads, [sum(x) for x in zip(*(own for _, own in each), strict=True)], 1e-4)
 
 
 @NAMES
@@ -240,11 +220,11 @@ def test_empty_batches_and_meshes(name, batch, num_faces):
 
 @NAMES
 def test_float32_is_close_to_float64(name):
-    mesh = MESHES[1]
-    values = values_of(name, *mesh)
-    single = outcome(name, *mesh, values, EYES[0])
-    double = outcome(name, mesh[0].double(), mesh[1], [x.double() for x in values], EYES[0])
-    for a, b in zip((*single[0], *single[1]), (*double[0], *double[1]), strict=True):
+    vertices, faces = MESHES[1]
+    values = values_of(name, vertices, faces)
+    single = outcome(name, vertices, faces, values, EYES[0])
+    wide = outcome(name, vertices.double(), faces, [x.double() for x in values], EYES[0])
+    for a, b in zip((*single[0], *single[1]), (*wide[0], *wide[1]), strict=True):
         assert b.dtype == torch.float64 or not b.is_floating_point()
         error = (a.double() - b).abs().flatten()
         # a pixel at an edge may belong to the other side
@@ -256,17 +236,13 @@ def test_float32_is_close_to_float64(name):
 @pytest.mark.parametrize("eyes", [EYES, INSIDE], ids=["outside", "inside"])
 def test_faces_with_a_corner_that_is_not_finite_draw_nothing_and_spoil_nothing(name, bad, eyes):
     vertices, faces = MESHES[1]
-    more = torch.cat(
-        [
-            vertices,
-            torch.tensor([[bad, 0.0, 0.0], [0.3, bad, bad], [0.9, 0.9, 0.0], [-0.9, 0.9, 0.0]]),
-        ]
-    )
+    corners = [[bad, 0.0, 0.0], [0.3, bad, bad], [0.9, 0.9, 0.0], [-0.9, 0.9, 0.0]]
+    more = torch.cat([vertices, torch.tensor(corners)])
     extra = torch.cat([faces, torch.tensor([[42, 44, 45], [44, 43, 45], [42, 43, 44]])])
-    values, longer = values_of(name, vertices, faces), values_of(name, more, extra)
+    values = values_of(name, vertices, faces)
     longer = [
         torch.cat([x, y[len(x) :]]) if len(y) > len(x) else x
-        for x, y in zip(values, longer, strict=True)
+        for x, y in zip(values, values_of(name, more, extra), strict=True)
     ]
     images, grads = outcome(name, vertices, faces, values, eyes[0])
     spoiled, spoiled_grads = outcome(name, more, extra, longer, eyes[0])
@@ -275,77 +251,48 @@ def test_faces_with_a_corner_that_is_not_finite_draw_nothing_and_spoil_nothing(n
         assert torch.equal(a, b[: len(a)]) and not b[len(a) :].any()
 
 
-ODD = [
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    0.5,
-    1e-45,
-    1e-30,
-    1e-7,
-    1e11,
-    1e30,
-    -1e30,
-    3.4e38,
-    -3.4e38,
-    np.inf,
-    -np.inf,
-    np.nan,
-]
-numbers = st.one_of(st.sampled_from(ODD), st.floats(-2, 2, width=32), st.floats(width=32))
-
-
 @settings(max_examples=500, deadline=None)
 @given(
     st.sampled_from(sorted(FUNCTIONS)),
-    st.lists(numbers, min_size=21, max_size=21),
+    st.lists(any_number, min_size=21, max_size=21),
     st.lists(st.lists(st.integers(0, 6), min_size=3, max_size=3), max_size=6),
-    st.lists(st.one_of(st.just(-2.0), numbers), min_size=3, max_size=3),
+    st.lists(st.one_of(st.just(-2.0), any_number), min_size=3, max_size=3),
     st.booleans(),
     st.integers(1, 12),
 )
-def test_no_mesh_and_no_camera_gives_a_nan(name, coordinates, faces, eye, double, size):
-    vertices = (
-        torch.tensor(coordinates, dtype=torch.float64)
-        .view(7, 3)
-        .to(torch.float64 if double else torch.float32)
-    )
+def test_no_mesh_and_no_camera_gives_a_nan(name, coordinates, faces, eye, is_double, size):
+    vertices = double(coordinates).view(7, 3).to(torch.float64 if is_double else torch.float32)
     faces = torch.tensor(faces, dtype=torch.long).view(-1, 3)
     values = values_of(name, noise(7, 3).to(vertices), faces)
     images, grads = outcome(name, vertices, faces, values, torch.tensor(eye), size)
     assert all(x.isfinite().all() for x in images) and not any(x.isnan().any() for x in grads)
-    assert ((images[0] >= -1e-6) & (images[0] <= 1 + 1e-6)).all() or name not in (
-        "silhouette",
-        "local",
-        "soft",
-    )
-    used = torch.zeros(7, dtype=torch.bool)
-    used[faces.flatten()] = True
-    assert not grads[0][~used].any()
+    if name in ("silhouette", "local", "soft"):
+        assert images[0].min() >= -1e-6 and images[0].max() <= 1 + 1e-6
+    unused = torch.ones(7, dtype=torch.bool)
+    unused[faces.flatten()] = False
+    assert not grads[0][unused].any()
 
 
 @NAMES
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_an_upstream_gradient_that_is_not_finite_stays_in_its_image(name, bad):
     """A gradient scaler must see it, and the next step must not."""
-    vertices, faces = torch.stack([MESHES[1][0], 0.8 * MESHES[1][0]]), MESHES[1][1]
-    values = [torch.stack([x, x]) for x in values_of(name, vertices[0], faces)]
+    mesh, faces = MESHES[1]
+    inputs = [torch.stack([mesh, 0.8 * mesh])]
+    inputs += [torch.stack([x, x]) for x in values_of(name, mesh, faces)]
 
-    def grads(spoil):
-        given = leaves([vertices, *values])
-        image = FUNCTIONS[name][0](given[0], faces, EYES[:2], 24, *given[1:])[0]
-        upstream = torch.ones_like(image)
-        upstream[0, 8:13] *= bad if spoil else 1
-        return torch.autograd.grad(
-            image, given, upstream, allow_unused=True, materialize_grads=True
-        )
+    def draw(vertices, *values):
+        return FUNCTIONS[name][0](vertices, faces, EYES[:2], 24, *values)[0]
 
-    healthy, spoiled = grads(False), grads(True)
-    assert not all(x[0].isfinite().all() for x in spoiled) and same_bits(
-        [x[1] for x in healthy], [x[1] for x in spoiled]
-    )
-    assert same_bits(grads(False), healthy)
+    def grads(factor):
+        upstream = torch.ones_like(draw(*inputs))
+        upstream[0, 8:13] *= factor
+        return value_and_gradients(draw, *inputs, upstream=upstream)[1:]
+
+    healthy, spoiled = grads(1), grads(bad)
+    assert not all(x[0].isfinite().all() for x in spoiled)
+    assert same_bits([x[1] for x in healthy], [x[1] for x in spoiled])
+    assert same_bits(grads(1), healthy)
 
 
 @NAMES
@@ -389,10 +336,10 @@ def test_compile_and_vmap_give_the_same(name, eyes):
     wanted = torch.func.grad(loss)(vertices)
     close = dict(rtol=1e-4, atol=1e-5 * float(wanted.abs().max()))
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    leaf = vertices.clone().requires_grad_()
-    torch.testing.assert_close(torch.autograd.grad(compiled(leaf), leaf)[0], wanted, **close)
+    leaf = leaf_of(vertices)
+    assert_close(torch.autograd.grad(compiled(leaf), leaf)[0], wanted, **close)
     many = torch.stack([0.9 * vertices, vertices])
-    torch.testing.assert_close(torch.func.vmap(torch.func.grad(loss))(many)[1], wanted, **close)
+    assert_close(torch.func.vmap(torch.func.grad(loss))(many)[1], wanted, **close)
     assert wanted.any()
 
 
@@ -411,21 +358,20 @@ def test_cuda_tensors_are_staged_through_the_host(name):
 
 def call_everything(dtype, packed):
     """Every operator at least once, forward and backward."""
-    meshes = [MESHES[1], (0.9 * MESHES[1][0], MESHES[1][1])]
+    mesh, faces = MESHES[1]
+    both = mesh.to(dtype), 0.9 * mesh.to(dtype)
+    join = list if packed else torch.stack
     for name in FUNCTIONS:
-        values = [[x.to(dtype) for x in values_of(name, *mesh)] for mesh in meshes]
-        vertices, faces = [v.to(dtype) for v, _ in meshes], [f for _, f in meshes]
-        join = (lambda x: list(x)) if packed else (lambda x: torch.stack(list(x)))
-        values = [join(x) for x in zip(*values, strict=True)]
+        values = [[x.to(dtype)] * 2 for x in values_of(name, mesh, faces)]
         for eyes in (EYES, INSIDE)[: 2 if name in ("depth", "vertices") else 1]:
-            outcome(name, join(vertices), join(faces), values, eyes[:2].to(dtype), 8)
-    vertices, faces = torch.stack(vertices).requires_grad_(), faces[0]
+            given = join(both), join([faces, faces]), [join(x) for x in values]
+            outcome(name, *given, eyes[:2].to(dtype), 8)
+    vertices = torch.stack(both).requires_grad_()
     angles = nmr.LookAt(vertices[:, 0] + 3, up=[0.1, 1.0, 0.0])
     pinhole = nmr.Pinhole(torch.eye(3), torch.eye(3), vertices[:, 0] + 5, [0.1] * 5, orig_size=1)
-    images = noise(2, 9).to(dtype).requires_grad_(), noise(2, 9, seed=1).to(dtype).requires_grad_()
-    loss = nmr.losses.smoothness_loss(vertices, nmr.edge_table(faces)) + nmr.losses.soft_iou_loss(
-        *images
-    )
+    images = [uniform(2, 9, seed=seed, dtype=dtype).requires_grad_() for seed in (0, 1)]
+    loss = nmr.losses.smoothness_loss(vertices, nmr.edge_table(faces))
+    loss = loss + nmr.losses.soft_iou_loss(*images)
     (loss + pinhole.transform(vertices).sum() + angles.transform(vertices).sum()).backward()
     nmr.voxelize(vertices, faces, 4)
     # in clip space
@@ -455,19 +401,13 @@ def test_opcheck(dtype, packed, monkeypatch):
     with Recorder() as recorder:
         call_everything(dtype, packed)
     operators = [x for x in vars(nmr.ops).values() if hasattr(x, "op")]
-    wanted = {x.op for x in operators} | {
-        x.backward.op for x in operators if hasattr(x, "backward")
-    }
-    assert {op for op, _ in recorder.calls} == wanted
+    operators += [x.backward for x in operators if hasattr(x, "backward")]
+    assert {op for op, _ in recorder.calls} == {x.op for x in operators}
     for (op, _), args in recorder.calls.items():
-        if op.name().endswith("_backward"):
-            torch.library.opcheck(op, args)
-            continue
-        leaves = [
-            x.requires_grad_() if isinstance(x, torch.Tensor) and x.is_floating_point() else x
-            for x in args
-        ]
-        torch.library.opcheck(op, leaves)
+        for x in args:
+            if isinstance(x, torch.Tensor) and not op.name().endswith("_backward"):
+                x.requires_grad_(x.is_floating_point())
+        torch.library.opcheck(op, args)
 
 
 _LIBC = ctypes.CDLL(None)
@@ -481,16 +421,15 @@ def guarded(array):
     first = ctypes.addressof(ctypes.c_char.from_buffer(block))
     for address in (first, first + page + size):
         assert _LIBC.mprotect(ctypes.c_void_p(address), page, 0) == 0
-    copy = np.frombuffer(block, array.dtype, array.size, page + size - array.nbytes).reshape(
-        array.shape
-    )
+    copy = np.frombuffer(block, array.dtype, array.size, page + size - array.nbytes)
+    copy = copy.reshape(array.shape)
     copy[...] = array
     return copy
 
 
 def changes(array):
-    """Arrays in place of this one, most of which do not fit."""
-    yield np.stack([array, array])
+    """Arrays in place of this one, most of which do not fit; the first of them never does."""
+    yield np.stack([array] * 7)
     for axis, size in enumerate(array.shape):
         if size:
             yield array.take(range(size - 1), axis)
@@ -509,21 +448,14 @@ def test_no_kernel_reads_or_writes_outside_an_array(monkeypatch):
 
     def record(name, kernel):
         def call(**args):
-            arrays = {
-                key: x.detach().numpy().copy()
-                for key, x in args.items()
-                if isinstance(x, torch.Tensor)
-            }
+            tensors = {key: x for key, x in args.items() if isinstance(x, torch.Tensor)}
+            arrays = {key: x.detach().numpy().copy() for key, x in tensors.items()}
             calls[name, tuple((key, x.ndim) for key, x in arrays.items())] = args | arrays
             return kernel(**args)
 
         return call
 
-    kernels = {
-        name: getattr(_C, name)
-        for name in dir(_C)
-        if callable(getattr(_C, name)) and name != "free_scratch"
-    }
+    kernels = {name: x for name, x in vars(_C).items() if callable(x) and name != "free_scratch"}
     with monkeypatch.context() as patch:
         for name, kernel in kernels.items():
             patch.setattr(_C, name, record(name, kernel))
@@ -536,19 +468,28 @@ def test_no_kernel_reads_or_writes_outside_an_array(monkeypatch):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
+# Arguments that a kernel does not read: scenes in front of the camera, and those of its backward pass.
+SKIPPED = {("clip_count", name) for name in ("faces", "starts")}
+SKIPPED |= {("resolve", name) for name in ("vertices", "faces", "starts")}
+
+
 def mostly_refused(kernels, calls):
-    refused = accepted = 0
+    refused, accepted, unchecked = 0, 0, set()
     for (name, _), args in calls.items():
         arrays = {key: x for key, x in args.items() if isinstance(x, np.ndarray)}
         copies = {key: guarded(x) for key, x in arrays.items()}
         for changed in arrays:
-            for other in changes(arrays[changed]):
+            for number, other in enumerate(changes(arrays[changed])):
                 for key, x in arrays.items():
                     copies[key][...] = x
                 try:
                     kernels[name](**args | copies | {changed: guarded(other)})
-                    accepted += 1
                 except ValueError:
                     refused += 1
+                    continue
+                accepted += 1
+                if number == 0:
+                    unchecked.add((name, changed))
+    print("not checked:", unchecked - SKIPPED)
     # such as fewer faces, or old values of an output
-    return refused > 2000 and accepted < 0.1 * refused
+    return refused > 2000 and accepted < 0.1 * refused and unchecked == SKIPPED
