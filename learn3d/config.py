@@ -1,5 +1,6 @@
-"""The options of a training run: a frozen dataclass, its checks and its JSON form. `presets` has
-instances of it.
+"""The options of a training run: a frozen dataclass, its checks and its JSON form.
+
+`presets` has instances of it.
 """
 
 import dataclasses
@@ -128,9 +129,7 @@ class TrainConfig:
 
 
 def config_to_dict(config: TrainConfig) -> dict[str, Any]:
-    """The configuration as plain JSON values; the method's settings are a dictionary under
-    "settings".
-    """
+    """The configuration as JSON values, with the method's settings under "settings"."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
@@ -142,9 +141,7 @@ _MAY_DIFFER_NAMES = {
 
 
 def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
-    """A line for each option that must not change, but differs between `config` and the run
-    `saved`.
-    """
+    """A line for each option that must not change, but differs from the run `saved`."""
     old, new = (
         {"method": type(c.settings).__name__.removesuffix("Settings"), **all_options(c)}
         for c in (saved, config)

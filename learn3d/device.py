@@ -108,8 +108,9 @@ class ThreadTuner:
         return f"{self.threads} thread{'s' * (self.threads > 1)}"
 
     def after_step(self, seconds: float) -> str:
-        """Record the duration of a step. Returns a line for the log when a number is chosen, else
-        "".
+        """Record the duration of a step.
+
+        Returns a line for the log when a number is chosen, else "".
         """
         self._seconds.append(seconds)
         if self.fixed or len(self._seconds) < (TRIAL if self._trying else WINDOW):

@@ -1,6 +1,4 @@
-"""Voxel IoU, silhouette IoU, surface distances and pose invariance (MMD) of a trained method on
-one split.
-"""
+"""Voxel and silhouette IoU, surface distances and MMD of a trained method on a split."""
 
 import itertools
 import math
@@ -161,9 +159,7 @@ def _compare_voxels(
 
 
 def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
-    """IoU of a batch's masks and the silhouettes at its cameras: sum of minima over sum of maxima
-    (NaN: both empty).
-    """
+    """IoU of masks and silhouettes: sum of minima over sum of maxima (NaN: both empty)."""
     size = batch.masks.shape[-1]
     silhouettes = nmr.render_silhouette(
         shapes.vertices, shapes.faces, batch.cameras, image_size=size
@@ -178,9 +174,7 @@ def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
 def _compare_surfaces(
     shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Chamfer-L1 and F-score with the true points [P, 3] of each object; see `MEASURED` for empty
-    surfaces.
-    """
+    """Chamfer-L1 and F-score with the true points [P, 3] of each object."""
     found = []
     for surface, theirs in zip(shapes.surfaces(), truth, strict=True):
         ours = _sample(surface, generator)
@@ -220,8 +214,7 @@ def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
 
 
 def _other_images(object_ids: np.ndarray) -> Tensor:
-    """For each sample another one of its object, int64 [M]: a quarter of the object's images
-    further on.
+    """For each sample another of its object, int64 [M]: a quarter of its images further on.
 
     If views go around the object, that is a quarter turn. Half a turn would show the same
     outline, mirrored.

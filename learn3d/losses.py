@@ -1,5 +1,6 @@
-"""Losses on shape codes, pose logits, silhouettes and depth, and the MMD, all in float32. See
-also nmr.losses.
+"""Losses on shape codes, pose logits, silhouettes and depth, and the MMD, all in float32.
+
+See also nmr.losses.
 """
 
 import math
@@ -54,8 +55,9 @@ def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:
-    """L_prior: batch mean of the norm of the codes (eq. 5, "norm") or of its square (published
-    code, "squared").
+    """L_prior: batch mean of the norm of the codes (eq.
+
+    5, "norm") or of its square (published code, "squared").
 
     codes [B,C]; differentiable; the gradient at a zero code is zero.
     """

@@ -215,8 +215,9 @@ PRESETS: dict[str, TrainConfig] = {
 
 
 def full_name(name: str) -> str:
-    """The name of a preset, given that name or the short name of a method. Raises ValueError for
-    other names.
+    """The name of a preset, given that name or the short name of a method.
+
+    Raises ValueError for other names.
     """
     preset = SHORT_NAMES[name][0] if str(name) in SHORT_NAMES else name
     if str(preset) not in PRESETS:
@@ -250,8 +251,9 @@ def configure(preset: str = DEFAULT_PRESET, **options: Any) -> TrainConfig:
 
 
 def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
-    """Build a TrainConfig from plain values. Raises a ValueError that names `source` and the
-    wrong option.
+    """Build a TrainConfig from plain values.
+
+    Raises a ValueError that names `source` and the wrong option.
     """
     try:
         if not isinstance(values, dict):
@@ -262,8 +264,9 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
 
 
 def load_config(path: Path) -> TrainConfig:
-    """Read the config.json of a run. Raises MissingFile or ValueError if it is missing or
-    damaged.
+    """Read the config.json of a run.
+
+    Raises MissingFile or ValueError if it is missing or damaged.
     """
     wanted = "the options of a run; to start a new run, leave out --resume"
     return config_from_dict(read_json(path, limits.TEXT_BYTES, wanted), source=str(path))

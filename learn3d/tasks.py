@@ -117,8 +117,9 @@ def run_tasks(tasks: Sequence[Task], workers: Workers) -> list[str]:
 
 @contextlib.contextmanager
 def _executor(workers: Workers) -> Iterator[tuple[concurrent.futures.Executor, Any]]:
-    """The executor of tasks, and the event that stops them. At the end it waits for those that
-    run.
+    """The executor of tasks, and the event that stops them.
+
+    At the end it waits for those that run.
     """
     if workers.cluster is None:
         with concurrent.futures.ThreadPoolExecutor(workers.jobs) as threads:

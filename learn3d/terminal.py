@@ -76,8 +76,9 @@ def _print(text: str, stream: TextIO) -> None:
 
 
 def _silence(stream: TextIO) -> None:
-    """Let no further output fail. Python flushes once more when it ends: "Note on SIGPIPE" of
-    module `signal`.
+    """Let no further output fail.
+
+    Python flushes once more when it ends: "Note on SIGPIPE" of module `signal`.
     """
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 

@@ -137,8 +137,9 @@ def create_run(config: TrainConfig) -> tuple[Run, ViewDataset, ViewDataset]:
 
 
 def take_step(method: Method, batch: Batch, step: int) -> dict[str, float]:
-    """Take training step `step` (from 1). Returns its losses before weighting, and "total", their
-    weighted sum.
+    """Take training step `step` (from 1).
+
+    Returns its losses before weighting, and "total", their weighted sum.
 
     Raises FloatingPointError if a loss is not finite, before its gradient is computed.
     """
@@ -174,8 +175,7 @@ def loss_values(losses: Losses, step: int) -> dict[str, float]:
 
 
 def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) -> Progress:
-    """Measure IoU and MMD on the validation images; save the networks if their IoU is the best so
-    far.
+    """Measure IoU and MMD on the validation images; save the networks with the best IoU.
 
     `Evaluation.selection_metric` says which IoU. Returns the progress with the best IoU and its
     step.
@@ -200,9 +200,7 @@ def validate(run: Run, val_set: ViewDataset, progress: Progress, log: RunLog) ->
 
 
 def draw(config: TrainConfig, method: Method, val_set: ViewDataset, step: int, log: RunLog) -> None:
-    """Write pictures/<step>.png: the same few validation images of different objects and views
-    each time.
-    """
+    """Write pictures/<step>.png: the same few validation images each time."""
     if distributed.rank() > 0:
         return
     samples = spread_samples(val_set.object_ids, val_set.view_ids, PICTURE_ROWS)

@@ -1,5 +1,6 @@
-"""The program `learn3d`. Each command is a class; its module is imported when the command is
-called.
+"""The program `learn3d`.
+
+Each command is a class; its module is imported when the command is called.
 
 torch takes seconds to import. So it is imported inside of `main`, which handles Ctrl-C.
 """
@@ -117,8 +118,9 @@ def _load(name: str) -> Any:
 
 
 def print_completion(shell: str = "bash") -> None:
-    """Print the shell script of tab completion. Commands whose packages are not installed are
-    left out.
+    """Print the shell script of tab completion.
+
+    Commands whose packages are not installed are left out.
     """
     import tyro
 

@@ -28,8 +28,9 @@ FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.AvoidSubcommands)
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Command:
-    """Base class of commands, which become frozen dataclasses. `run` does the work and may return
-    an exit status.
+    """Base class of commands, which become frozen dataclasses.
+
+    `run` does the work and may return an exit status.
     """
 
     def __init_subclass__(cls) -> None:

@@ -1,5 +1,4 @@
-"""Conventions: the object frame, Kato's 24 views, the axes of each data set's voxels, and the names of
-categories and splits.
+"""Conventions: object frame, Kato's views, axes of voxels, names of categories and splits.
 
 The object frame is that of the renderer: LEFT-handed, x right, y up, z away from the camera of
 view 0. Mesh files are right-handed; `mesh_to_object` converts their coordinates. A prediction is
@@ -42,22 +41,17 @@ class VoxelConvention:
     kato18_scale: float = 1.0  # scale of meshes before the kato18 voxelizer, whose rays are on the grid's corner lines
 
     def to_axes(self, grid: Tensor) -> Tensor:
-        """Convert grids [B, s, s, s] from the axes (x, y, z) of the object frame to those of the
-        stored voxels.
-        """
+        """Convert grids [B, s, s, s] from the object frame's axes to those of stored voxels."""
         return grid.transpose(*self.swap).flip(self.flip)
 
     def to_object(self, grid: Tensor) -> Tensor:
-        """The inverse of `to_axes`: convert stored voxels [B, s, s, s] to the axes (x, y, z) of
-        the object frame.
-        """
+        """The inverse of `to_axes`, for stored voxels [B, s, s, s]."""
         return grid.flip(self.flip).transpose(*self.swap)
 
     def voxelize(
         self, vertices: Tensor, faces: Tensor, definition: Definition = "kato18"
     ) -> Tensor:
-        """Occupancy bool [B, 32, 32, 32] of meshes in the object frame, comparable with the
-        stored voxels.
+        """Occupancy bool [B, 32, 32, 32] of meshes, comparable with the stored voxels.
 
         vertices: float [B, V, 3] or [V, 3]. faces: integer [F, 3] or [B, F, 3]. definition:
         "kato18" for the voxelizer of Kato et al. 2018 and of the paper, "kato19" for the
@@ -70,9 +64,7 @@ class VoxelConvention:
         return self.to_axes(grid)
 
     def exceeds_grid(self, vertices: Tensor, definition: Definition = "kato18") -> Tensor:
-        """Which meshes (vertices float [B, V, 3]) exceed the grid, and therefore count as hollow:
-        bool [B].
-        """
+        """Which meshes (float [B, V, 3]) exceed the grid, so that they count as hollow: bool [B]."""
         return (self._to_unit(vertices, definition) - 0.5).abs().amax(dim=(1, 2)) > 0.5
 
     def _to_unit(self, vertices: Tensor, definition: Definition) -> Tensor:
@@ -104,9 +96,7 @@ class LayoutProperties:
     options: tuple[str, ...] = ()  # those of image_size and views_per_object that the reader takes
 
     def about(self, category: str, split: str) -> dict[str, Any]:
-        """The fields of a `ViewDataset` that all data sets of the layout share, and its category
-        and split.
-        """
+        """The fields of a `ViewDataset` that data sets of the layout share."""
         return {
             "category": category,
             "split": split,
@@ -144,8 +134,7 @@ LAYOUTS = {
 
 
 def mesh_to_object(up: str = "y", front: str = "x") -> np.ndarray:
-    """Matrix float64 [3, 3] from right-handed mesh coordinates to the object frame: object =
-    matrix @ mesh.
+    """Matrix float64 [3, 3] from mesh coordinates to the object frame: object = matrix @ mesh.
 
     `up` is the mesh axis that points up, `front` the one that faces the camera of view 0 ("x",
     "-x", "y" ...). A viewer in front of the mesh has up x front on the right. So the rows are [up

@@ -16,9 +16,7 @@ LARGEST = np.ones(4)  # and of the largest
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """M images, cut to the largest possible crops: the object's box plus 30 % a side (Kato and
-    Harada 2019).
-    """
+    """M images, cut to the largest possible crops: the object's box plus 30 % a side."""
 
     pixels: Sequence[np.ndarray]  # M regions uint8 [h, w, 3]
     boxes: np.ndarray  # float64 [M, 4]: left, top, width, height of the object's box in its region
@@ -49,8 +47,7 @@ class Crops:
         return Crops([self.pixels[k] for k in samples], self.boxes[samples], self.size)
 
     def cut(self, shifts: np.ndarray | None = None) -> np.ndarray:
-        """Input images uint8 [M, 3, size, size]: the box padded by 15 % a side, clipped to the
-        image, and stretched.
+        """Input images uint8 [M, 3, size, size]: boxes padded by 15 % a side and stretched.
 
         shifts: float [M, 4] in -1 .. 1: outward shifts of the left, top, right and bottom side,
         in units of 15 % of the box; None for no shifts (evaluation).
@@ -67,9 +64,7 @@ class Crops:
 
 
 def bounds(box: np.ndarray, shift: np.ndarray, image: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a crop in pixels of the image, rounded and clipped as in the
-    published code.
-    """
+    """Left, top, right, bottom of a crop in pixels, rounded and clipped as published."""
     left, top, w, h = box
     padding = PADDING + JITTER * shift  # [4]: left, top, right, bottom
     return (

@@ -33,8 +33,9 @@ _OF_VIEWS = ("images", "masks", "depth", "poses", "stored_sizes", "crops")
 
 @checked
 class DatasetInfo:
-    """Properties of the data that methods need to build their networks. Every checkpoint has
-    them.
+    """Properties of the data that methods need to build their networks.
+
+    Every checkpoint has them.
     """
 
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K view classes
@@ -171,8 +172,9 @@ class ViewDataset:
         return DatasetInfo(*sizes, mirror_plane_deg, cube_side, solidity)
 
     def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
-        """The samples `indices`, integer [B] in 0 .. M-1, as one Batch on the CPU. ValueError for
-        other indices.
+        """The samples `indices`, integer [B] in 0 ..
+
+        M-1, as one Batch on the CPU. ValueError for other indices.
 
         voxels: False for training, which needs none; they are twice as large as the images.
         """
@@ -206,8 +208,9 @@ class ViewDataset:
         )
 
     def digest(self, *, voxels: bool = True) -> int:
-        """CRC-32 of images, masks, poses and classes, and of voxels if wanted. Arrays on disk
-        count by checksums.
+        """CRC-32 of images, masks, poses and classes, and of voxels if wanted.
+
+        Arrays on disk count by checksums.
         """
         poses = () if self.poses is None else vars(self.poses).values()
         parts = [
@@ -281,8 +284,9 @@ class ViewDataset:
         return np.maximum(*sides)
 
     def with_bins(self, bins: AngleBins) -> ViewDataset:
-        """The same views with cells of azimuth and elevation as view classes. Raises ValueError
-        without such poses.
+        """The same views with cells of azimuth and elevation as view classes.
+
+        Raises ValueError without such poses.
         """
         if not isinstance(self.poses, LookAtPoses):
             got = "no poses" if self.poses is None else "rotations"
@@ -298,8 +302,7 @@ class ViewDataset:
         return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), **parts)
 
     def with_few_views(self, count: int) -> ViewDataset:
-        """`count` random views of each object, or all of an object with fewer; the same ones in
-        every run.
+        """`count` random views of each object, or all; the same ones in every run.
 
         Raises ValueError if no object has `count` views.
         """
@@ -332,25 +335,22 @@ DEPTH_REACH = 0.9
 
 
 def depth_levels(depth: Tensor, poses: LookAtPoses) -> Tensor:
-    """Quantise depth maps float [M, S, S]: 1 .. 255 within `DEPTH_REACH` of the centre's depth, 0
-    for no surface.
-    """
+    """Quantise depth maps float [M, S, S]: 1 .. 255 near the centre's depth, 0 for no surface."""
     nearer = (depth - poses.distance[:, None, None]) / DEPTH_REACH
     level = (1 + 127 * (nearer + 1)).round().clamp(1, 255)
     return torch.where(nearer.abs() <= 1, level, 0).to(torch.uint8)
 
 
 def depth_of_levels(levels: Tensor, poses: LookAtPoses) -> Tensor:
-    """The inverse of `depth_levels`: float32 [M, S, S] in units of the object frame, 0 for no
-    surface.
-    """
+    """The inverse of `depth_levels`: float32 [M, S, S], 0 for no surface."""
     depth = ((levels.float() - 1) / 127 - 1) * DEPTH_REACH + poses.distance[:, None, None]
     return torch.where(levels > 0, depth, 0.0)
 
 
 def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
-    """Join categories of one layout and split to a set with class ids. ValueError if their view
-    classes differ.
+    """Join categories of one layout and split to a set with class ids.
+
+    ValueError if their view classes differ.
     """
     if len(datasets) == 1:
         return datasets[0]
@@ -363,8 +363,9 @@ def concatenate(datasets: Sequence[ViewDataset]) -> ViewDataset:
 
 
 def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
-    """Concatenate the views and objects of several sets. Raises ValueError if their kinds of
-    images or poses differ.
+    """Concatenate the views and objects of several sets.
+
+    Raises ValueError if their kinds of images or poses differ.
     """
     first = datasets[0]
     for other in datasets[1:]:

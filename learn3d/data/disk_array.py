@@ -24,8 +24,9 @@ ROW = np.dtype([("file", np.int32), ("row", np.int32), ("crc", np.uint32)])
 
 @dataclass(frozen=True, eq=False)
 class DiskArray:
-    """An array [M, ...] on disk, whose rows are in some files. `array[samples]` reads rows, int64
-    [B].
+    """An array [M, ...] on disk, whose rows are in some files.
+
+    `array[samples]` reads rows, int64 [B].
 
     Files are not mapped into memory: if a mapped file is truncated later, a signal ends the
     process. Here a DamagedFile with its name is raised.

@@ -1,5 +1,4 @@
-"""Frames photographs: the square around the photograph, or around its object, as the image of a
-network.
+"""Frames photographs: a square around them, or around their object, for a network.
 
 A training image is padded to a square around its centre, because a square elsewhere would need an
 off-axis projection. So the camera must have been aimed at the middle of the object.
@@ -24,8 +23,7 @@ MEAN_OBJECT_SIZE = 0.65  # `ViewDataset.mean_object_size` of Kato's renderings
 def read_photo(
     path: Path, mask_path: Path | None = None, *, optional: bool = False
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read colours uint8 [H, W, 3] and mask uint8 [H, W] of an image with a mask file or with
-    transparency.
+    """Read colours uint8 [H, W, 3] and mask uint8 [H, W] of an image.
 
     Both are turned upright (EXIF). The mask is the transparency of the mask file if it has any,
     else its grey values: white is the object. optional: the mask is None if there is neither.

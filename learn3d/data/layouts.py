@@ -44,9 +44,7 @@ def reader(layout: str) -> ModuleType:
 def check_options(
     layout: str, *, image_size: int = IMAGE_SIZE, view_bins: str | None = None
 ) -> None:
-    """Raise ValueError for an unknown layout, or for an option of `load_dataset` that it does not
-    support.
-    """
+    """Raise ValueError for an unknown layout, or for an option that it does not support."""
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
     if "image_size" not in LAYOUTS[layout].options and image_size != IMAGE_SIZE:
@@ -63,9 +61,7 @@ def check_options(
 
 
 def require_folder(folder: Path | str) -> None:
-    """Raise FileNotFoundError if the folder of a data set does not exist; the message has its
-    absolute path.
-    """
+    """Raise FileNotFoundError, with the absolute path, if the folder does not exist."""
     folder = Path(folder)
     if not folder.is_dir():
         absolute = "" if folder.is_absolute() else f" ({folder.absolute()})"
@@ -182,8 +178,9 @@ class Problem:
 
 @dataclass(frozen=True)
 class SplitReport:
-    """Faults of one category and split. Errors are those that `load_dataset` would raise; it
-    would accept warnings.
+    """Faults of one category and split.
+
+    Errors are those that `load_dataset` would raise; it would accept warnings.
     """
 
     category: str

@@ -67,9 +67,7 @@ def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
 
 
 def _describe(left_out: np.ndarray, area: float) -> str | None:
-    """A sentence about the areas of regions that were left out; None if all are below a hundredth
-    of the object.
-    """
+    """A sentence about regions that were left out; None if they are small."""
     if left_out.max() >= _SIMILAR * area:
         return "several objects of similar size were found, and only the largest is used"
     share = left_out.sum() / area

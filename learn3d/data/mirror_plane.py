@@ -22,8 +22,7 @@ _MAX_RATIO = 0.1
 
 
 def find_mirror_plane(dataset: ViewDataset) -> float | None:
-    """Azimuth in degrees, 0 .. 172.5, of a camera that looks along the mirror plane; None if no
-    plane is found.
+    """Azimuth in degrees of a camera that looks along the mirror plane; None if there is none.
 
     The difference at a plane p is the mean squared difference of the mean masks of the sectors v
     and 2 p - v, less its expected value from noise. A plane is found if the smallest of the 24

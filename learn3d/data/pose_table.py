@@ -27,8 +27,9 @@ MAX_CANDIDATES = 64
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """C candidate poses for each of N images, the most probable first. Raises ValueError for
-    impossible values.
+    """C candidate poses for each of N images, the most probable first.
+
+    Raises ValueError for impossible values.
     """
 
     fingerprint: np.ndarray  # uint64 [N]
@@ -95,8 +96,9 @@ class PoseTable:
             return cls(*npz.read_several(Path(path), names, _WANTED))
 
     def apply(self, dataset: ViewDataset, source: str) -> ViewDataset:
-        """The data set with the poses of this table and view classes from them. `source` names
-        the table in messages.
+        """The data set with the poses of this table and view classes from them.
+
+        `source` names the table in messages.
 
         Raises ValueError if an image is not in the table.
         """

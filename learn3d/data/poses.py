@@ -1,6 +1,4 @@
-"""Camera poses of the samples of a data set: look-at poses, rotations, and candidates for unknown
-ones.
-"""
+"""Camera poses of a data set: look-at poses, rotations, candidates for unknown ones."""
 
 from __future__ import annotations
 
@@ -57,8 +55,7 @@ class _PoseSet:
 
 @dataclass(frozen=True, eq=False)
 class LookAtPoses(_PoseSet):
-    """M perspective cameras that look at the origin from (distance, elevation, azimuth) in the
-    object frame.
+    """M perspective cameras that look at the origin from distance, elevation, azimuth.
 
     Conventions of `nmr.cameras.points_from_angles`: the eye is at d (cos e sin a, sin e, -cos e
     cos a).
@@ -104,9 +101,7 @@ class LookAtPoses(_PoseSet):
         ).to(torch.float32)
 
     def mirrored(self, chosen: Tensor) -> LookAtPoses:
-        """The poses after the images `chosen` (bool [M]) are flipped left-right: their azimuths
-        are negated.
-        """
+        """The poses after the images `chosen` (bool [M]) are flipped: azimuths are negated."""
         return replace(self, azimuth_deg=torch.where(chosen, -self.azimuth_deg, self.azimuth_deg))
 
 

@@ -86,9 +86,7 @@ def shard_path(folder: Path, number: int) -> Path:
 
 
 def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
-    """Write `part` of a data set, with its arrays in memory, as shard `number` in the folder of
-    its split.
-    """
+    """Write `part` of a data set as shard `number` in the folder of its split."""
     tensors = {name: getattr(part, name).astype(np.int32) for name in ("object_ids", "view_ids")}
     tensors["sides"] = part.object_sizes().astype(np.float32)
     tensors |= {name: v.numpy() for name, v in _pose_fields(part).items() if isinstance(v, Tensor)}
@@ -105,8 +103,9 @@ def write_shard(folder: Path, number: int, part: ViewDataset) -> None:
 
 
 def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> None:
-    """Mark a split of `shards` shards as complete, and remove what killed processes left. `part`:
-    any part of it.
+    """Mark a split of `shards` shards as complete, and remove what killed processes left.
+
+    `part`: any part of it.
     """
     for path in itertools.chain(*(folder.glob(pattern) for pattern in _PARTIALS)):
         path.unlink(missing_ok=True)
@@ -196,9 +195,7 @@ def load(
 
 
 def check_arrays(dataset: ViewDataset, where: Path, on_fault: FaultHandler) -> None:
-    """Read all arrays of a set of shards, whose folder is `where`, and report faults of their
-    rows.
-    """
+    """Read all arrays of the shards in the folder `where`, and report faults."""
     for name in _ARRAYS:
         if (array := getattr(dataset, name)) is not None:
             array.check(on_fault)
@@ -207,9 +204,7 @@ def check_arrays(dataset: ViewDataset, where: Path, on_fault: FaultHandler) -> N
 
 
 def _read_shard(path: Path, facts: SetFile, category: str, split: str) -> ViewDataset:
-    """Read names and tables of a shard, and check them against the facts; its arrays stay on
-    disk.
-    """
+    """Read and check names and tables of a shard; its arrays stay on disk."""
     with open_file(path, MAX_BYTES, WANTED) as file:
         try:
             names, tables, arrays = _read_tables(path, file)

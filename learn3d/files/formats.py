@@ -65,8 +65,9 @@ def _read(path: Path) -> RawMesh:
 
 
 def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces [F, 3]. Modules are imported here, so that a worker imports only
-    those it needs.
+    """Vertices [V, 3] and faces [F, 3].
+
+    Modules are imported here, so that a worker imports only those it needs.
     """
     kind = path.suffix.lower()
     if kind == ".obj":
@@ -104,9 +105,7 @@ def _file_below(folder: Path, name: str) -> bytes:
 
 
 def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
-    """Which numbers of the array `name` [size, size, size] of a MATLAB file (version 5 to 7) are
-    not 0: bool.
-    """
+    """Which numbers of the array `name` [size, size, size] of a MATLAB file are not 0: bool."""
     import scipy.io  # imported here, as its import takes longer than a worker's start
 
     wanted = f"a MATLAB file (version 5 to 7) with the array {name!r} of numbers [{size}, {size}, {size}]"
@@ -120,9 +119,7 @@ def read_matlab(path: Path, name: str, size: int) -> np.ndarray:
 
 
 def read_table(path: Path, rows: int, columns: int, wanted: str) -> np.ndarray:
-    """The first rows and columns of a table of numbers in a text file: float64 [rows, columns],
-    all finite.
-    """
+    """The first rows and columns of a table in a text file: float64 [rows, columns], finite."""
     text = io.StringIO(read_text(path, limits.TEXT_BYTES, wanted))
     table = np.loadtxt(text, comments=None, usecols=range(columns), max_rows=rows, ndmin=2)
     if (found := np.isfinite(table).all(axis=1).sum()) < rows:

@@ -209,8 +209,9 @@ def _skinned(
     accessors: _Accessors,
     places: dict[int, np.ndarray],
 ) -> np.ndarray:
-    """Points [N, 3] moved by the joints of their skin. The place of the mesh itself has no
-    effect.
+    """Points [N, 3] moved by the joints of their skin.
+
+    The place of the mesh itself has no effect.
     """
     joints = np.stack([places[number] for number in skin["joints"]])
     if "inverseBindMatrices" in skin:

@@ -1,6 +1,4 @@
-"""Decodes untrusted images with Pillow in the sandbox, reads the renderings of data sets, and
-resamples pictures.
-"""
+"""Decodes untrusted images in the sandbox, reads renderings, and resamples pictures."""
 
 import functools
 from collections.abc import Sequence
@@ -43,8 +41,9 @@ Rendering = tuple[np.ndarray, np.ndarray, int]
 
 
 def read_with_depth(path: Path, depth_path: Path, size: int) -> Rendering:
-    """A square rendering, reduced to `size`. Mask: depth below 250 in 8 bits, or alpha if there
-    is no depth file.
+    """A square rendering, reduced to `size`.
+
+    Mask: depth below 250 in 8 bits, or alpha if there is no depth file.
     """
     color, mask = _read_square(path, size)
     if depth_path.exists():
@@ -93,9 +92,7 @@ def _kind(image: Image.Image) -> str:
 
 
 def split_alpha(image: Image.Image) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None if the
-    image has none.
-    """
+    """Colours over white, uint8 [H, W, 3], and the alpha channel, uint8 [H, W], or None."""
     if not image.has_transparency_data:
         return np.asarray(image.convert("RGB")), None
     image = image.convert("RGBA")
@@ -124,9 +121,7 @@ def resample(
 
 @functools.lru_cache(16)
 def _weights(count: int, start: float, side: float, size: int) -> np.ndarray:
-    """Weight of each of `count` pixels for each of the `size` pixels of a line from `start`:
-    float32 [size, count].
-    """
+    """Weights of `count` pixels for `size` pixels from `start` on: float32 [size, count]."""
     pixels = np.arange(count) - start
     edges = np.arange(size + 1) * (side / size)
     if side < size:

@@ -1,5 +1,6 @@
-"""Limits of untrusted files. Real data are far below them, as the comments say; so there are no
-options for them.
+"""Limits of untrusted files.
+
+Real data are far below them, as the comments say; so there are no options for them.
 
 `sandbox` limits the memory and the time of reading.
 """

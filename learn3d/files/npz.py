@@ -28,8 +28,9 @@ def names(path: Path, wanted: str) -> list[str]:
 
 
 def read(path: Path, key: str, wanted: str, max_bytes: int | None = None) -> np.ndarray:
-    """The array `key`, of numbers or bools. Raises DamagedFile for other arrays and larger ones,
-    and MissingFile.
+    """The array `key`, of numbers or bools.
+
+    Raises DamagedFile for other arrays and larger ones, and MissingFile.
 
     max_bytes: largest size; None if unknown, then large arrays with a suspicious compression
     ratio are refused.

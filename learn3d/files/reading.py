@@ -53,8 +53,9 @@ def refuse(found: _FileError) -> None:
 
 
 def attempt(on_fault: FaultHandler, function: Callable[..., R], *arguments: Any) -> R | None:
-    """The result of function(*arguments). If it raises a fault, the fault is reported, and the
-    result is None.
+    """The result of function(*arguments).
+
+    If it raises a fault, the fault is reported, and the result is None.
     """
     try:
         return function(*arguments)
@@ -120,8 +121,9 @@ def read_bytes(path: Path | str, max_bytes: int, wanted: str) -> bytes:
 
 
 def read_text(path: Path | str, max_bytes: int, wanted: str, *, encoding: str = "utf-8") -> str:
-    """The content of a text file, with line ends \\n. Raises as `open_file`, and DamagedFile for
-    another encoding.
+    """The content of a text file, with line ends \\n.
+
+    Raises as `open_file`, and DamagedFile for another encoding.
     """
     with faults_of(path, wanted):
         text = read_bytes(path, max_bytes, wanted).decode(encoding)

@@ -35,8 +35,9 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 
 @dataclass(frozen=True)
 class Call:
-    """One file to read: function(path, *arguments). The module of the function should not import
-    torch.
+    """One file to read: function(path, *arguments).
+
+    The module of the function should not import torch.
     """
 
     function: Callable[..., Any]
@@ -159,18 +160,14 @@ _working = False  # True in a worker
 
 
 def allow(memory: int, seconds: float = 0.0) -> None:
-    """Raise the limits of the running call by bytes and seconds, for a file whose header shows an
-    acceptable size.
-    """
+    """Raise the limits of the running call by bytes and seconds, for a large file."""
     if _working:
         left, _ = signal.getitimer(signal.ITIMER_PROF)
         _limit(resource.getrlimit(resource.RLIMIT_DATA)[0] + memory, left + seconds)
 
 
 def _serve(end: int) -> None:
-    """Run the requests, each a current folder and a list of calls, until the connection is
-    closed.
-    """
+    """Run requests, each a folder and a list of calls, until the connection is closed."""
     global _working
     _working = True
     package = ModuleType("nmr")  # for nmr.obj: nmr's __init__ would import torch

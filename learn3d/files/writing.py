@@ -63,8 +63,9 @@ def _sync(path: Path) -> None:
 
 
 def check_target(path: Path, option: str, *, folder: bool = False) -> None:
-    """Raise OSError if `path` cannot be written. To be called before long computations; it leaves
-    no files.
+    """Raise OSError if `path` cannot be written.
+
+    To be called before long computations; it leaves no files.
 
     folder: `path` is a folder, which need not exist. option: the command's option for the path,
     for the message.
@@ -83,8 +84,9 @@ def check_target(path: Path, option: str, *, folder: bool = False) -> None:
 
 
 def give_second_name(path: Path, name: Path) -> None:
-    """Make `name` a hard link to `path`, or a copy if the file system has no hard links. Replaces
-    a file `name`.
+    """Make `name` a hard link to `path`, or a copy if the file system has no hard links.
+
+    Replaces a file `name`.
     """
     with replacing(name, sync=True) as temporary:
         try:

@@ -157,9 +157,7 @@ class MeshMethod(Method):
         return Meshes(vertices, self.faces)
 
     def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images, on the method's
-        device.
-        """
+        """Codes float32 [B, C] and vertices float32 [B, V, 3] of stored images."""
         with self.autocast():
             codes = self.encoder(self._pixels(images))
             vertices = self.generator(codes)
@@ -182,9 +180,7 @@ class MeshMethod(Method):
 
     @property
     def memory_format(self) -> torch.memory_format:
-        """Layout of the convolutions: channels last is faster in bf16, and 7 % of a step slower
-        in fp32 (AVX2).
-        """
+        """Layout of the convolutions: channels last is faster in bf16, slower in fp32 (AVX2)."""
         return torch.channels_last if self.precision == "bf16" else torch.contiguous_format
 
     def _pixels(self, images: Tensor) -> Tensor:
@@ -196,8 +192,7 @@ class MeshMethod(Method):
             return network(self._pixels(images)).float()
 
     def flip_every_second(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Flip every second image if shapes are symmetric: the images, and bool [B], whether each
-        is flipped.
+        """Flip every second image if shapes are symmetric. Returns images, and bool [B].
 
         A flipped image of a symmetric object shows the same shape, so mask and pose stay the same.
         """

@@ -1,6 +1,4 @@
-"""Base classes of every method: settings, losses of a training step, prediction of shapes from
-images.
-"""
+"""Base classes of every method: settings, losses of a step, shapes from images."""
 
 from __future__ import annotations
 
@@ -26,8 +24,9 @@ Losses: TypeAlias = dict[str, tuple[float, Tensor]]
 
 @checked
 class MethodSettings:
-    """Settings of a method. A run also reads the values below, which subclasses override, some by
-    properties.
+    """Settings of a method.
+
+    A run also reads the values below, which subclasses override, some by properties.
     """
 
     # These values have no annotation, so they are no fields: nobody can set them.
@@ -44,9 +43,7 @@ class MethodSettings:
         """Raise ValueError if the settings do not fit a run of this length and batch size."""
 
     def for_iterations(self, iterations: int) -> MethodSettings:
-        """These settings for a run of another length: phases of the training keep their share of
-        it.
-        """
+        """These settings for a run of another length; phases keep their share of it."""
         return self
 
     def for_data(self, info: DatasetInfo) -> MethodSettings:
@@ -87,9 +84,7 @@ class Grids:
         return [grid_surface(grid, level=self.threshold) for grid in self.occupancy]
 
     def occupied(self, size: int) -> Tensor:
-        """Bool [B, size, size, size], whether the mean of a larger cell is above the threshold;
-        size divides s.
-        """
+        """Bool [B, size, size, size]: whether the mean of larger cells is above the threshold."""
         return (
             F.avg_pool3d(self.occupancy[:, None], self.occupancy.shape[-1] // size)[:, 0]
             > self.threshold
@@ -97,8 +92,10 @@ class Grids:
 
 
 class Method(abc.ABC):
-    """One method in training or in use. A subclass creates networks and optimizers and computes
-    losses; `training.take_step` takes the steps.
+    """One method in training or in use.
+
+    A subclass creates networks and optimizers and computes losses; `training.take_step` takes the
+    steps.
 
     Losses depend only on the batch, the step, the parameters and buffers of `networks`, and
     torch's global random state. A run that is resumed from these, `optimizers` and `ema` is
@@ -135,19 +132,17 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def create_networks(self) -> dict[str, nn.Module]:
-        """The networks by name, for `settings` and `info`. Raises ValueError if these contradict
-        each other.
+        """The networks by name, for `settings` and `info`.
+
+        Raises ValueError if these contradict each other.
         """
 
     @abc.abstractmethod
     def create_optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Optimizers by name, with the learning rates of the settings; the loop applies the
-        schedule.
-        """
+        """Optimizers by name, with full learning rates; the loop applies the schedule."""
 
     def losses(self, batch: Batch, step: int) -> Losses:
-        """The losses of training step `step` (from 1), whose weighted sum all optimizers minimise
-        together.
+        """The losses of step `step` (from 1), whose weighted sum all optimizers minimise.
 
         Parameters that no loss of the step depends on do not change.
         """
@@ -156,8 +151,7 @@ class Method(abc.ABC):
         )
 
     def phases(self, batch: Batch, step: int) -> Iterator[tuple[Losses, tuple[str, ...]]]:
-        """The phases of training step `step`: the losses of each, and the names of the optimizers
-        that minimise them.
+        """The phases of a step: the losses of each, and the optimizers that minimise them.
 
         A step has one phase, `losses` with all optimizers, unless a subclass yields others. The
         optimizers of a phase have stepped when the next one is computed.
@@ -166,9 +160,7 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def encode(self, images: Tensor) -> Tensor:
-        """Shape codes float32 [B, C], on the method's device, of stored images uint8 [B, 4, S,
-        S].
-        """
+        """Shape codes float32 [B, C] of stored images uint8 [B, 4, S, S]."""
 
     @abc.abstractmethod
     def decode(self, codes: Tensor) -> Meshes | Grids:
@@ -181,12 +173,10 @@ class Method(abc.ABC):
         return None
 
     def start_from_pretrained(self) -> None:  # noqa: B027
-        """Load the file of pretrained weights that the settings name, if any; called at the start
-        of a run."""
+        """Load the pretrained weights that the settings name; called at the start of a run."""
 
     def check_batch(self, batch: Batch) -> None:  # noqa: B027
-        """Raise ValueError if the method cannot learn from batches like this one; called at the
-        start of a run."""
+        """Raise ValueError if the method cannot learn from such batches; called at the start."""
 
     def ema_weights(self) -> contextlib.AbstractContextManager[None]:
         """Context in which the networks have their EMA weights, if the run keeps an EMA."""
@@ -206,9 +196,7 @@ class Method(abc.ABC):
             self.networks.train(was_training)
 
     def autocast(self) -> torch.autocast:
-        """Context in which the networks run at the method's precision; losses and rendering
-        belong outside it.
-        """
+        """Context for networks at the method's precision; losses and rendering belong outside."""
         return torch.autocast(
             self.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16"
         )

@@ -32,8 +32,10 @@ class MultiView(MeshMethod):
     settings: MultiViewSettings
 
     def losses(self, batch: Batch, step: int) -> Losses:
-        """Render the shapes of both views, a and b, in both views. The loss is the mean of the
-        four IoU losses plus lambda_smooth times the mean smoothness of the shapes.
+        """Render the shapes of both views, a and b, in both views.
+
+        The loss is the mean of the four IoU losses plus lambda_smooth times the mean smoothness
+        of the shapes.
         """
         pairs = len(batch) // 2
         vertices = self.predict(batch.images)[1].cpu()
@@ -46,9 +48,7 @@ class MultiView(MeshMethod):
 
 @checked
 class ManyViewsSettings(MeshSettings):
-    """Networks and weights of the losses; a loss with weight 0 is not computed, but depth and
-    slope are together.
-    """
+    """Networks and weights of the losses; a loss with weight 0 is not computed."""
 
     sampling = "groups"
     encoder: EncoderName = "conv-light"

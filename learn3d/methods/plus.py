@@ -1,5 +1,4 @@
-"""Plus: the pose-invariant method with mirror symmetry and a loss at novel views, from masks of
-other objects.
+"""Plus: the pose-invariant method with mirror symmetry and a loss at novel views.
 
 The supervision is that of Peng et al. 2020: single images, each with its mask and its pose.
 """

@@ -1,6 +1,4 @@
-"""The pose-invariant method (Peng et al. 2020), and Vanilla-AE: the same without the losses on
-codes.
-"""
+"""The pose-invariant method (Peng et al. 2020), and Vanilla-AE without losses on codes."""
 
 from __future__ import annotations
 
@@ -74,9 +72,7 @@ class PoseInvariantSettings(MeshSettings):
 
 
 class PoseInvariant(MeshMethod):
-    """Encoder, mesh generator and, unless it is Vanilla-AE, a pose discriminator on the shape
-    codes.
-    """
+    """Encoder, mesh generator and, but for Vanilla-AE, a pose discriminator on the codes."""
 
     settings: PoseInvariantSettings
 
@@ -106,9 +102,7 @@ class PoseInvariant(MeshMethod):
         return losses
 
     def smoothness_weight(self, step: int) -> float:
-        """The weight of the smoothness loss in step `step`: it decays exponentially to
-        `lambda_smooth_end`.
-        """
+        """The weight of smoothness in a step: it decays exponentially to `lambda_smooth_end`."""
         first, last = self.settings.lambda_smooth, self.settings.lambda_smooth_end
         done = min(1.0, (step - 1) / max(1, self.schedule.iterations - 1))
         return first ** (1 - done) * last**done

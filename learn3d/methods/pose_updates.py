@@ -28,8 +28,7 @@ def update_steps(iterations: int, count: int) -> tuple[int, ...]:
 
 @torch.no_grad()
 def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
-    """Reweight the candidates of all images of `dataset`; returns the share of images whose best
-    pose changed.
+    """Reweight the candidates of all images. Returns the share of changed best poses.
 
     The weights are softmax(IoU / TEMPERATURE + log p + b) over the candidates, with masks and
     renderings of SIZE pixels. p is the candidate's probability in the table, at least

@@ -1,6 +1,4 @@
-"""PrGAN (Gadelha et al. 2017): a GAN of voxel grids trained on silhouettes, and an encoder
-trained afterwards.
-"""
+"""PrGAN (Gadelha et al. 2017): a GAN of voxel grids, then an encoder."""
 
 from __future__ import annotations
 
@@ -40,9 +38,7 @@ FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerC
 
 @checked
 class PrGANSettings(MethodSettings):
-    """Learning rates, widths, phases and cameras; the defaults are the published code's for
-    airplanes.
-    """
+    """Learning rates, widths, phases and cameras, as in the published code for airplanes."""
 
     image_size = SILHOUETTE_SIZE
     reads_view_ids = True
@@ -139,8 +135,9 @@ class PrGAN(Method):
         return ((z[:, -1] + 1) * (self.views.count / 2)).long().clamp(0, self.views.count - 1)
 
     def generate(self, z: Tensor) -> Tensor:
-        """Silhouettes [B, 64, 64] of generated shapes, for z [B, 201] on the CPU. In float32:
-        bf16 is slow here.
+        """Silhouettes [B, 64, 64] of generated shapes, for z [B, 201] on the CPU.
+
+        In float32: bf16 is slow here.
         """
         codes = z[:, :SHAPE_CODE].to(self.device, non_blocking=True)
         with torch.autocast(self.device.type, enabled=False):
@@ -201,9 +198,7 @@ class PrGAN(Method):
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> Tensor:
-        """Mean probability, in evaluation mode, that the discriminator assigns to the right
-        answers: a scalar.
-        """
+        """Mean probability that the discriminator, in evaluation mode, gives right answers."""
         self.networks.eval()
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
@@ -212,9 +207,7 @@ class PrGAN(Method):
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
-    """Sum over all features [B, ...] of the squared differences of their batch means and batch
-    variances.
-    """
+    """Sum over features [B, ...] of squared differences of batch means and variances."""
     means, variances = [], []  # torch.var takes ten times as long over the first axis
     for features in (of_real, of_fake):
         mean = all_reduce_mean(features.mean(0))
@@ -224,8 +217,7 @@ def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
 
 
 def check_views(poses: Poses, view_ids: Tensor, views: ViewCircle) -> None:
-    """Raise a ValueError unless every camera is that of its view class, as PrGAN has a fixed
-    table of views.
+    """Raise a ValueError unless every camera is that of its view class.
 
     Tolerances: half a degree for angles, half a percent for the distance, 0.1 degrees for half
     the field of view.

@@ -1,5 +1,4 @@
-"""View prior learning (VPL; Kato and Harada 2019), as re-implemented by Peng et al. 2020 and as
-published.
+"""View prior learning (VPL; Kato and Harada 2019), as published and by Peng et al. 2020.
 
 A discriminator learns to separate silhouettes of predicted shapes at the view of the input image
 ("real") from those at other views ("fake"); encoder and generator learn to fool it.
@@ -130,9 +129,7 @@ class VPLSettings(MeshSettings):
 
 
 class VPL(MeshMethod):
-    """Encoder, mesh generator and, unless it is the baseline, a discriminator of silhouettes and
-    their views.
-    """
+    """Encoder, mesh generator and, but for the baseline, a discriminator of silhouettes."""
 
     settings: VPLSettings
 
@@ -244,9 +241,7 @@ class VPL(MeshMethod):
         seen_at: Tensor,
         own: Tensor,
     ) -> Tensor:
-        """Logits for silhouettes [b,S,S] of the shapes `own` of a whole batch, seen at its views
-        `seen_at`.
-        """
+        """Logits for silhouettes [b,S,S] of the shapes `own`, seen at the views `seen_at`."""
         silhouettes = silhouettes.to(self.device, non_blocking=True)
         if self.settings.discriminator == "dcgan":
             with self.autocast():
@@ -261,8 +256,7 @@ class VPL(MeshMethod):
 
 
 def other_views(batch: Batch, choice: Literal["random", "reversed", "next"]) -> Tensor:
-    """For each sample the index of the sample whose view is its other view, int64 [B]; see
-    VPLSettings.other_views.
+    """The sample whose view is the other view of each sample, int64 [B].
 
     "random" uses torch's global generator, and takes any sample if the batch has one view class.
     As published, "reversed" gives the middle sample of an odd batch its own view, and "next" does

@@ -93,8 +93,9 @@ class CentredConvEncoder(LightConvEncoder):
 
 
 class ViewClassifier(nn.Module):
-    """Images [B,4,64,64], as for an encoder -> logits [B,K] over K view classes. Objects are
-    scaled to one size.
+    """Images [B,4,64,64], as for an encoder -> logits [B,K] over K view classes.
+
+    Objects are scaled to one size.
 
     0.2 million weights. Unpublished.
     """

@@ -44,8 +44,9 @@ class DoublingConvolution(nn.ConvTranspose3d):
 
 
 class _Double(torch.autograd.Function):
-    """DoublingConvolution to one channel. Each cell becomes eight, so it is a convolution with
-    eight output channels.
+    """DoublingConvolution to one channel.
+
+    Each cell becomes eight, so it is a convolution with eight output channels.
 
     Along an axis, cell 2i is w[3] x[i-1] + w[1] x[i], and cell 2i + 1 is w[2] x[i] + w[0] x[i+1].
     """

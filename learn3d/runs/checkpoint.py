@@ -281,8 +281,9 @@ def optimizer_tensors(name: str, optimizer: torch.optim.Optimizer) -> dict[str, 
 def restore_optimizer(
     name: str, optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], source: Path
 ) -> None:
-    """Restore the tensors of `optimizer_tensors`. Raises ValueError if they do not fit the
-    parameters.
+    """Restore the tensors of `optimizer_tensors`.
+
+    Raises ValueError if they do not fit the parameters.
 
     Fused kernels index parameter, gradient and state by position in memory, so each tensor must
     have its parameter's shape, and is copied to its parameter's memory layout.

@@ -148,8 +148,9 @@ def _all_reduce(values: Tensor) -> Tensor:
 
 
 class _AllReduce(torch.autograd.Function):
-    """The sum over all ranks. The loss of every rank depends on it, so its gradient is the sum of
-    their gradients.
+    """The sum over all ranks.
+
+    The loss of every rank depends on it, so its gradient is the sum of their gradients.
     """
 
     @staticmethod

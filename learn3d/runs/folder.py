@@ -72,10 +72,9 @@ def is_run(folder: Path) -> bool:
 
 
 def check_can_start(folder: Path, overwrite: bool) -> None:
-    """Raise a ValueError unless a new run may begin in a folder: an empty one, or with
-    `overwrite` any folder.
+    """Raise a ValueError unless a new run may begin in a folder.
 
-    Even then no file may have the name of a run's file, unless it belongs to a run. Only rank 0
+    An empty folder may, or with `overwrite` any. Even then no file may have the name of a run's file, unless it belongs to a run. Only rank 0
     checks.
     """
     if rank() > 0:
@@ -135,9 +134,7 @@ def resume_command(folder: Path) -> str:
 
 @contextlib.contextmanager
 def advice_on_errors(folder: Path) -> Iterator[None]:
-    """Context that adds the last checkpoint and the command to resume to errors that end the run
-    in `folder`.
-    """
+    """Context that adds the last checkpoint and the command to resume to errors."""
     try:
         yield
     except (FloatingPointError, OSError) as error:

@@ -31,8 +31,9 @@ _SILENT = dict.fromkeys(("add_scalar", "add_image", "flush", "close"), lambda *_
 
 
 class RunLog(contextlib.ExitStack):
-    """The log of a run, a context manager. Metrics of steps after `start`, from before an
-    interruption, are dropped.
+    """The log of a run, a context manager.
+
+    Metrics of steps after `start`, from before an interruption, are dropped.
 
     On a terminal it shows a progress bar with the losses and the time left; elsewhere it prints a
     line now and then. Shown losses are means over the last steps that computed them. Raises

@@ -201,9 +201,7 @@ def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[Objec
 
 
 def format_table(results: Sequence[Result]) -> str:
-    """The results as a text table: a line per result, then the mean over categories of each
-    method.
-    """
+    """The results as a text table, then the mean over categories of each method."""
     rows = [("class", "method", "seed", "iterations", "images", *HEADERS)]
     for r in results:
         about = (r.category, f"{r.method} ({r.preset})", str(r.seed), str(r.step), str(r.images))

@@ -1,6 +1,4 @@
-"""A run: its state, saved and restored bit-identically, the first lines of its log and its
-summary.
-"""
+"""A run: its state, saved and restored bit-identically, and its summary."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -98,9 +96,7 @@ class Run:
     def describe(
         self, progress: Progress, train_set: ViewDataset, val_set: ViewDataset, threads: ThreadTuner
     ) -> str:
-        """Method, data and device of a run that begins or continues; mirror plane and generator
-        if masks decide.
-        """
+        """Method, data and device of a run; mirror plane and generator if masks decide."""
         config = self.config
         info = self.info
         verb = f"resuming at step {progress.step}" if progress.step else "training"
@@ -119,8 +115,9 @@ class Run:
         return text
 
     def _restore(self, tensors: dict[str, Tensor], metadata: Metadata) -> Progress:
-        """Restore the state of a checkpoint. Raises a ValueError that names options or data that
-        differ.
+        """Restore the state of a checkpoint.
+
+        Raises a ValueError that names options or data that differ.
         """
         config = self.config
         before = metadata.config
@@ -156,8 +153,7 @@ class Run:
         return metadata.progress
 
     def save(self, progress: Progress, log: RunLog) -> None:
-        """Flush the metrics, then write last.safetensors: networks, EMA, optimizers, random state
-        and `Metadata`.
+        """Flush the metrics, then write last.safetensors with all that a resumption needs.
 
         The checkpoint before it becomes previous.safetensors. Neither file is ever incomplete.
         """

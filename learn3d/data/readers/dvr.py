@@ -79,8 +79,9 @@ def load(
 
 
 def _category_folder(folder: Path, category: str) -> Path:
-    """The folder of a category (name or synset id) in `folder`. Raises MissingFile with the
-    existing ones.
+    """The folder of a category (name or synset id) in `folder`.
+
+    Raises MissingFile with the existing ones.
     """
     path = folder / synset_of(category)
     if not path.is_dir():
@@ -107,8 +108,9 @@ def _build(files: Files, cameras: list[np.ndarray], points: np.ndarray) -> tuple
 
 
 def _fit_world(path: Path, cameras: list[np.ndarray]) -> np.ndarray:
-    """Orthogonal matrix [3, 3] from the cameras' world to the object frame. DamagedFile if they
-    are not Kato's.
+    """Orthogonal matrix [3, 3] from the cameras' world to the object frame.
+
+    DamagedFile if they are not Kato's.
     """
     for name, matrix in zip(_MATRICES, cameras, strict=True):
         if matrix.shape != (4, 4):

@@ -120,8 +120,9 @@ def load(
 
 
 def check_poses(path: Path, poses: np.ndarray, wanted: str) -> np.ndarray:
-    """Return poses float64 [V, 3] (azimuth, elevation, distance). Raises DamagedFile if one is
-    out of range.
+    """Return poses float64 [V, 3] (azimuth, elevation, distance).
+
+    Raises DamagedFile if one is out of range.
     """
     sound = LookAtPoses(*torch.from_numpy(poses.T), HALF_FOV_DEG).in_range().numpy()
     if not sound.all():

@@ -1,5 +1,4 @@
-"""Kato's layout (Kato et al. 2018): 24 views of each object, 64x64, in two npz files per category
-and split.
+"""Kato's layout (Kato et al. 2018): 24 views of each object, in two npz files per split.
 
 - Files are `{synset}_{split}_images.npz`, uint8 [N, 24, 4, 64, 64], and `{synset}_{split}_voxels.npz`, bool
   [N, 32, 32, 32]; each holds the single array 'arr_0'.
@@ -45,8 +44,9 @@ def split_paths(folder: Path | str, category: str, split: str) -> tuple[Path, Pa
 def load(
     folder: Path | str, category: str, split: str, *, on_fault: FaultHandler = refuse
 ) -> ViewDataset:
-    """Read a split. Sample `object * 24 + view` is one view of one object; the view classes are
-    the 24 views.
+    """Read a split.
+
+    Sample `object * 24 + view` is one view of one object; the view classes are the 24 views.
     """
     paths = split_paths(folder, category, split)
     images = attempt(on_fault, _read, paths[0], "images", None)
@@ -67,9 +67,7 @@ def load(
 def from_arrays(
     images: np.ndarray, voxels: np.ndarray | None, category: str, split: str
 ) -> ViewDataset:
-    """The data set of images uint8 [N, 24, 4, 64, 64] (or [N * 24, ...]) and voxels bool [N, 32,
-    32, 32].
-    """
+    """The data set of images uint8 [N, 24, 4, 64, 64] and voxels bool [N, 32, 32, 32]."""
     images = images.reshape(-1, 4, IMAGE_SIZE, IMAGE_SIZE)
     count = len(images) // NUM_VIEWS
     view_ids = np.tile(np.arange(NUM_VIEWS), count)
@@ -86,9 +84,7 @@ def from_arrays(
 
 
 def contents(folder: Path | str) -> dict[str, tuple[str, ...]]:
-    """The categories (synset ids or prefixes) of a folder and the splits of each, by the names of
-    its files.
-    """
+    """The categories (synset ids or prefixes) of a folder and their splits, by file names."""
     return find_splits(folder, *(f"*_SPLIT_{kind}.npz" for kind in _ARRAYS))
 
 

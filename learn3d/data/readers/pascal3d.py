@@ -123,8 +123,9 @@ def rotation_cells(rotations: np.ndarray) -> np.ndarray:
 
 
 def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Class int64 [M] in 0 .. K-1 of each rotation [M, 3, 3], and the K names. Classes are cells
-    of `training`.
+    """Class int64 [M] in 0 ..
+
+    K-1 of each rotation [M, 3, 3], and the K names. Classes are cells of `training`.
     """
     # The trace of A^T B grows as the angle between the rotations A and B falls.
     ids, kept = training_classes(
@@ -161,8 +162,9 @@ def _paths(folder: Path | str, category: str, split: str) -> list[Path]:
 
 
 def _parse(path: Path, images: Any, on_fault: FaultHandler) -> tuple[list[np.ndarray], ...] | None:
-    """Check the arrays of a file. Returns N images uint8 [H, W, 3] and the arrays of `_SHAPES`;
-    None if one is wrong.
+    """Check the arrays of a file.
+
+    Returns N images uint8 [H, W, 3] and the arrays of `_SHAPES`; None if one is wrong.
 
     images: the result of a worker.
     """
@@ -224,8 +226,6 @@ def _training_rotations(path: Path) -> np.ndarray:
 
 
 def _nearest(masks: np.ndarray, size: int) -> np.ndarray:
-    """Resize masks uint8 [M, S, S] by nearest neighbour, as torch.nn.functional.interpolate does
-    by default.
-    """
+    """Resize masks uint8 [M, S, S] by nearest neighbour, as torch's interpolate does."""
     rows = np.arange(size) * masks.shape[1] // size
     return masks[:, rows[:, None], rows]

@@ -185,8 +185,9 @@ def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], on_fault: Faul
 
 
 def read_photo_table(table: Path, on_fault: FaultHandler) -> list[Photo]:
-    """The valid rows of a table; faults of the others are reported. Without a table, all images
-    without poses.
+    """The valid rows of a table; faults of the others are reported.
+
+    Without a table, all images without poses.
 
     Raises MissingFile, and DamagedFile if the file is not a table of photographs.
     """
@@ -234,8 +235,9 @@ def _unlisted(table: Path, photos: list[Photo]) -> str | None:
 
 
 def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
-    """The split of each object. Without splits in the table, a hash of the names selects 20 %
-    test and 10 % val.
+    """The split of each object.
+
+    Without splits in the table, a hash of the names selects 20 % test and 10 % val.
 
     Raises DamagedFile if an object is in two splits or in none, or if there are too few objects
     to split.
