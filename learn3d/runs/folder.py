@@ -74,8 +74,8 @@ def is_run(folder: Path) -> bool:
 def check_can_start(folder: Path, overwrite: bool) -> None:
     """Raise a ValueError unless a new run may begin in a folder.
 
-    An empty folder may, or with `overwrite` any. Even then no file may have the name of a run's file, unless it belongs to a run. Only rank 0
-    checks.
+    An empty folder may, or with `overwrite` any. Even then no file may have the name of a run's
+    file, unless it belongs to a run. Only rank 0 checks.
     """
     if rank() > 0:
         return
