@@ -48,7 +48,9 @@ def read_objects(
     """
     count = len(files(names[0]).views)
     images = np.empty((len(names) * count, 4, image_size, image_size), np.uint8)
-    masks = np.empty((len(names) * count, MASK_SIZE, MASK_SIZE), np.uint8)
+    masks = None
+    if image_size != MASK_SIZE:
+        masks = np.empty((len(images), MASK_SIZE, MASK_SIZE), np.uint8)
     sound, poses, shapes = [], [], []
     calls = ([cameras, shape, *views] for cameras, shape, views in map(files, names))
     read = tqdm(read_all(calls), title, len(names), disable=not is_watched(), unit="object")
@@ -67,7 +69,9 @@ def read_objects(
             on_fault(OddFile(wanted.shape.path, "the grid is empty"))
         pairs = zip(wanted.views, views, strict=True)
         for row, (call, view) in enumerate(pairs, len(sound) * count):
-            images[row], masks[row], brightest = view
+            images[row], mask, brightest = view
+            if masks is not None:
+                masks[row] = mask
             if brightest < 128:
                 message = f"its mask is empty: the brightest of its values 0 .. 255 is {brightest}"
                 on_fault(OddFile(call.path, message))
@@ -77,8 +81,7 @@ def read_objects(
     if not sound:
         raise DamagedFile(folder, "no object of the split is whole")
     rows = len(sound) * count
-    masks = None if image_size == MASK_SIZE else masks[:rows]
-    return Objects(sound, images[:rows], masks, poses, shapes)
+    return Objects(sound, images[:rows], None if masks is None else masks[:rows], poses, shapes)
 
 
 def check_lists(
