@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
+
+from children import environment
 
 
 @contextlib.contextmanager
 def dask_cluster() -> Iterator[tuple[str, subprocess.Popen]]:
     """Address and process of the scheduler. It gives a task up when its first worker dies; workers are replaced."""
-    environment = {
-        "PYTHONPATH": os.pathsep.join(sys.path),
-        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
-    }
     pipes = {
         "stdin": subprocess.PIPE,
         "stdout": subprocess.PIPE,
         "stderr": subprocess.DEVNULL,
         "text": True,
     }
-    with subprocess.Popen(
-        [sys.executable, __file__], **pipes, env=os.environ | environment
-    ) as process:
+    failures = environment(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
+    with subprocess.Popen([sys.executable, __file__], **pipes, env=failures) as process:
         yield process.stdout.readline().strip(), process
         process.stdin.close()
 

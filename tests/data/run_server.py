@@ -18,18 +18,12 @@ import time
 import traceback
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import learn3d
+from children import environment
+
 from learn3d.config import TrainConfig, config_to_dict
 
-ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "CUDA_VISIBLE_DEVICES": "",
-}
 EVENTS = {"open", "os.rename", "os.remove", "os.link", "os.mkdir", "os.rmdir"}
 LIMIT = 240.0  # seconds for a run; then it exits with status 1 and its log shows all stacks
 BEST = 4  # the last validated step whose networks are called the best
@@ -43,16 +37,11 @@ class RunServer:
     """
 
     def __enter__(self) -> RunServer:
-        packages = [
-            str(Path(learn3d.__file__).parents[1]),
-            *filter(None, [os.environ.get("PYTHONPATH")]),
-        ]
-        environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
         self._process = subprocess.Popen(
             [sys.executable, __file__],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=environment,
+            env=environment(),
             text=True,
         )
         return self

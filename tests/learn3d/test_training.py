@@ -2,40 +2,34 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import shutil
 import signal
+from pathlib import Path
 
 import pytest
 import torch
-from steps import backpropagate
+from steps import INFO, backpropagate, make_method
 
 import nmr
 from learn3d import training
 from learn3d.config import TrainConfig
-from learn3d.data.dataset import DatasetInfo, ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.sampling import shuffled_epochs
-from learn3d.methods import create_method
-from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint
 from learn3d.training import take_step, train
 
 VANILLA = "peng2020-kato-vanilla"
 
 
-def snapshot(network: torch.nn.Module) -> list[torch.Tensor]:
-    return [p.detach().clone() for p in network.parameters()]
-
-
-def changed(network: torch.nn.Module, before: list[torch.Tensor]) -> bool:
-    return any(not torch.equal(p, q) for p, q in zip(network.parameters(), before, strict=True))
+def changed(network: torch.nn.Module, before: torch.nn.Module) -> bool:
+    return not all(map(torch.equal, network.parameters(), before.parameters()))
 
 
 def make_step(config: TrainConfig, data: ViewDataset, step=take_step):
     """Networks by name, and a function that takes one step with them."""
-    method = create_method(
-        config.settings, DatasetInfo(24, inverted=False), device="cpu", precision="fp32", seed=0
-    )
+    method = make_method(config.settings)
     batch = data.batch(torch.tensor([0, 25, 50, 7]))
     return method.networks, lambda iteration: step(method, batch, iteration)
 
@@ -43,7 +37,7 @@ def make_step(config: TrainConfig, data: ViewDataset, step=take_step):
 def test_alternation(tiny_config, tiny_set, tmp_path) -> None:
     networks, step = make_step(tiny_config(tmp_path), tiny_set)
     for iteration in (1, 2, 3):
-        before = {name: snapshot(network) for name, network in networks.items()}
+        before = copy.deepcopy(networks)
         losses = step(iteration)
         assert changed(networks["encoder"], before["encoder"])
         assert changed(networks["generator"], before["generator"])
@@ -66,16 +60,16 @@ def test_classification_reaches_the_discriminator_and_confusion_the_encoder_only
     tiny_config, tiny_set, tmp_path
 ) -> None:
     for iteration, weight, changed in (
-        (1, "lambda_classification", ()),
-        (2, "lambda_adversarial", ("encoder",)),
+        (1, "lambda_classification", []),
+        (2, "lambda_adversarial", ["encoder"]),
     ):
         with_loss = gradients(tiny_config(tmp_path), tiny_set, iteration)
         without = gradients(tiny_config(tmp_path, **{weight: 0.0}), tiny_set, iteration)
-        for name in ("encoder", "generator"):
-            same = all(
-                torch.equal(a, b) for a, b in zip(with_loss[name], without[name], strict=True)
-            )
-            assert same == (name not in changed)
+        assert changed == [
+            name
+            for name in ("encoder", "generator")
+            if not all(map(torch.equal, with_loss[name], without[name]))
+        ]
         assert bool(with_loss["discriminator"]) == (iteration == 1)
         assert not without["discriminator"]
     networks, step = make_step(tiny_config(tmp_path, preset=VANILLA), tiny_set)
@@ -94,12 +88,8 @@ def test_printed_losses_differ_from_those_of_the_published_code(
 @pytest.mark.parametrize(("samples", "batch"), [(24, 5), (24, 24), (7, 20)])
 def test_batches_go_through_every_epoch_completely(samples: int, batch: int) -> None:
     def draw(seed: int) -> torch.Tensor:
-        return torch.cat(
-            [
-                shuffled_epochs(samples, batch, seed=seed, step=step)
-                for step in range(1, 3 * samples + 1)
-            ]
-        )
+        steps = range(1, 3 * samples + 1)
+        return torch.cat([shuffled_epochs(samples, batch, seed=seed, step=step) for step in steps])
 
     drawn = draw(0)
     epochs = drawn.reshape(-1, samples)
@@ -112,9 +102,8 @@ def test_a_finished_run_leaves_everything(finished_run, read_metrics) -> None:
     names = {path.name for path in finished_run.iterdir()}
     assert {"config.json", "last.safetensors", "best.safetensors"} < names
     metrics = read_metrics(finished_run)
-    assert [(m["step"], m["split"]) for m in metrics] == [(s, "train") for s in (1, 2, 3, 4)] + [
-        (4, "val")
-    ]
+    assert [m["step"] for m in metrics] == [1, 2, 3, 4, 4]
+    assert [m["split"] for m in metrics] == ["train"] * 4 + ["val"]
     assert "confusion" in metrics[1]
     assert 0 <= metrics[-1]["voxel_iou"] <= 1
     assert "mmd" not in metrics[-1], (
@@ -153,12 +142,14 @@ def test_resume_finds_its_data_in_another_folder(
     tiny_config, tiny_folder, finished_run, tmp_path
 ) -> None:
     shutil.copytree(tiny_folder, tmp_path / "moved")
-    before = {path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()}
+
+    def times() -> dict[Path, int]:
+        return {p: p.stat().st_mtime_ns for p in finished_run.rglob("*") if p.is_file()}
+
+    before = times()
     summary = train(tiny_config(finished_run, data=tmp_path / "moved"), resume=True)
     assert (summary.progress.step, summary.finished, summary.progress.best_step) == (4, True, 4)
-    assert {
-        path: path.stat().st_mtime_ns for path in finished_run.rglob("*") if path.is_file()
-    } == before
+    assert times() == before
 
 
 @pytest.mark.parametrize("change", ["images", "poses"])
@@ -273,14 +264,9 @@ def test_empty_masks_are_said_and_nothing_but_empty_ones_refused(
 def test_symmetry_auto_is_the_plane_that_the_data_have(
     preset: str, plane: float | None, fixed: bool
 ) -> None:
-    settings = dataclasses.replace(
-        PRESETS[preset].settings, symmetry="auto", generator="sphere-small"
-    )
-    shape = DatasetInfo(24, inverted=False, mirror_plane_deg=plane)
-    generator = create_method(settings, shape, device="cpu", precision="fp32", seed=0).networks[
-        "generator"
-    ]
-    assert (generator.mirror is not None) == fixed
+    info = dataclasses.replace(INFO, mirror_plane_deg=plane)
+    method = make_method(preset, info, symmetry="auto", generator="sphere-small")
+    assert (method.generator.mirror is not None) == fixed
 
 
 def test_the_plane_is_found_before_the_first_step_and_kept(

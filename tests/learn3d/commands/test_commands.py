@@ -48,12 +48,8 @@ def test_options_reach_the_configuration(tmp_path) -> None:
     ("options", "steps"), [("", 100), ("--iterations 60", 6), ("--warmup-steps 9", 9)]
 )
 def test_the_warm_up_is_at_most_a_tenth_of_a_run(options: str, steps: int) -> None:
-    assert (
-        read(
-            f"--data d --category chair --output o --preset plus {options}"
-        ).config.schedule.warmup_steps
-        == steps
-    )
+    command = read(f"--data d --category chair --output o --preset plus {options}")
+    assert command.config.schedule.warmup_steps == steps
 
 
 @pytest.mark.parametrize("form", ["--output {}", "--output={}"])
@@ -83,10 +79,8 @@ def test_tab_completes_commands_options_and_values_in_bash(command, tmp_path) ->
         ("evaluate", "--cat"): "--category",
     }.items():
         bash = ["bash", "-c", f"{ask}; echo ${{COMPREPLY[*]}}", "learn3d", *words]
-        assert (
-            subprocess.run(bash, cwd=tmp_path, capture_output=True, text=True).stdout.strip()
-            == wanted
-        )
+        done = subprocess.run(bash, cwd=tmp_path, capture_output=True, text=True)
+        assert done.stdout.strip() == wanted
 
 
 @pytest.mark.parametrize(
@@ -157,11 +151,8 @@ def test_help_has_every_preset_and_the_options_of_the_chosen_one(command) -> Non
 def test_the_help_of_evaluate_explains_every_column(command) -> None:
     lines = command("evaluate", "--help")[1].splitlines()
     for column, _ in MEASURES.values():
-        assert [
-            line
-            for line in lines
-            if line.startswith(f"  {column} ") and len(line) > len(column) + 30
-        ], column
+        (explained,) = (line for line in lines if line.startswith(f"  {column} "))
+        assert len(explained) > len(column) + 30
 
 
 @pytest.mark.parametrize(
@@ -279,25 +270,9 @@ def test_the_fit_of_pictures_is_measured(tmp_path, capsys) -> None:
 
 
 def test_interrupting_the_command_saves_and_says_so(tiny_folder, run_folder) -> None:
-    command = [
-        sys.executable,
-        str(TOOLS / "train.py"),
-        "--data",
-        str(tiny_folder),
-        "--category",
-        "airplane",
-    ]
-    command += [
-        "--output",
-        str(run_folder),
-        "--batch-size",
-        "2",
-        "--log-every",
-        "1",
-        "--preset",
-        "vanilla",
-    ]
-    command += ["--encoder", "conv-small", "--generator", "sphere-small"]
+    command = [sys.executable, TOOLS / "train.py", "--data", tiny_folder, "--output", run_folder]
+    command += "--category airplane --preset vanilla --batch-size 2 --log-every 1".split()
+    command += "--encoder conv-small --generator sphere-small".split()
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

@@ -34,7 +34,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_best_networks_are_those_with_the_best_silhouettes(
-    made: Path, tiny_config, read_metrics, tmp_path: Path
+    made: Path, tiny_names, tiny_config, read_metrics, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
     summary = train(
@@ -219,7 +219,7 @@ def test_all_mistakes_are_listed(chairs: Path) -> None:
 
 
 def test_photographs_without_poses_learn_from_an_estimate(
-    chairs: Path, command, tiny_config, tmp_path: Path
+    chairs: Path, command, tiny_names, tiny_config, tmp_path: Path
 ) -> None:
     """A table without numbers keeps objects together; without any table each photograph is of another object."""
     write_rows(chairs, [{k: row[k] for k in ("file", "object")} for row in read_rows(chairs)])

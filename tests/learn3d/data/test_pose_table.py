@@ -109,11 +109,12 @@ def table(tmp_path: Path, tiny_folder: Path) -> Path:
 def test_weights_of_poses_survive_a_stop(
     table: Path,
     tmp_path: Path,
+    tiny_names: None,
     tiny_config: Callable[..., TrainConfig],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Reweighted after the steps 1 and 3, stopped after step 4."""
-    options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2}
+    options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2} | TINY
     assert train(tiny_config(tmp_path / "whole", **options)).finished
     with monkeypatch.context() as patch:
         before_step(patch, 4, lambda: signal.raise_signal(signal.SIGINT))
@@ -131,10 +132,11 @@ def test_a_run_is_measured_with_its_poses_on_its_own_data(
     table: Path,
     run_folder: Path,
     tiny_folder: Path,
+    tiny_names: None,
     tiny_config: Callable[..., TrainConfig],
     monkeypatch,
 ) -> None:
-    train(tiny_config(run_folder, preset="plus-kato", iterations=1, poses=table))
+    train(tiny_config(run_folder, preset="plus-kato", iterations=1, poses=table, **TINY))
     measured = []
 
     def look(method: Plus, dataset: ViewDataset, **options: object) -> Evaluation:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import stub_work
 import torch
 from steps import TINY, make_method
 
@@ -25,7 +26,7 @@ from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices
 from learn3d.evaluation import evaluate
 from learn3d.losses import depth_losses
 from learn3d.methods.multi_view import ManyViews, MultiViewSettings
-from learn3d.studio.make_data.render import DatasetConfig, make_shards
+from learn3d.studio.make_data import render
 from learn3d.training import take_step
 
 
@@ -77,7 +78,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> ViewDataset:
         "test": 1,
         "val": 1,
     }
-    assert make_shards(DatasetConfig(output=folder, shards=True, **options)) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render, "run_tasks", stub_work.run_tasks_here)
+        assert render.make_shards(render.DatasetConfig(output=folder, shards=True, **options)) == 0
     return load_dataset("around", folder, "table", "train")
 
 
@@ -190,6 +193,6 @@ def test_it_learns_the_shapes(dataset: ViewDataset) -> None:
 
 def test_the_layout_is_made_as_shards_alone(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="the layout around are for shards: add --shards"):
-        DatasetConfig(output=tmp_path, category="table", procedural=4, layout="around")
+        render.DatasetConfig(output=tmp_path, category="table", procedural=4, layout="around")
     with pytest.raises(FileNotFoundError, match="has no shards of table, train"):
         load_dataset("around", tmp_path, "table", "train")

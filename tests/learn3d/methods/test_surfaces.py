@@ -85,7 +85,8 @@ def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(
     torch.testing.assert_close(method.generator.symmetrized(both), both)
 
 
-def test_shapes_of_a_data_set_are_refined(finished_run, tiny_folder, tmp_path) -> None:
+def test_shapes_of_a_data_set_are_refined(finished_run, tiny_folder, tmp_path, monkeypatch) -> None:
+    take_steps(monkeypatch, 2, 2)
     options = {"data": tiny_folder, "indices": [3], "mesh_format": "obj"}
     plain = reconstruct_dataset(finished_run, tmp_path / "plain", **options)
     fitted = reconstruct_dataset(finished_run, tmp_path / "fitted", refined=True, **options)

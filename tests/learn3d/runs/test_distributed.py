@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,24 +11,25 @@ from pathlib import Path
 import pytest
 import torch
 import train_ranks
+from children import environment
 from runs import check_same
+from steps import TINY, TINY_PRGAN, TINY_VPL
 
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.presets import PRESETS
 from learn3d.runs import checkpoint, distributed
 
-SMALL = {"encoder": "conv-small", "generator": "sphere-small"}
 RUNS = {  # for each: its preset, options, and the bound of relative differences of losses and weights
-    "proposed": ("peng2020-kato", SMALL, 1e-5),
+    "proposed": ("peng2020-kato", TINY, 1e-5),
     "long": (
         "peng2020-kato",
-        SMALL | {"iterations": 200, "validate_every": 100, "checkpoint_every": 100},
+        TINY | {"iterations": 200, "validate_every": 100, "checkpoint_every": 100},
         1e-5,
     ),
-    "plus": ("plus-kato", SMALL | {"symmetry": "x", "bank_size": 16, "lambda_view": 0.1}, 1e-5),
-    "pairs": ("multi-view-kato", SMALL, 1e-5),
-    "groups": ("many-views-kato", SMALL | {"symmetry": "x", "batch_size": 20}, 1e-5),
-    "vpl": ("peng2020-kato-vpl", {"generator": "sphere-small", "discriminator_channels": 2}, 1e-4),
+    "plus": ("plus-kato", TINY | {"symmetry": "x", "bank_size": 16, "lambda_view": 0.1}, 1e-5),
+    "pairs": ("multi-view-kato", TINY, 1e-5),
+    "groups": ("many-views-kato", TINY | {"symmetry": "x", "batch_size": 20}, 1e-5),
+    "vpl": ("peng2020-kato-vpl", TINY_VPL, 1e-4),
     "vpl-kar": (
         "kato2019-kar",
         {
@@ -41,15 +41,7 @@ RUNS = {  # for each: its preset, options, and the bound of relative differences
         },
         1e-3,
     ),
-    "prgan": (
-        "gadelha2017-kato",
-        {
-            "encoder_from_step": 3,
-            "generator_channels": (2, 2, 2, 1),
-            "discriminator_channels": (2, 2, 2, 2),
-        },
-        1e-3,
-    ),
+    "prgan": ("gadelha2017-kato", TINY_PRGAN, 1e-3),
 }
 OFTEN = {"log_every": 1, "validate_every": 2, "checkpoint_every": 2, "pictures_every": 4}
 
@@ -57,14 +49,10 @@ OFTEN = {"log_every": 1, "validate_every": 2, "checkpoint_every": 2, "pictures_e
 def run(tasks: list[dict], path: Path, ranks: int = 1) -> subprocess.CompletedProcess:
     """Run tasks of `train_ranks` in one process or in several ranks."""
     path.write_text(json.dumps(tasks))
-    torchrun = (
-        ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
-        if ranks > 1
-        else []
-    )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
+    torchrun = torchrun if ranks > 1 else []
     command = [sys.executable, *torchrun, train_ranks.__file__, path]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
+    return subprocess.run(command, capture_output=True, text=True, env=environment(), timeout=500)
 
 
 def task(config: TrainConfig, output: Path, **how: object) -> dict:
@@ -73,10 +61,11 @@ def task(config: TrainConfig, output: Path, **how: object) -> dict:
 
 def losses(metrics: list[dict]) -> dict[int, dict[str, float]]:
     """The losses of each step."""
-    lines = [dict(line) for line in metrics if line["split"] == "train"]
+    named = ("step", "split")
     return {
-        line.pop("step"): {name: value for name, value in line.items() if name != "split"}
-        for line in lines
+        line["step"]: {name: value for name, value in line.items() if name not in named}
+        for line in metrics
+        if line["split"] == "train"
     }
 
 
@@ -127,24 +116,22 @@ def test_two_ranks_learn_what_one_process_learns(folders, read_metrics, name) ->
 def test_a_run_continues_with_another_number_of_ranks(
     folders, tiny_config, tmp_path, read_metrics
 ) -> None:
-    config = tiny_config(tmp_path, **SMALL | OFTEN, batch_size=8, iterations=6)
+    config = tiny_config(tmp_path, **TINY | OFTEN, batch_size=8, iterations=6)
     half = dataclasses.replace(config, iterations=4)
-    for first, then in ((1, 2), (2, 1)):
+    for first in (1, 2):
         output = tmp_path / str(first)
-        for ranks, steps, resume in ((first, half, False), (then, config, True)):
-            ended = run(
-                [task(steps, output, rate=3e-3, resume=resume)], tmp_path / "tasks.json", ranks
-            )
+        for ranks, steps, resume in ((first, half, False), (3 - first, config, True)):
+            tasks = [task(steps, output, rate=3e-3, resume=resume)]
+            ended = run(tasks, tmp_path / "tasks.json", ranks)
             assert ended.returncode == 0, ended.stderr
     one, two = (losses(read_metrics(tmp_path / name)) for name in "12")
     assert list(one) == list(two) == [1, 2, 3, 4, 5, 6]
-    assert all(
-        two[step] == pytest.approx(values, rel=1e-5, abs=1e-5) for step, values in one.items()
-    )
+    for step, values in one.items():
+        assert two[step] == pytest.approx(values, rel=1e-5, abs=1e-5)
 
 
 def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp_path) -> None:
-    config = tiny_config(tmp_path, **SMALL | OFTEN, batch_size=8, iterations=8)
+    config = tiny_config(tmp_path, **TINY | OFTEN, batch_size=8, iterations=8)
     ended = run([task(config, tmp_path / "whole")], tmp_path / "tasks.json", 2)
     assert ended.returncode == 0, ended.stderr
     resume = False
@@ -152,10 +139,8 @@ def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp
         tasks = [task(config, tmp_path / "killed", kill=kill, resume=resume)]
         ended = run(tasks, tmp_path / "tasks.json", 2)
         assert ended.returncode == 1
-        assert f"rank {1 - kill[0]}: another rank ended or does not answer" in ended.stderr, (
-            ended.stderr
-        )
-        assert "--resume" in ended.stderr
+        said = f"rank {1 - kill[0]}: another rank ended or does not answer"
+        assert said in ended.stderr and "--resume" in ended.stderr, ended.stderr
         resume = (tmp_path / "killed" / "config.json").exists()
     ended = run([task(config, tmp_path / "killed", resume=resume)], tmp_path / "tasks.json", 2)
     assert ended.returncode == 0, ended.stderr

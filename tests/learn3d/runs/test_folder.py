@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from children import environment
 
-import learn3d
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.log import RunLog
@@ -32,10 +32,10 @@ with lock_folder(Path(sys.argv[1])):
 
 def test_a_folder_in_use_is_refused_and_a_killed_process_does_not_hold_it(tmp_path) -> None:
     folder = tmp_path / "run"
-    path = [str(Path(learn3d.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path)}
     command = [sys.executable, "-c", HOLDER, str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, cwd=tmp_path) as holder:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, env=environment(), cwd=tmp_path
+    ) as holder:
         assert holder.stdout.readline() == b"mine\n"
         with pytest.raises(
             OSError, match=r"another process works in .*run; wait for it, or stop it"
@@ -65,13 +65,8 @@ def test_the_last_two_checkpoints_are_kept(tiny_run, tmp_path, monkeypatch, link
 
 def make_run(folder: Path, config: bool = True) -> Path:
     """The files of a run, and one of the user's."""
-    for name in (
-        "last.safetensors",
-        "metrics.jsonl",
-        "pictures/000010.png",
-        "pictures/holiday.jpg",
-        ".x.partial",
-    ):
+    names = ("last.safetensors", "metrics.jsonl", "pictures/000010.png", "pictures/holiday.jpg")
+    for name in (*names, ".x.partial"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(name)
     if config:
@@ -168,13 +163,9 @@ def test_elsewhere_it_prints_few_lines_with_means_of_losses_that_take_turns(
     tmp_path, tiny_config, capsys
 ) -> None:
     with RunLog(tiny_config(tmp_path, iterations=100), start=4) as log:
+        odd, even = {"total": 3.0, "classification": 2.0}, {"total": 1.0, "confusion": 1.0}
         for step in range(5, 101):
-            log.step(
-                step,
-                {"total": 3.0, "classification": 2.0}
-                if step % 2
-                else {"total": 1.0, "confusion": 1.0},
-            )
+            log.step(step, odd if step % 2 else even)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
     assert lines[0].startswith("step 5/100  total 3  classification 2")
@@ -195,12 +186,9 @@ def test_metrics_can_be_read_back_and_later_or_damaged_ones_are_dropped(
             file.write(damaged)
     with RunLog(tiny_config(tmp_path, iterations=9), start=3):
         pass
-    assert [(m["step"], m["split"]) for m in read_metrics(tmp_path)] == [
-        (1, "train"),
-        (2, "train"),
-        (3, "val"),
-    ]
-    assert read_metrics(tmp_path)[1]["total"] == 1.5
+    one, two, three = read_metrics(tmp_path)
+    assert [m["split"] for m in (one, two, three)] == ["train", "train", "val"]
+    assert (one["step"], two["step"], three["step"], two["total"]) == (1, 2, 3, 1.5)
 
 
 @pytest.mark.usefixtures("tiny_names")
@@ -218,11 +206,8 @@ def test_wandb_is_one_run_with_the_options_numbers_and_pictures(
     monkeypatch.setitem(sys.modules, "wandb", fake)
     for steps in (2, 4):
         assert train(tiny_run(run_folder, log="wandb", iterations=steps), resume=steps > 2).finished
-    assert (
-        len(finished) == 2
-        and started[0]["id"] == started[1]["id"]
-        and started[1]["resume"] == "allow"
-    )
+    assert len(finished) == 2 and started[0]["id"] == started[1]["id"]
+    assert started[1]["resume"] == "allow"
     assert started[0]["config"]["batch_size"] == 2 and started[0]["name"] == "run"
     assert [step for step, values in shown if "train/total" in values] == [1, 2, 3, 4]
     assert [(step, values["val"][2]) for step, values in shown if "val" in values] == [

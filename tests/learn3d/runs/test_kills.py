@@ -15,18 +15,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_server import BEST, ENVIRONMENT, RunServer
+from children import environment
+from run_server import BEST, RunServer
 from runs import check_same
 
-import learn3d
 from learn3d import training
-from learn3d.config import TrainConfig
-from learn3d.presets import PRESETS, configure
+from learn3d.config import TrainConfig, config_to_dict
 from learn3d.runs import checkpoint
 from learn3d.training import train
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and SIGKILL")
 
+TRAIN = Path(__file__).parents[3] / "tools" / "train.py"
 SEED = int(os.environ.get("KILL_SEED", "0"))
 
 
@@ -37,7 +37,9 @@ def server() -> Iterator[RunServer]:
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(server, tiny_folder, tmp_path_factory) -> tuple[TrainConfig, float, int]:
+def uninterrupted(
+    server, tiny_folder, tiny_config, tmp_path_factory
+) -> tuple[TrainConfig, float, int]:
     """A run that nothing disturbed, the seconds it took and the number of things it did in its folder.
 
     It has 10 steps with everything in them: 5 validations, 4 checkpoints, 3 pictures. Its best networks are those of
@@ -47,13 +49,10 @@ def uninterrupted(server, tiny_folder, tmp_path_factory) -> tuple[TrainConfig, f
     for path in tiny_folder.iterdir():  # not compressed: the tests read them a hundred times
         with np.load(path) as archive:
             np.savez(folder / path.name, archive["arr_0"])
-    small = {"encoder": "conv-small", "generator": "sphere", "learning_rate": 1e-2}
-    settings = dataclasses.replace(PRESETS["peng2020-kato"].settings, **small)
-    often = {"log_every": 1, "validate_every": 2, "checkpoint_every": 3, "pictures_every": 4}
-    fixed = {"batch_size": 2, "precision": "fp32", "threads": 1, "max_val_images": 4}
-    where = {"data": folder, "category": "airplane", "preset": "peng2020-kato"}
+    small = {"generator": "sphere", "learning_rate": 1e-2, "batch_size": 2, "threads": 1}
+    often = {"validate_every": 2, "checkpoint_every": 3, "pictures_every": 4}
     output = folder / "whole"
-    config = configure(**where, output=output, settings=settings, iterations=10, **fixed, **often)
+    config = tiny_config(output, data=folder, iterations=10, **small, **often)
     started = time.monotonic()
     answer = server(config)
     assert answer["status"] == 0, output.with_suffix(".log").read_text()
@@ -98,22 +97,6 @@ def test_killed_at_any_place(server, uninterrupted, wanted: int) -> None:
         check_same(config.output, killed.output)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["last", "best"])
-def test_killed_in_the_middle_of_each_checkpoint(server, uninterrupted, name: str) -> None:
-    """Half of a file under its temporary name, whatever is saved; it is removed when the run goes on."""
-    killed, _, things = uninterrupted
-    for place in range(things // 4, things):
-        config = dataclasses.replace(killed, output=killed.output.with_name(f"half-{name}-{place}"))
-        server(config, kill_at=place, half=True)
-        if (config.output / f".{name}.safetensors.partial").exists():
-            check_whole(config.output)
-            assert server(config, resume=True)["status"] == 0
-            check_same(config.output, killed.output)
-            return
-    raise AssertionError(f"no kill left half of {name}")
-
-
 def test_signals_at_any_time(server, uninterrupted) -> None:
     killed, seconds, _ = uninterrupted
     rng = random.Random(SEED)
@@ -142,27 +125,15 @@ def test_the_command_killed_at_any_time(uninterrupted, tmp_path, monkeypatch) ->
         uninterrupted[0], settings=gentle, output=tmp_path / "uninterrupted"
     )
     train(reference)
-    names = ("iterations", "seed", "batch_size", "precision", "threads", "max_val_images")
-    names += ("log_every", "validate_every", "checkpoint_every", "pictures_every")
-    options = [f"--{name.replace('_', '-')}={getattr(reference, name)}" for name in names]
-    options += ["--encoder=conv-small", "--generator=sphere", "--learning-rate=1e-4"]
-    options += [f"--data={reference.data}", "--category=airplane", "--preset=peng2020-kato"]
     run = tmp_path / "run"
-    script = [
-        sys.executable,
-        str(Path(__file__).parents[3] / "tools" / "train.py"),
-        f"--output={run}",
-    ]
-    packages = [
-        str(Path(learn3d.__file__).parents[1]),
-        *filter(None, [os.environ.get("PYTHONPATH")]),
-    ]
-    environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
+    options = config_to_dict(dataclasses.replace(reference, output=run))
+    run.mkdir()
+    (run / "config.json").write_text(json.dumps(options))
+    command = [sys.executable, TRAIN, "--output", run, "--resume"]
     rng = random.Random(SEED)
     for lines in (0, 4, 9, None):  # metrics.jsonl has 15
-        command = [*script, "--resume"] if (run / "config.json").exists() else [*script, *options]
         with subprocess.Popen(
-            command, stderr=subprocess.PIPE, env=environment, text=True
+            command, stderr=subprocess.PIPE, env=environment(), text=True
         ) as process:
             deadline = time.monotonic() + 600
             while lines is not None and process.poll() is None and time.monotonic() < deadline:

@@ -6,7 +6,6 @@ Other programs make the CPU time of a step longer, never shorter: its least is c
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,9 +14,8 @@ from statistics import median
 
 import numpy as np
 import pytest
-from run_server import ENVIRONMENT
+from children import environment
 
-import learn3d
 from learn3d.config import config_to_dict
 
 pytestmark = [
@@ -42,14 +40,9 @@ def soak(tiny_run, tiny_folder: Path, folder: Path) -> list[dict[str, float]]:
         "pictures_every": 1000,
     }
     config = tiny_run(folder / "run", data=folder, iterations=STEPS, **often)
-    packages = [
-        str(Path(learn3d.__file__).parents[1]),
-        *filter(None, [os.environ.get("PYTHONPATH")]),
-    ]
-    environment = os.environ | ENVIRONMENT | {"PYTHONPATH": os.pathsep.join(packages)}
     script = Path(__file__).parents[2] / "data" / "soak.py"
     command = [sys.executable, str(script), json.dumps(config_to_dict(config)), str(EVERY)]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    ended = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
     assert ended.returncode == 0, ended.stderr
     return [json.loads(line) for line in ended.stdout.splitlines()]
 
