@@ -6,35 +6,56 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
-#include <utility>
 #include <vector>
 
+#include "geometry.h"
 #include "parallel.h"
 #include "stages.h"
 
 namespace nmr {
 
+constexpr int64_t kBandRows = 32;  // rows of a raster per task, if every task looks at all faces
+
+// Calls body(b, first, last) for bands of `rows` rows of every image: rows first, ..., last - 1.
+template <class Body>
+void for_bands(int64_t batch, int64_t height, int64_t rows, int num_threads, const Body& body) {
+  const int64_t bands = (height + rows - 1) / rows;
+  parallel_for(batch * bands, num_threads, [&](int64_t n) {
+    const int64_t first = n % bands * rows;
+    body(n / bands, first, std::min(first + rows, height));
+  });
+}
+
 // The rows of one image, in blocks. Each has an even number of rows, so that every 2x2 mean is
 // within one block.
 struct RowBlocks {
   Size raster;
+  int64_t num_faces;
   int64_t rows;  // per block
   int64_t count;
 
   // A block has at least 2^14 pixels, and at least half as many pixels as there are faces, because
   // it reads every face's mark.
-  RowBlocks(Size raster, int64_t num_faces) : raster(raster) {
+  RowBlocks(Size raster, int64_t num_faces) : raster(raster), num_faces(num_faces) {
     const int64_t pixels = std::max<int64_t>(int64_t(1) << 14, num_faces / 2);
     rows = (pixels + raster.width - 1) / raster.width;
     rows = std::min(rows + rows % 2, raster.height);
     count = (raster.height + rows - 1) / rows;
   }
-  int64_t first(int64_t block) const { return block * rows; }
-  int64_t last(int64_t block) const { return std::min(first(block) + rows, raster.height); }
   // Largest number of faces (originals and copies) that can own a pixel of one block.
-  int64_t most_visible(int64_t num_faces) const {
-    return std::min(2 * num_faces, rows * raster.width);
-  }
+  int64_t most_visible() const { return std::min(2 * num_faces, rows * raster.width); }
+};
+
+// One of the blocks of image b.
+struct RowBlock {
+  RowBlocks blocks;
+  int64_t b, number;
+
+  // Its rows first(), ..., last() - 1, and its pixels begin(), ..., end() - 1 in a batch [B, H, W].
+  int64_t first() const { return number * blocks.rows; }
+  int64_t last() const { return std::min(first() + blocks.rows, blocks.raster.height); }
+  int64_t begin() const { return (b * blocks.raster.height + first()) * blocks.raster.width; }
+  int64_t end() const { return (b * blocks.raster.height + last()) * blocks.raster.width; }
 };
 
 // The faces that own a pixel, numbered from 1 in ascending order; the background is number 0.
@@ -75,21 +96,59 @@ struct VisibleFaces {
       }
     }
   }
+
+  // The same, with the memory for it.
+  void list(const int32_t* face_index, int64_t pixels, int64_t num_faces) {
+    reserve_for(num_faces, std::min(2 * num_faces, pixels));
+    find(face_index, pixels, num_faces);
+  }
 };
 
-// Calls produce(b, block, result) for every block of every image, on several threads, and then
+// Sums per visible face of some pixels: `numbers` values for each, the background's first.
+template <class T>
+struct FaceSums {
+  VisibleFaces visible;
+  std::vector<T> values;  // [count, numbers]
+
+  // Lists the faces that own one of these pixels. Their sums are 0.
+  void start(const int32_t* face_index, int64_t pixels, int64_t num_faces, int64_t numbers) {
+    visible.list(face_index, pixels, num_faces);
+    const int64_t size = visible.count * numbers;
+    std::fill_n(reserve(values, size), size, T(0));
+  }
+  // Those of the face with this face index.
+  NMR_INLINE T* of(int64_t id, int64_t numbers) {
+    return values.data() + visible.slots[id + 1] * numbers;
+  }
+};
+
+// Calls body(block) for every block of every image. face_count(b) is the number of faces of image
+// b: its blocks do not depend on other images.
+template <class FaceCount, class Body>
+void for_blocks(int64_t batch, Size raster, int num_threads, const FaceCount& face_count,
+                const Body& body) {
+  int64_t most = 1;
+  for (int64_t b = 0; b < batch; ++b) most = std::max(most, RowBlocks(raster, face_count(b)).count);
+  parallel_for(batch * most, num_threads, [&](int64_t task) {
+    const RowBlock block{RowBlocks(raster, face_count(task / most)), task / most, task % most};
+    if (block.number < block.blocks.count) body(block);
+  });
+}
+
+// Calls produce(block, result) for every block of every image, on several threads, and then
 // consume(b, result) for each block. Blocks that add to the same output are consumed one after the
-// other, in ascending order of (b, block). Each image has its own output, unless the images share
-// one. block_count(b) is the number of blocks of image b.
-template <class Result, class BlockCount, class Produce, class Consume>
-void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& block_count,
-                const Produce& produce, const Consume& consume) {
+// other, in ascending order of image and block. Each image has its own output, unless the images
+// share one. face_count: as in for_blocks.
+template <class Result, class FaceCount, class Produce, class Consume>
+void sum_blocks(int64_t batch, Size raster, bool shared, int num_threads,
+                const FaceCount& face_count, const Produce& produce, const Consume& consume) {
   const ScratchUse use;
   if (!shared && batch >= num_threads) {
     parallel_for(batch, num_threads, [&](int64_t b) {
       Result& result = thread_scratch<Result>();
-      for (int64_t block = 0; block < block_count(b); ++block) {
-        produce(b, block, result);
+      const RowBlocks blocks(raster, face_count(b));
+      for (int64_t n = 0; n < blocks.count; ++n) {
+        produce(RowBlock{blocks, b, n}, result);
         consume(b, result);
       }
     });
@@ -97,20 +156,20 @@ void sum_blocks(int64_t batch, bool shared, int num_threads, const BlockCount& b
   }
   // All threads produce a group of blocks, which are then consumed in order.
   std::vector<Result>& results = thread_scratch<std::vector<Result>>();
-  std::vector<std::pair<int64_t, int64_t>>& tasks =
-      thread_scratch<std::vector<std::pair<int64_t, int64_t>>>();
+  std::vector<RowBlock>& tasks = thread_scratch<std::vector<RowBlock>>();
   tasks.clear();
   const auto flush = [&] {
     if (results.size() < tasks.size()) results.resize(tasks.size());
     parallel_for(static_cast<int64_t>(tasks.size()), num_threads,
-                 [&](int64_t n) { produce(tasks[n].first, tasks[n].second, results[n]); });
-    for (size_t n = 0; n < tasks.size(); ++n) consume(tasks[n].first, results[n]);
+                 [&](int64_t n) { produce(tasks[n], results[n]); });
+    for (size_t n = 0; n < tasks.size(); ++n) consume(tasks[n].b, results[n]);
     tasks.clear();
   };
   const size_t wave = num_threads <= 1 ? 1 : 4 * static_cast<size_t>(num_threads);
   for (int64_t b = 0; b < batch; ++b) {
-    for (int64_t block = 0; block < block_count(b); ++block) {
-      tasks.emplace_back(b, block);
+    const RowBlocks blocks(raster, face_count(b));
+    for (int64_t n = 0; n < blocks.count; ++n) {
+      tasks.push_back({blocks, b, n});
       if (tasks.size() == wave) flush();
     }
   }
@@ -138,7 +197,7 @@ void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* fa
   const T* value = gradients.values.data();
   for (int64_t n = 0; n < gradients.count; ++n) {
     const bool reversed = gradients.ids[n] >= num_faces;
-    const int64_t* face = faces + 3 * (reversed ? gradients.ids[n] - num_faces : gradients.ids[n]);
+    const int64_t* face = faces + 3 * face_of(gradients.ids[n], num_faces);
     for (int k = 0; k < 3; ++k, value += 3) {
       T* grad = grad_vertices + 3 * face[reversed ? 2 - k : k];
       for (int c = 0; c < 3; ++c) grad[c] += value[c];

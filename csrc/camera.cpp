@@ -12,13 +12,13 @@
 namespace nmr {
 namespace {
 
-constexpr int kGroup =
-    16;  // vertices processed together, and partial sums per gradient; the same on every processor
-constexpr int64_t kChunk = 512;  // vertices per task: sums are taken per chunk, then over chunks
-constexpr int kSums =
+// Vertices per task. Sums are taken per chunk, in kGroup partial sums, then over chunks: the same
+// on every processor.
+constexpr int64_t kVertexChunk = 512;
+constexpr int kCameraSums =
     12 + 6 + 8;  // sums over vertices per camera: gradients of [A | t], K, distortion
 constexpr int kTotals =
-    kSums + 3 + 1;  // plus the gradients of origin and extent, which follow from the sums
+    kCameraSums + 3 + 1;  // plus the gradients of origin and extent, which follow from the sums
 
 // Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small
 // enough that sums cannot overflow.
@@ -98,8 +98,8 @@ const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch)
     const int64_t points = args.starts ? args.starts[2 * b] : b * args.num_vertices;
     const int64_t vertices = args.starts || args.vertex_batch != 1 ? points : 0;
     const int64_t count = args.starts ? args.starts[2 * b + 2] - points : args.num_vertices;
-    for (int64_t n = 0; n < count; n += kChunk)
-      scratch.runs.push_back({b, vertices + n, points + n, std::min(kChunk, count - n)});
+    for (int64_t n = 0; n < count; n += kVertexChunk)
+      scratch.runs.push_back({b, vertices + n, points + n, std::min(kVertexChunk, count - n)});
   }
   return scratch.runs;
 }
@@ -114,7 +114,7 @@ void write(const double* sum, int count, T* grad, int64_t place) {
 template <class T>
 void write_camera(const double* sum, T* grad, int64_t b) {
   write(sum, 18, grad, kCamera * b);
-  write(sum + kSums, 4, grad, kCamera * b + kOrigin);
+  write(sum + kCameraSums, 4, grad, kCamera * b + kOrigin);
 }
 
 }  // namespace
@@ -144,7 +144,7 @@ void project_backward(const Project<T>& args) {
   const bool shared = !args.starts && args.vertex_batch == 1 && args.batch > 1;
   const int64_t images = shared ? args.batch : 1, tasks = num_runs / images;
   parallel_for(tasks, args.num_threads, [&](int64_t task) {
-    T discarded[3 * kChunk];
+    T discarded[3 * kVertexChunk];
     T* grad = args.grad_vertices ? args.grad_vertices + 3 * runs[task].vertices : discarded;
     std::fill_n(grad, 3 * runs[task].count, T(0));
     for (int64_t b = 0; b < images; ++b) {
@@ -171,9 +171,7 @@ void project_backward(const Project<T>& args) {
     write(of_all + 18, static_cast<int>(args.coefficients), args.grad_distortion, 0);
 }
 
-template void project_forward(const Project<float>&);
-template void project_forward(const Project<double>&);
-template void project_backward(const Project<float>&);
-template void project_backward(const Project<double>&);
+NMR_FLOAT_AND_DOUBLE(project_forward, Project)
+NMR_FLOAT_AND_DOUBLE(project_backward, Project)
 
 }  // namespace nmr

@@ -16,19 +16,6 @@
 namespace nmr {
 namespace {
 
-constexpr int64_t kGroup = 16;
-
-// Whether a depth is behind the plane; false for NaN, because such a face is not drawn anyway.
-template <class T>
-bool any_behind(const T* vertices, int64_t count, T near) {
-  int32_t behind[kGroup] = {};
-  int64_t v = 0;
-  for (; v + kGroup <= count; v += kGroup)
-    for (int64_t l = 0; l < kGroup; ++l) behind[l] |= vertices[3 * (v + l) + 2] < near;
-  for (; v < count; ++v) behind[0] |= vertices[3 * v + 2] < near;
-  return std::any_of(behind, behind + kGroup, [](int32_t any) { return any != 0; });
-}
-
 // Number of triangles that remain of a face with 0, 1, 2 or 3 corners behind the plane.
 constexpr int64_t kPieces[4] = {1, 2, 1, 0};
 
@@ -68,11 +55,25 @@ bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
   return false;
 }
 
+// Whether the mesh does not stay as it is.
+template <class T>
+bool changes(const MeshBatch<T>& mesh, int64_t b, T near) {
+  for (int64_t f = 0; f < mesh.face_count(b); ++f)
+    if (sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, near).cut()) return true;
+  return any_around_eye(mesh, b, near);
+}
+
 }  // namespace
 
+// Whether a depth is behind the plane; false for NaN, because such a face is not drawn anyway.
 template <class T>
 bool crosses_near(const T* vertices, int64_t count, T near) {
-  return any_behind(vertices, count, near);
+  int32_t behind[kGroup] = {};
+  int64_t v = 0;
+  for (; v + kGroup <= count; v += kGroup)
+    for (int64_t l = 0; l < kGroup; ++l) behind[l] |= vertices[3 * (v + l) + 2] < near;
+  for (; v < count; ++v) behind[0] |= vertices[3 * v + 2] < near;
+  return std::any_of(behind, behind + kGroup, [](int32_t any) { return any != 0; });
 }
 
 template <class T>
@@ -121,15 +122,11 @@ void clip_faces(const ClipFaces<T>& args) {
       }
       args.source[n++] = static_cast<int32_t>(f);
     };
-    const int64_t num_faces = mesh.face_count(b);
-    bool changes = false;
-    for (int64_t f = 0; f < num_faces && !changes; ++f)
-      changes = sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, args.near).cut();
-    changes = changes || any_around_eye(mesh, b, args.near);
-    for (int64_t f = 0; f < num_faces; ++f) {
+    const bool stays = !changes(mesh, b, args.near);
+    for (int64_t f = 0; f < mesh.face_count(b); ++f) {
       const int64_t* face = mesh.image_faces(b) + 3 * f;
       const Sides sides = sides_of(mesh.image_vertices(b), face, args.near);
-      if (!changes || sides.count == 0) {
+      if (stays || sides.count == 0) {
         draw(f, 0, 1, 2);
       } else if (sides.cut()) {
         int i = 0;  // the corner that is alone on its side
@@ -161,9 +158,7 @@ void clip_faces(const ClipFaces<T>& args) {
 
 template bool crosses_near(const float*, int64_t, float);
 template bool crosses_near(const double*, int64_t, double);
-template void clip_count(const ClipCount<float>&);
-template void clip_count(const ClipCount<double>&);
-template void clip_faces(const ClipFaces<float>&);
-template void clip_faces(const ClipFaces<double>&);
+NMR_FLOAT_AND_DOUBLE(clip_count, ClipCount)
+NMR_FLOAT_AND_DOUBLE(clip_faces, ClipFaces)
 
 }  // namespace nmr

@@ -46,8 +46,7 @@ struct ClipImage {
     return {p[0] - X * w, p[1] - Y * w, w};
   }
   int64_t face(int64_t n) const {  // -1 on background
-    const int64_t id = face_index[n];
-    return id < attributes.num_faces ? id : id - attributes.num_faces;
+    return face_of(face_index[n], attributes.num_faces);
   }
 };
 
@@ -80,11 +79,8 @@ NMR_INLINE double unit(double x) { return x > 0 ? (x < 1 ? x : 1) : 0; }
 // Sums of gradients per corner of the faces that are seen in pixels begin..end - 1 of an image:
 // [count, 3, 4].
 template <class T>
-void start_sums(const ClipImage<T>& image, int64_t begin, int64_t end, CornerSums<T>& sums) {
-  const int64_t F = image.attributes.num_faces;
-  sums.visible.reserve_for(F, std::min(2 * F, end - begin));
-  sums.visible.find(image.face_index + begin, end - begin, F);
-  std::fill_n(reserve(sums.values, sums.visible.count * 12), sums.visible.count * 12, T(0));
+void start_sums(const ClipImage<T>& image, int64_t begin, int64_t end, FaceSums<T>& sums) {
+  sums.start(image.face_index + begin, end - begin, image.attributes.num_faces, 12);
 }
 
 // Adds the gradient of a corner as seen from (X, Y) to that of its position.
@@ -98,15 +94,15 @@ NMR_INLINE void add_corner(const Corner& grad, double X, double Y, T* position) 
 template <class T, class Body>
 void sum_positions(const ClipMesh<T>& mesh, T* grad_positions, const Body& body) {
   std::fill_n(grad_positions, 4 * mesh.num_vertices * mesh.position_batch, T(0));
-  const RowBlocks blocks(mesh.raster, mesh.num_faces);
-  sum_blocks<CornerSums<T>>(
-      mesh.batch, mesh.position_batch == 1, mesh.num_threads, [&](int64_t) { return blocks.count; },
-      [&](int64_t b, int64_t block, CornerSums<T>& sums) {
+  sum_blocks<FaceSums<T>>(
+      mesh.batch, mesh.raster, mesh.position_batch == 1, mesh.num_threads,
+      [&](int64_t) { return mesh.num_faces; },
+      [&](const RowBlock& block, FaceSums<T>& sums) {
         const int64_t W = mesh.raster.width;
-        body(b, blocks.first(block) * W, blocks.last(block) * W, sums);
+        body(block.b, block.first() * W, block.last() * W, sums);
       },
-      [&](int64_t b, const CornerSums<T>& sums) {
-        scatter_corner_sums(sums, ClipImage<T>(mesh, b).attributes, 4, grad_positions);
+      [&](int64_t b, const FaceSums<T>& sums) {
+        scatter_corner_sums<4>(sums, ClipImage<T>(mesh, b).attributes, 4, grad_positions);
       });
 }
 
@@ -152,7 +148,7 @@ template <class T>
 void clip_weights_backward(const ClipWeights<T>& args) {
   const ClipMesh<T>& mesh = args.mesh;
   sum_positions(
-      mesh, args.grad_positions, [&](int64_t b, int64_t begin, int64_t end, CornerSums<T>& sums) {
+      mesh, args.grad_positions, [&](int64_t b, int64_t begin, int64_t end, FaceSums<T>& sums) {
         const ClipImage<T> image(mesh, b);
         start_sums(image, begin, end, sums);
         const double scale_x = 2.0 / mesh.raster.width, scale_y = 2.0 / mesh.raster.height;
@@ -197,7 +193,7 @@ void clip_weights_backward(const ClipWeights<T>& args) {
             to_j.y += e * i.x - x * i.w;
             to_j.w += x * i.y - y * i.x;
           }
-          T* sum = sums.values.data() + 12 * sums.visible.slots[image.face_index[n] + 1];
+          T* sum = sums.of(image.face_index[n], 12);
           for (int k = 0; k < 3; ++k) add_corner(grads[k], X, Y, sum + 4 * k);
         }
       });
@@ -338,7 +334,7 @@ void antialias_backward(const Antialias<T>& args) {
   }
   if (!args.grad_positions) return;
   sum_positions(
-      mesh, args.grad_positions, [&](int64_t b, int64_t begin, int64_t end, CornerSums<T>& sums) {
+      mesh, args.grad_positions, [&](int64_t b, int64_t begin, int64_t end, FaceSums<T>& sums) {
         const ClipImage<T> image(mesh, b);
         const int64_t start = b * mesh.raster.pixels(), pixels = mesh.raster.pixels();
         start_sums(image, begin, std::min(end + W, pixels), sums);
@@ -364,8 +360,7 @@ void antialias_backward(const Antialias<T>& args) {
             sum /= D;
             const Corner to_i{sum * j.y, sum * (place * j.w - j.x), -sum * place * j.y};
             const Corner to_j{-sum * i.y, sum * (i.x - place * i.w), sum * place * i.y};
-            T* corners =
-                sums.values.data() + 12 * sums.visible.slots[image.face_index[pair.front] + 1];
+            T* corners = sums.of(image.face_index[pair.front], 12);
             add_corner(along(to_i, vertical), X, Y, corners + 4 * ki);
             add_corner(along(to_j, vertical), X, Y, corners + 4 * kj);
           }
@@ -373,13 +368,9 @@ void antialias_backward(const Antialias<T>& args) {
       });
 }
 
-#define NMR_DEFINE_CLIP_SPACE(T)                              \
-  template void clip_weights_forward(const ClipWeights<T>&);  \
-  template void clip_weights_backward(const ClipWeights<T>&); \
-  template void antialias_forward(const Antialias<T>&);       \
-  template void antialias_backward(const Antialias<T>&);
-NMR_DEFINE_CLIP_SPACE(float)
-NMR_DEFINE_CLIP_SPACE(double)
-#undef NMR_DEFINE_CLIP_SPACE
+NMR_FLOAT_AND_DOUBLE(clip_weights_forward, ClipWeights)
+NMR_FLOAT_AND_DOUBLE(clip_weights_backward, ClipWeights)
+NMR_FLOAT_AND_DOUBLE(antialias_forward, Antialias)
+NMR_FLOAT_AND_DOUBLE(antialias_backward, Antialias)
 
 }  // namespace nmr

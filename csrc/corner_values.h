@@ -17,10 +17,8 @@ constexpr int64_t kRows = 8;  // raster rows processed together in forward passe
 // Calls body(b, row) for every row of every raster.
 template <class Body>
 void for_rows(int64_t batch, int64_t height, int num_threads, const Body& body) {
-  const int64_t tiles = (height + kRows - 1) / kRows;
-  parallel_for(batch * tiles, num_threads, [&](int64_t n) {
-    const int64_t first = n % tiles * kRows;
-    for (int64_t row = first; row < std::min(first + kRows, height); ++row) body(n / tiles, row);
+  for_bands(batch, height, kRows, num_threads, [&](int64_t b, int64_t first, int64_t last) {
+    for (int64_t row = first; row < last; ++row) body(b, row);
   });
 }
 
@@ -52,6 +50,11 @@ struct ImageAttributes {
   int64_t first_row;       // first row of attributes
   const int64_t* corners;  // [F, 3]
   int64_t num_faces;
+
+  // Those of the face with this face index.
+  NMR_INLINE const int64_t* corners_of(int64_t id) const {
+    return corners + 3 * face_of(id, num_faces);
+  }
 };
 
 template <class T>
@@ -64,22 +67,15 @@ ImageAttributes<T> image_attributes(const Interpolate<T>& args, int64_t b) {
           args.corners + (args.corners_per_image ? 3 * b * args.num_faces : 0), args.num_faces};
 }
 
-// Sums per visible face of a block: [count, 3, C] over its corners.
-template <class T>
-struct CornerSums {
-  VisibleFaces visible;
-  std::vector<T> values;
-};
-
-// Adds these sums to the rows of attributes at the corners.
-template <class T>
-void scatter_corner_sums(const CornerSums<T>& sums, const ImageAttributes<T>& image,
-                         int64_t channels, T* grad_attributes) {
-  const int64_t C = channels, F = image.num_faces;
+// Adds sums [count, 3, C] of the corners of faces to the rows of attributes at these corners.
+// kChannels: C, or 0 if it is known only at run time.
+template <int64_t kChannels, class T>
+void scatter_corner_sums(const FaceSums<T>& sums, const ImageAttributes<T>& image, int64_t channels,
+                         T* grad_attributes) {
+  const int64_t C = kChannels ? kChannels : channels;
   const T* value = sums.values.data() + 3 * C;  // skips the background's
   for (int64_t n = 1; n < sums.visible.count; ++n) {
-    const int64_t id = sums.visible.ids[n];
-    const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
+    const int64_t* corners = image.corners_of(sums.visible.ids[n]);
     for (int k = 0; k < 3; ++k, value += C) {
       T* grad = grad_attributes + (image.first_row + corners[k]) * C;
       for (int64_t c = 0; c < C; ++c) grad[c] += value[c];

@@ -36,9 +36,8 @@ namespace nmr {
 namespace {
 
 constexpr int64_t kCoverage = -1;  // in place of a number of channels: a silhouette
-constexpr int64_t kGroup = 16;     // lines that are read together: columns of one cache line
-constexpr int64_t kPad = 8;        // values behind the pixels of a line that vectors may touch
-constexpr int64_t kEntry =
+constexpr int64_t kLines = 16;     // lines that are read together: columns of one cache line
+constexpr int64_t kEdgeEntry =
     16;  // numbers per face: x of its corners in pixels, y, gradients of x, of y; four of each
 
 // Pixels first, ..., last - 1 of a line.
@@ -86,7 +85,7 @@ struct EdgeImage {
   Reach reach;
 };
 
-// Up to kGroup lines: columns, or rows from the top.
+// Up to kLines lines: columns, or rows from the top.
 struct LineRange {
   int64_t first, count;
   bool columns;
@@ -137,7 +136,7 @@ struct PixelList {
 template <class T>
 struct EdgeSums {
   std::vector<int32_t> ids;  // face indices
-  Buffer<T> entries;         // [faces, kEntry], corners in drawing order
+  Buffer<T> entries;         // [faces, kEdgeEntry], corners in drawing order
   int64_t count;
 };
 
@@ -153,8 +152,9 @@ struct EdgeScratch {
 
   // Memory for lines of up to `longest` pixels.
   LineGroup<T> reserve_group(const EdgeImage<T>& image, int64_t longest) {
-    const int64_t C = image.channels, stride = (longest + 7) / 8 * 8 + kPad, size = kGroup * stride;
-    list = {reserve(position, stride + kPad) + kPad, reserve(weight, stride),
+    const int64_t C = image.channels, stride = (longest + 7) / 8 * 8 + kLanes,
+                  size = kLines * stride;
+    list = {reserve(position, stride + kLanes) + kLanes, reserve(weight, stride),
             reserve(pixel, stride), reserve(near_colors, 8 * C)};
     return {{},
             0,
@@ -163,7 +163,7 @@ struct EdgeScratch {
             nullptr,
             0,
             {reserve(run_first, size), reserve(run_last, size), reserve(run_face, size)},
-            reserve(runs_end, kGroup),
+            reserve(runs_end, kLines),
             reserve(transposed, size),
             image.pixels ? reserve(colors, size * C) : nullptr,
             reserve(grads, size * C),
@@ -195,9 +195,9 @@ void number_faces(const EdgeImage<T>& image, const RunList& runs, int64_t count,
   }
   const T width = static_cast<T>(image.raster.width), height = static_cast<T>(image.raster.height);
   for (int64_t n = sums.count; n < found; ++n) {
-    T* entry = sums.entries.data() + n * kEntry;
+    T* entry = sums.entries.data() + n * kEdgeEntry;
     const bool reversed = ids[n] >= image.num_faces;
-    const int64_t* face = image.faces + 3 * (reversed ? ids[n] - image.num_faces : ids[n]);
+    const int64_t* face = image.faces + 3 * face_of(ids[n], image.num_faces);
     for (int k = 0; k < 3; ++k) {
       const T* vertex = image.vertices + 3 * face[reversed ? 2 - k : k];
       entry[k] = to_pixel(vertex[0], width);
@@ -209,49 +209,45 @@ void number_faces(const EdgeImage<T>& image, const RunList& runs, int64_t count,
   sums.count = found;
 }
 
-// The tasks of one image: each has a band of rows and a band of columns.
-struct EdgeBands {
-  RowBlocks rows;
-  int64_t columns;  // per task
+// A block has a band of rows and a band of so many columns.
+int64_t columns_of(const RowBlocks& blocks) {
+  const int64_t columns = (blocks.raster.width + blocks.count - 1) / blocks.count;
+  return columns + columns % 2;
+}
 
-  EdgeBands(Size raster, int64_t num_faces) : rows(raster, num_faces) {
-    columns = (raster.width + rows.count - 1) / rows.count;
-    columns += columns % 2;
-  }
-  // Lines of a task that faces can reach; whole pairs.
-  LineRange band(int64_t task, bool in_columns, const PixelRange& reached) const {
-    const int64_t width = in_columns ? columns : rows.rows;
-    const int64_t first = std::max(task * width, reached.first / 2 * 2);
-    const int64_t last = std::min(reached.last + reached.last % 2,
-                                  in_columns ? rows.raster.width : rows.raster.height);
-    return {first, std::min((task + 1) * width, last) - first, in_columns};
-  }
-};
+// Lines of a block that faces can reach; whole pairs.
+LineRange band_of(const RowBlock& block, bool columns, const PixelRange& reached) {
+  const RowBlocks& blocks = block.blocks;
+  const int64_t width = columns ? columns_of(blocks) : blocks.rows;
+  const int64_t first = std::max(block.number * width, reached.first / 2 * 2);
+  const int64_t last = std::min(reached.last + reached.last % 2,
+                                columns ? blocks.raster.width : blocks.raster.height);
+  return {first, std::min((block.number + 1) * width, last) - first, columns};
+}
 
-// The sums of one task. If a gradient of the image is not finite, they are NaN.
+// The sums of one block. If a gradient of the image is not finite, they are NaN.
 template <class T>
-void sum_bands(const EdgeImage<T>& image, const EdgeBands& bands, int64_t task, bool finite,
-               EdgeSums<T>& sums) {
+void sum_bands(const EdgeImage<T>& image, const RowBlock& block, bool finite, EdgeSums<T>& sums) {
   const Size raster = image.raster;
   const int64_t entries = 2 * image.num_faces + 1;
-  const int64_t most =
-      std::min(entries, 1 + bands.rows.rows * raster.width + bands.columns * raster.height);
+  const int64_t most = std::min(
+      entries, 1 + block.blocks.rows * raster.width + columns_of(block.blocks) * raster.height);
   EdgeScratch<T>& scratch = thread_scratch<EdgeScratch<T>>();
   LineGroup<T> group = scratch.reserve_group(image, std::max(raster.width, raster.height));
   std::fill_n(reserve(scratch.numbers, entries), entries, -1);
   reserve(sums.ids, most + 1);  // one may be written behind the last
-  std::fill_n(reserve(sums.entries, most * kEntry), kEntry,
+  std::fill_n(reserve(sums.entries, most * kEdgeEntry), kEdgeEntry,
               T(0));  // of the background: a point, which no line crosses
   scratch.numbers[0] = 0;
   sums.count = 1;
   for (const bool columns : {false, true}) {
     const Reach& reach = image.reach;
-    const LineRange band = bands.band(task, columns, columns ? reach.columns : reach.rows);
+    const LineRange band = band_of(block, columns, columns ? reach.columns : reach.rows);
     const PixelRange bottom_up{raster.height - reach.rows.last, raster.height - reach.rows.first};
     const PixelRange& along = columns ? bottom_up : reach.columns;
     group.window = {along.first / 8 * 8, (along.last + 7) / 8 * 8};
-    for (int64_t n = 0; n < band.count; n += kGroup) {
-      group.lines = {band.first + n, std::min(kGroup, band.count - n), columns};
+    for (int64_t n = 0; n < band.count; n += kLines) {
+      group.lines = {band.first + n, std::min(kLines, band.count - n), columns};
       group.length = columns ? raster.height : raster.width;
       NMR_AT_BEST_LEVEL(find_group_runs, image, group);
       const int64_t runs = group.runs_end[group.lines.count - 1];
@@ -268,7 +264,7 @@ void sum_bands(const EdgeImage<T>& image, const EdgeBands& bands, int64_t task, 
     }
   }
   if (!finite)
-    std::fill_n(sums.entries.data(), sums.count * kEntry, std::numeric_limits<T>::quiet_NaN());
+    std::fill_n(sums.entries.data(), sums.count * kEdgeEntry, std::numeric_limits<T>::quiet_NaN());
 }
 
 // Gradients of all images; image_of(b) describes one.
@@ -284,21 +280,20 @@ void sum_edges(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_
     reach[b] = reach_of(image.vertices, mesh.vertex_count(b), raster);
     std::fill_n(grad_vertices + 3 * mesh.vertex_start(b), 3 * mesh.vertex_count(b), T(0));
   });
-  const auto bands_of = [&](int64_t b) { return EdgeBands(raster, mesh.face_count(b)); };
   sum_blocks<EdgeSums<T>>(
-      mesh.batch, false, num_threads, [&](int64_t b) { return bands_of(b).rows.count; },
-      [&](int64_t b, int64_t task, EdgeSums<T>& sums) {
-        EdgeImage<T> image = image_of(b);
-        image.reach = reach[b];
-        sum_bands(image, bands_of(b), task, finite[b], sums);
+      mesh.batch, raster, false, num_threads, [&](int64_t b) { return mesh.face_count(b); },
+      [&](const RowBlock& block, EdgeSums<T>& sums) {
+        EdgeImage<T> image = image_of(block.b);
+        image.reach = reach[block.b];
+        sum_bands(image, block, finite[block.b], sums);
       },
       [&](int64_t b, const EdgeSums<T>& sums) {
         const int64_t F = mesh.face_count(b);
         T* grad_image = grad_vertices + 3 * mesh.vertex_start(b);
         for (int64_t n = 1; n < sums.count; ++n) {  // skips the background
           const int32_t id = sums.ids[n];
-          const int64_t* face = mesh.image_faces(b) + 3 * (id < F ? id : id - F);
-          const T* grads = sums.entries.data() + n * kEntry + 8;
+          const int64_t* face = mesh.image_faces(b) + 3 * face_of(id, F);
+          const T* grads = sums.entries.data() + n * kEdgeEntry + 8;
           for (int k = 0; k < 3; ++k) {
             T* grad = grad_image + 3 * face[id < F ? k : 2 - k];
             grad[0] += grads[k];
@@ -354,9 +349,7 @@ void edges_backward(const EdgesBackward<T>& args) {
   });
 }
 
-template void silhouette_backward(const SilhouetteBackward<float>&);
-template void silhouette_backward(const SilhouetteBackward<double>&);
-template void edges_backward(const EdgesBackward<float>&);
-template void edges_backward(const EdgesBackward<double>&);
+NMR_FLOAT_AND_DOUBLE(silhouette_backward, SilhouetteBackward)
+NMR_FLOAT_AND_DOUBLE(edges_backward, EdgesBackward)
 
 }  // namespace nmr

@@ -13,7 +13,7 @@ bool all_finite(const T* values, int64_t count) {
   return zero == T(0) && lane_bits(zeros == splat(T(0))) == 0xff;
 }
 
-constexpr int64_t kTogether = 4;
+constexpr int64_t kVectors = 4;  // of runs, whose crossings are found before their pulls
 
 // --- lines
 
@@ -61,7 +61,7 @@ NMR_INLINE void load_planes(const E* image, Size size, int64_t channels, const L
       transpose(from, length, channels, channels, end, to + n * channels * stride, stride);
   }
   for (int64_t n = 0; n < lines.count * channels; ++n)
-    std::fill_n(to + n * stride + length, kPad, E(0));
+    std::fill_n(to + n * stride + length, kLanes, E(0));
 }
 
 // Colours and gradients of the group.
@@ -89,7 +89,7 @@ NMR_INLINE void load_pixels(const EdgeImage<T>& image, const LineGroup<T>& group
     const T* half = group.half_grads + n * stride;
     T* grad = group.grads + n * stride;
     for (int64_t m = 0; m < M / 2; ++m) grad[2 * m] = grad[2 * m + 1] = half[m] / 4;
-    std::fill_n(grad + M, kPad, T(0));
+    std::fill_n(grad + M, kLanes, T(0));
   }
 }
 
@@ -415,7 +415,7 @@ NMR_INLINE void cross_runs(const EdgeLine<T>& line, const RunList& runs, int64_t
                            CrossedRuns<T>& x) {
   const T* corners[kLanes];
   for (int64_t l = 0; l < kLanes; ++l) {
-    T* entry = entries + kEntry * runs.face[r + l];
+    T* entry = entries + kEdgeEntry * runs.face[r + l];
     corners[l] = entry;
     x.sums[l] = entry + (line.columns ? 12 : 8);
   }
@@ -490,9 +490,9 @@ void pull_group(const EdgeImage<T>& image, const LineGroup<T>& group, const Pixe
     if (first < last) list_pixels<kChannels>(line, list);
     // First all crossings of some runs: the number of pixels beyond one is only known when it is
     // there.
-    CrossedRuns<T> crossed[kTogether];
-    for (int64_t r = first; r < last && (line.pulling || line.gains); r += kTogether * kLanes) {
-      const int64_t count = std::min(kTogether, (last - r) / kLanes);
+    CrossedRuns<T> crossed[kVectors];
+    for (int64_t r = first; r < last && (line.pulling || line.gains); r += kVectors * kLanes) {
+      const int64_t count = std::min(kVectors, (last - r) / kLanes);
       for (int64_t n = 0; n < count; ++n)
         cross_runs(line, group.runs, r + n * kLanes, entries, crossed[n]);
       for (int64_t n = 0; n < count; ++n) pull_runs<kChannels>(line, list, crossed[n]);

@@ -1,9 +1,6 @@
 // The inner loops of the rasterizer; included by levels.h for every instruction set. See
 // rasterize.cpp.
 
-static_assert(kLanes == kTogether,
-              "a vector holds the faces of a block and a row of a block of pixels");
-
 // --- set-up
 
 // The first and the last of `size` pixels along one axis whose centres lie in [lo, hi]: a face
@@ -97,24 +94,60 @@ NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)
   return bound;
 }
 
-// Sets up the faces of a chunk and lists those that are drawn.
+// Stores the bounds of the depths of eight faces, and returns the largest q of each; infinite ones
+// for faces so thin that all three weights could round to 0, or close to the limits of T or of
+// depth. largest: the largest coordinate of each, at least 1.
 template <class T>
-void set_up_faces(const Image<T>& image, int64_t chunk) {
-  FaceTable<T>& table = *image.table;
-  const int64_t first = chunk * kChunk, last = std::min(first + kChunk, image.num_faces);
-  const T width = static_cast<T>(image.settings.raster.width),
-          height = static_cast<T>(image.settings.raster.height);
+NMR_INLINE Lanes<T> store_bounds(const RasterSettings<T>& settings, const Lanes<T> (&x)[3],
+                                 const Lanes<T> (&y)[3], const Lanes<T> (&z)[3], LaneMask<T> usable,
+                                 Lanes<T> largest, FaceBlock<T>& block) {
+  const T width = static_cast<T>(settings.raster.width),
+          height = static_cast<T>(settings.raster.height);
   const T longer = width > height ? width : height, shorter = width > height ? height : width;
-  const T near = image.settings.near, far = image.settings.far;
-  const T* vertices = image.vertices;
-  const Lanes<T> infinity = splat(std::numeric_limits<T>::infinity()), zero = splat(T(0)),
-                 one = splat(T(1));
+  const T near = settings.near, far = settings.far;
   const T moderate = std::sqrt(std::numeric_limits<T>::max()) /
                      4;  // products of two pixel coordinates stay finite
   const T eps = std::numeric_limits<T>::epsilon(), resolution = 288 * eps * (longer / shorter);
   const T smallest = std::sqrt(std::numeric_limits<T>::min()) /
                      eps;  // 1 / depth and its slopes stay ordinary numbers
-  const LaneMask<T> some_bounds = splat(near) >= zero;
+  const Lanes<T> infinity = splat(std::numeric_limits<T>::infinity()), zero = splat(T(0)),
+                 one = splat(T(1));
+  const Lanes<T> lo = min_of(min_of(z[0], z[1]), z[2]), hi = max_of(max_of(z[0], z[1]), z[2]);
+  const Lanes<T> det = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]);
+  const LaneMask<T> bounded =
+      usable & (splat(near) >= zero) & (absolute<T>(det) >= splat(resolution) * largest * largest) &
+      (largest * splat(longer) < splat(moderate)) & (lo * splat(1 - 16 * eps) > splat(near)) &
+      (hi * splat(1 + 16 * eps) < splat(far)) & (lo > splat(smallest)) & (hi < splat(1 / smallest));
+  // For faces without bounds, those of an ordinary triangle are computed and not used.
+  const Lanes<T> ordinary_x[3] = {zero, one, zero}, ordinary_y[3] = {zero, zero, one};
+  Lanes<T> bx[3], by[3], bz[3];
+  for (int k = 0; k < 3; ++k) {
+    bx[k] = select(bounded, x[k], ordinary_x[k]);
+    by[k] = select(bounded, y[k], ordinary_y[k]);
+    bz[k] = select(bounded, z[k], one);
+  }
+  const DepthBound<T> bound =
+      bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width, height,
+                     settings.perspective);
+  const Lanes<T> nearest = select(bounded, bound.nearest, infinity);
+  store_lanes(block.slope_x, bound.slope_x);
+  store_lanes(block.slope_y, bound.slope_y);
+  store_lanes(block.level, bound.level);
+  store_lanes(block.margin, select(bounded, bound.margin, infinity));
+  store_lanes(block.nearest, nearest);
+  return nearest;
+}
+
+// Sets up the faces of a chunk and lists those that are drawn.
+template <class T>
+void set_up_faces(const Image<T>& image, int64_t chunk) {
+  FaceTable<T>& table = *image.table;
+  const int64_t first = chunk * kFaceChunk, last = std::min(first + kFaceChunk, image.num_faces);
+  const T width = static_cast<T>(image.settings.raster.width),
+          height = static_cast<T>(image.settings.raster.height);
+  const T* vertices = image.vertices;
+  const Lanes<T> infinity = splat(std::numeric_limits<T>::infinity()), zero = splat(T(0)),
+                 one = splat(T(1));
   int64_t num_front = 0, num_back = 0;
   Lanes<T> front_sum = zero, back_sum = zero;
   const Lanes32 most = splat(std::numeric_limits<int32_t>::max()), least = splat(int32_t(-1));
@@ -150,32 +183,7 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
       usable = usable & (ax < infinity) & (ay < infinity);
       largest = max_of(max_of(ax, ay), largest);
     }
-    const Lanes<T> lo = min_of(min_of(z[0], z[1]), z[2]), hi = max_of(max_of(z[0], z[1]), z[2]);
-    // No bounds for faces so thin that all three weights could round to 0, or close to the limits
-    // of T or of depth.
-    const Lanes<T> det = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]);
-    const LaneMask<T> bounded =
-        usable & some_bounds & (absolute<T>(det) >= splat(resolution) * largest * largest) &
-        (largest * splat(longer) < splat(moderate)) & (lo * splat(1 - 16 * eps) > splat(near)) &
-        (hi * splat(1 + 16 * eps) < splat(far)) & (lo > splat(smallest)) &
-        (hi < splat(1 / smallest));
-    // For faces without bounds, those of an ordinary triangle are computed and not used.
-    const Lanes<T> ordinary_x[3] = {zero, one, zero}, ordinary_y[3] = {zero, zero, one};
-    Lanes<T> bx[3], by[3], bz[3];
-    for (int k = 0; k < 3; ++k) {
-      bx[k] = select(bounded, x[k], ordinary_x[k]);
-      by[k] = select(bounded, y[k], ordinary_y[k]);
-      bz[k] = select(bounded, z[k], one);
-    }
-    const DepthBound<T> bound =
-        bound_depth<T>(bx, by, bz, select(bounded, lo, one), select(bounded, hi, one), width,
-                       height, image.settings.perspective);
-    const Lanes<T> nearest = select(bounded, bound.nearest, infinity);
-    store_lanes(block.slope_x, bound.slope_x);
-    store_lanes(block.slope_y, bound.slope_y);
-    store_lanes(block.level, bound.level);
-    store_lanes(block.margin, select(bounded, bound.margin, infinity));
-    store_lanes(block.nearest, nearest);
+    const Lanes<T> nearest = store_bounds(image.settings, x, y, z, usable, largest, block);
     Lanes32 i0, i1, j0, j1;
     pixel_range<T>(min_of(min_of(x[0], x[1]), x[2]), max_of(max_of(x[0], x[1]), x[2]), width, i0,
                    i1);
@@ -197,7 +205,7 @@ void set_up_faces(const Image<T>& image, int64_t chunk) {
     const Lanes32 numbers = lane_numbers() + splat(static_cast<int32_t>(f));
     num_front += compress_lanes(numbers, front_bits, front + num_front);
     num_back += compress_lanes(numbers, back_bits, back + num_back);
-    const Lanes<T> known = keep(bounded, nearest);
+    const Lanes<T> known = keep(nearest < infinity, nearest);
     front_sum = front_sum + select(not_ccw, zero, known);
     back_sum = back_sum + select(not_cw, zero, known);
   }
@@ -221,19 +229,13 @@ template <class T>
 NMR_INLINE Lanes<T> exact_depths(const FacePlane<T>& plane, Lanes<T> column, T row,
                                  bool perspective) {
   const auto& m = plane.weights.m;
-  const Lanes<T> zero = splat(T(0)), one = splat(T(1));
-  Lanes<T> w[3];
+  Lanes<T> w[3], z[3];
   for (int k = 0; k < 3; ++k) {
     w[k] = column * splat(m[k][0]) + splat(m[k][1] * row) + splat(m[k][2]);
-    w[k] = select(w[k] > zero, w[k], zero);
-    w[k] = select(w[k] < one, w[k], one);
+    z[k] = splat(plane.z[k]);
   }
-  const Lanes<T> sum = w[0] + w[1] + w[2];
-  if (!perspective)
-    return w[0] / sum * splat(plane.z[0]) + w[1] / sum * splat(plane.z[1]) +
-           w[2] / sum * splat(plane.z[2]);
-  return one / (w[0] / sum / splat(plane.z[0]) + w[1] / sum / splat(plane.z[1]) +
-                w[2] / sum / splat(plane.z[2]));
+  normalize_weights(w, splat(T(0)), splat(T(1)));
+  return lane_depths(w, z, splat(T(1)), perspective);
 }
 
 constexpr int32_t kBits[kLanes] = {1, 2, 4, 8, 16, 32, 64, 128};
@@ -421,7 +423,7 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
   const FaceTable<T>& table = *image.table;
   const int64_t rows = band.row_last - band.row_first + 1, H = band.raster.height,
                 W = band.raster.width;
-  const int64_t chunks = (image.num_faces + kChunk - 1) / kChunk;
+  const int64_t chunks = (image.num_faces + kFaceChunk - 1) / kFaceChunk;
   const Window window = find_window(table, chunks, band);
   const Lanes<T> nothing = splat(-std::numeric_limits<T>::infinity());
   const Lanes32 background = splat(int32_t(-1));
@@ -449,7 +451,7 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
     for (int64_t c = 0; c < chunks; ++c) {
       if (table.boxes[c].row_last < band.row_first || table.boxes[c].row_first > band.row_last)
         continue;
-      const int32_t* list = (reversed ? table.back : table.front).data() + c * kChunk;
+      const int32_t* list = (reversed ? table.back : table.front).data() + c * kFaceChunk;
       const int32_t count = (reversed ? table.num_back : table.num_front)[c];
       for (int32_t n = 0; n < count; ++n)
         if (pass == 0 || !is_hidden(table, list[n], band, blocks, block_least))

@@ -1,73 +1,108 @@
-// The loops of rasterize_layers; included by levels.h for every instruction set.
+// The loops of the K nearest faces; included by levels.h for every instruction set.
 
-// A range of pixels that contains all centres in [lo, hi], and few others.
-template <class T>
-NMR_INLINE void around(T lo, T hi, int64_t size, int64_t& first, int64_t& last) {
-  const T n = static_cast<T>(size), from = to_pixel(lo, n), to = to_pixel(hi, n);
-  first = std::max<int64_t>(0, static_cast<int64_t>(from > 0 ? (from < n ? from : n) : T(0)) - 1);
-  last = std::min<int64_t>(size - 1, static_cast<int64_t>(to > 0 ? (to < n ? to : n) : T(-2)) + 2);
-}
+#include "soft_pixels.h"
 
-// Inserts one face into the lists of the pixels that it covers.
-template <bool perspective, class T>
-NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t f, bool reversed) {
+// Inserts a face into the lists of those pixels of a box (rows from the bottom) for which
+// row(j)(i, depth) holds, which also computes its depth there.
+template <class T, class Row>
+NMR_INLINE void insert_face(const LayerBand<T>& band, int64_t id, int64_t column_first,
+                            int64_t column_last, int64_t row_first, int64_t row_last,
+                            const Row& row) {
   const Size raster = band.settings.raster;
-  const Triangle<T> t = load_triangle(band.vertices, band.faces + 3 * f, reversed);
-  const T *x = t.x, *y = t.y, *z = t.z;
-  if ((y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0])) return;
-  // As in the rasterizer, of the face's own order: rounding may find only one of the two orders
-  // flat.
-  if (!is_drawable(load_triangle(band.vertices, band.faces + 3 * f, false))) return;
-  const T left = std::min({x[0], x[1], x[2]}), right = std::max({x[0], x[1], x[2]});
-  const T bottom = std::min({y[0], y[1], y[2]}), top = std::max({y[0], y[1], y[2]});
-  int64_t i_first, i_last, j_first, j_last;
-  around(left, right, raster.width, i_first, i_last);
-  around(bottom, top, raster.height, j_first, j_last);
-  j_first = std::max(j_first, band.first), j_last = std::min(j_last, band.last);
-  if (i_first > i_last || j_first > j_last) return;
-  const int32_t id = static_cast<int32_t>(reversed ? band.num_faces + f : f);
-  const auto m = barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height));
   const T near = band.settings.near, far = band.settings.far;
   const int64_t K = band.layers;
-
-  for (int64_t j = j_first; j <= j_last; ++j) {
-    const T yp = pixel_centre<T>(j, raster.height), row = static_cast<T>(j);
-    if (!(yp >= bottom && yp <= top)) continue;
-    for (int64_t i = i_first; i <= i_last; i += kGroup) {
+  for (int64_t j = std::max(row_first, band.first); j < std::min(row_last + 1, band.last); ++j) {
+    const auto covers = row(j);
+    for (int64_t i = column_first; i <= column_last; i += kGroup) {
       T depth[kGroup];
       int32_t covered[kGroup], any = 0;
       for (int64_t n = 0; n < kGroup; ++n) {
-        const T xp = band.centres[i + n], column = static_cast<T>(static_cast<int32_t>(i + n));
-        const bool outside = ((yp - y[0]) * (x[1] - x[0]) < (xp - x[0]) * (y[1] - y[0])) |
-                             ((yp - y[1]) * (x[2] - x[1]) < (xp - x[1]) * (y[2] - y[1])) |
-                             ((yp - y[2]) * (x[0] - x[2]) < (xp - x[2]) * (y[0] - y[2]));
-        T w[3];
-        for (int k = 0; k < 3; ++k)
-          w[k] = clamp_weight(column * m.m[k][0] + m.m[k][1] * row + m.m[k][2]);
-        const T sum = w[0] + w[1] + w[2];
-        depth[n] = perspective ? 1 / (w[0] / sum / z[0] + w[1] / sum / z[1] + w[2] / sum / z[2])
-                               : w[0] / sum * z[0] + w[1] / sum * z[1] + w[2] / sum * z[2];
-        covered[n] = !outside & (xp >= left) & (xp <= right) & (depth[n] > near) & (depth[n] < far);
+        const bool reached = covers(i + n, depth[n]);
+        covered[n] = reached & (depth[n] > near) & (depth[n] < far);
         any |= covered[n];
       }
-      if (!any) continue;
-      const int64_t lanes = std::min(kGroup, i_last - i + 1);
+      const int64_t lanes = any ? std::min(kGroup, column_last - i + 1) : 0;
       for (int64_t n = 0; n < lanes; ++n) {
         T* depths = band.depth + ((j - band.first) * raster.width + i + n) * K;
         if (!covered[n] || !(depth[n] < depths[K - 1])) continue;
         int32_t* face_indices =
             band.face_index + ((raster.height - 1 - j) * raster.width + i + n) * K;
-        insert_sorted(depth[n], id, K, depths, face_indices);
+        int64_t k = K - 1;
+        for (; k > 0 && depth[n] < depths[k - 1]; --k) {
+          depths[k] = depths[k - 1];
+          face_indices[k] = face_indices[k - 1];
+        }
+        depths[k] = depth[n];
+        face_indices[k] = static_cast<int32_t>(id);
       }
     }
   }
 }
 
-// Inserts all faces of the image.
+template <bool perspective, class T>
+NMR_INLINE void insert_hard(const HardImage<T>& image, const LayerBand<T>& band, int64_t f,
+                            bool reversed) {
+  const Size raster = band.settings.raster;
+  const Triangle<T> t = load_triangle(image.vertices, image.faces + 3 * f, reversed);
+  const T *x = t.x, *y = t.y;
+  if ((y[2] - y[0]) * (x[1] - x[0]) < (y[1] - y[0]) * (x[2] - x[0])) return;
+  // As in the rasterizer, of the face's own order: rounding may find only one of the two orders
+  // flat.
+  if (!is_drawable(load_triangle(image.vertices, image.faces + 3 * f, false))) return;
+  const T left = min3(x[0], x[1], x[2]), right = max3(x[0], x[1], x[2]);
+  const T bottom = min3(y[0], y[1], y[2]), top = max3(y[0], y[1], y[2]);
+  int64_t i_first, i_last, j_first, j_last;
+  pixels_around(left, right, raster.width, 1, i_first, i_last);
+  pixels_around(bottom, top, raster.height, 1, j_first, j_last);
+  j_first = std::max(j_first, band.first);
+  j_last = std::min(j_last, band.last - 1);
+  if (i_first > i_last || j_first > j_last) return;
+  while (j_first <= j_last && pixel_centre<T>(j_first, raster.height) < bottom) ++j_first;
+  while (j_first <= j_last && pixel_centre<T>(j_last, raster.height) > top) --j_last;
+  const auto matrix =
+      barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height));
+  const auto row = [&](int64_t j) {
+    const T yp = pixel_centre<T>(j, raster.height);
+    return [&, yp, j](int64_t i, T& depth) {
+      const T xp = image.columns[i];
+      T w[3];
+      weights_at(matrix, static_cast<T>(static_cast<int32_t>(i)), static_cast<T>(j), w);
+      depth = depth_at(w, t.z, perspective);
+      const bool outside = ((yp - y[0]) * (x[1] - x[0]) < (xp - x[0]) * (y[1] - y[0])) |
+                           ((yp - y[1]) * (x[2] - x[1]) < (xp - x[1]) * (y[2] - y[1])) |
+                           ((yp - y[2]) * (x[0] - x[2]) < (xp - x[2]) * (y[0] - y[2]));
+      return !outside & (xp >= left) & (xp <= right);
+    };
+  };
+  insert_face(band, reversed ? image.num_faces + f : f, i_first, i_last, j_first, j_last, row);
+}
+
+// Inserts all faces that cover pixels.
 template <class T>
-void fill_layers(const LayerBand<T>& band) {
+void fill_hard(const HardImage<T>& image, const LayerBand<T>& band) {
   for (int reversed = 0; reversed <= band.settings.fill_back; ++reversed)
-    for (int64_t f = 0; f < band.num_faces; ++f)
-      band.settings.perspective ? insert_face<true>(band, f, reversed)
-                                : insert_face<false>(band, f, reversed);
+    for (int64_t f = 0; f < image.num_faces; ++f)
+      band.settings.perspective ? insert_hard<true>(image, band, f, reversed)
+                                : insert_hard<false>(image, band, f, reversed);
+}
+
+// Inserts all faces that reach pixels.
+template <class T>
+void fill_soft(const SoftImage<T>& image, const LayerBand<T>& band) {
+  for (int64_t f = 0; f < image.num_faces; ++f) {
+    SoftFace<T> face;
+    if (!set_up_face(image, f, face)) continue;
+    T z[3];
+    for (int k = 0; k < 3; ++k) z[k] = image.vertices[3 * face.corner[k] + 2];
+    const auto row = [&](int64_t j) {
+      const T py = image.row(j);
+      return [&, py](int64_t i, T& depth) {
+        const T px = image.columns[i];
+        depth = SoftWeights<T>(face.x, face.y, px, py).depth(z, image.settings.perspective);
+        return evaluate<T, false>(face, px, py, image.sigma, image.reach).reaches;
+      };
+    };
+    insert_face(band, face.back ? image.num_faces + f : f, face.column_first, face.column_last,
+                face.row_first, face.row_last, row);
+  }
 }

@@ -12,7 +12,7 @@ NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& 
   const int32_t* ids = scratch.visible.ids.data() + 1;
   const int64_t count = scratch.visible.count - 1;
   T* table = scratch.table.data();
-  for (int64_t n = 0; n < kEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
+  for (int64_t n = 0; n < kFaceEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
   const Lanes<T> width = splat(static_cast<T>(W)),
                  height = splat(static_cast<T>(block.raster.height));
   for (int64_t start = 0; start < count; start += kLanes) {
@@ -47,7 +47,7 @@ NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& 
       T rows[kLanes][4];
       store_quads<T>(column[quad], rows);
       for (int64_t n = 0; n < kLanes; ++n)
-        std::copy_n(rows[n], 4, table + (start + 1 + n) * kEntry + 4 * quad);
+        std::copy_n(rows[n], 4, table + (start + 1 + n) * kFaceEntry + 4 * quad);
     }
   }
 }
@@ -72,26 +72,20 @@ NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32
   const T* entry[kLanes];
   for (int64_t n = 0; n < kLanes; ++n) {
     p.slot[n] = slots.lane[n];
-    entry[n] = scratch.table.data() + p.slot[n] * kEntry;
+    entry[n] = scratch.table.data() + p.slot[n] * kFaceEntry;
   }
   Lanes<T> column[4][4];
   for (int quad = 0; quad < 4; ++quad) {
     load_quads<T>(entry, column[quad]);
     for (int64_t n = 0; n < kLanes; ++n) entry[n] += 4;
   }
-  const Lanes<T> x = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i))),
-                 zero = splat(T(0)), one = splat(T(1));
-  Lanes<T> raw[3];
-  for (int k = 0; k < 3; ++k)  // clamp_weight of geometry.h
-    raw[k] = min_of(max_of(column[0][k] * x + column[1][k] * y + column[2][k], zero), one);
-  const Lanes<T> sum = raw[0] + raw[1] + raw[2];
+  const Lanes<T> x = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i)));
   for (int k = 0; k < 3; ++k) {
-    p.w[k] = raw[k] / sum;
+    p.w[k] = column[0][k] * x + column[1][k] * y + column[2][k];
     p.corner_z[k] = column[3][k];
   }
-  p.z = scratch.perspective
-            ? one / (p.w[0] / p.corner_z[0] + p.w[1] / p.corner_z[1] + p.w[2] / p.corner_z[2])
-            : p.w[0] * p.corner_z[0] + p.w[1] * p.corner_z[1] + p.w[2] * p.corner_z[2];
+  normalize_weights(p.w, splat(T(0)), splat(T(1)));
+  p.z = lane_depths(p.w, p.corner_z, splat(T(1)), scratch.perspective);
   return p;
 }
 
@@ -111,82 +105,57 @@ NMR_INLINE void for_covered(const FragmentBlock<T>& block, int64_t j, const Visi
   }
 }
 
-// Depths of row j; out has room for eight more.
-template <class T>
-NMR_INLINE void depth_row(const FragmentBlock<T>& block, int64_t j, Lanes<T> far,
-                          const FragmentScratch<T>& scratch, T* out) {
-  for_covered(
-      block, j,
-      [&](int64_t i, Lanes32 ids, Lanes<T> y) {
-        const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
-        store_lanes(out + i, choose(widen_mask<T>(ids >= splat(int32_t(0))), p.z, far));
-      },
-      [&](int64_t i) { store_lanes(out + i, far); });
-}
-
 // --- forward
 
-// Fills the block's rows of a depth image.
+// Writes weights and depths of eight pixels: w at those of the face's own corners, 0 on background.
 template <class T>
-void depth_forward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b,
-                         FragmentScratch<T>& scratch) {
-  const int64_t W = block.raster.width, w = args.image.width;
-  set_up_faces(block, scratch);
-  T* image = args.depth + b * args.image.pixels();
-  T *upper = scratch.rows.data(), *lower = upper + W + kLanes;
-  const Lanes<T> far = splat(args.far);
-  if (!args.anti_aliasing) {
-    for (int64_t j = block.first; j < block.last; ++j) {
-      depth_row(block, j, far, scratch, upper);
-      std::copy_n(upper, w, image + j * w);
-    }
-    return;
-  }
-  for (int64_t j = block.first; j < block.last; j += 2) {
-    depth_row(block, j, far, scratch, upper);
-    depth_row(block, j + 1, far, scratch, lower);
-    T* mean = image + j / 2 * w;
-    for (int64_t i = 0; i < w; ++i)
-      mean[i] = (upper[2 * i] + upper[2 * i + 1] + lower[2 * i] + lower[2 * i + 1]) / 4;
-  }
+NMR_INLINE void store_weights(const FragmentPixels<T>& p, Lanes32 ids, int64_t num_faces,
+                              bool perspective, int64_t count, T* weights) {
+  const LaneMask<T> drawn = widen_mask<T>(ids >= splat(int32_t(0)));
+  const LaneMask<T> reversed = widen_mask<T>(ids >= splat(static_cast<int32_t>(num_faces)));
+  Lanes<T> at[3];
+  for (int k = 0; k < 3; ++k)
+    at[k] = choose(drawn, perspective ? p.w[k] * p.z / p.corner_z[k] : p.w[k], splat(T(0)));
+  T value[3][kLanes];
+  store_lanes(value[0], choose(reversed, at[2], at[0]));
+  store_lanes(value[1], at[1]);
+  store_lanes(value[2], choose(reversed, at[0], at[2]));
+  for (int64_t n = 0; n < count; ++n)
+    for (int k = 0; k < 3; ++k) weights[3 * n + k] = value[k][n];
 }
 
-// Fills the block's rows of weights and depths.
+// Fills the block's rows of depths and, if they are wanted, of weights.
 template <class T>
-void fragments_forward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b,
-                             FragmentScratch<T>& scratch) {
-  const int64_t W = block.raster.width;
+void forward_block(const Fragments<T>& args, const FragmentBlock<T>& block,
+                   FragmentScratch<T>& scratch) {
+  const int64_t W = block.raster.width, w = args.image.width, scale = args.anti_aliasing ? 2 : 1;
   set_up_faces(block, scratch);
-  const Lanes<T> far = splat(args.far), zero = splat(T(0));
+  T *upper = scratch.rows.data(), *lower = upper + W + kLanes;
+  const Lanes<T> far = splat(args.far);
   for (int64_t j = block.first; j < block.last; ++j) {
-    T* depth = args.depth + b * block.raster.pixels() + j * W;
-    T* weights = args.weights + 3 * (b * block.raster.pixels() + j * W);
+    T* row = j % scale ? lower : upper;  // blocks begin with an even row
+    T* weights =
+        args.weights ? args.weights + 3 * (block.b * block.raster.pixels() + j * W) : nullptr;
     for_covered(
         block, j,
         [&](int64_t i, Lanes32 ids, Lanes<T> y) {
           const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
-          const LaneMask<T> drawn = widen_mask<T>(ids >= splat(int32_t(0)));
-          const LaneMask<T> reversed =
-              widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
-          Lanes<T> at[3];
-          for (int k = 0; k < 3; ++k)
-            at[k] =
-                choose(drawn, scratch.perspective ? p.w[k] * p.z / p.corner_z[k] : p.w[k], zero);
-          T value[3][kLanes], z[kLanes];
-          store_lanes(z, choose(drawn, p.z, far));
-          store_lanes(value[0], choose(reversed, at[2], at[0]));
-          store_lanes(value[1], at[1]);
-          store_lanes(value[2], choose(reversed, at[0], at[2]));
-          const int64_t count = std::min(kLanes, W - i);
-          std::copy_n(z, count, depth + i);
-          for (int64_t n = 0; n < count; ++n)
-            for (int k = 0; k < 3; ++k) weights[3 * (i + n) + k] = value[k][n];
+          store_lanes(row + i, choose(widen_mask<T>(ids >= splat(int32_t(0))), p.z, far));
+          if (weights)
+            store_weights(p, ids, block.num_faces, scratch.perspective, std::min(kLanes, W - i),
+                          weights + 3 * i);
         },
         [&](int64_t i) {
-          const int64_t count = std::min(kLanes, W - i);
-          std::fill_n(depth + i, count, args.far);
-          std::fill_n(weights + 3 * i, 3 * count, T(0));
+          store_lanes(row + i, far);
+          if (weights) std::fill_n(weights + 3 * i, 3 * std::min(kLanes, W - i), T(0));
         });
+    T* depth = args.depth + block.b * args.image.pixels() + j / scale * w;
+    if (!args.anti_aliasing) {
+      std::copy_n(upper, w, depth);
+    } else if (j % 2) {
+      for (int64_t i = 0; i < w; ++i)
+        depth[i] = (upper[2 * i] + upper[2 * i + 1] + lower[2 * i] + lower[2 * i + 1]) / 4;
+    }
   }
 }
 
@@ -236,60 +205,89 @@ NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot,
     for (int c = 0; c < 9; ++c) out[c] = value[c][n];
 }
 
+// The values of eight faces in the table: M_k0 and M_k1, and the depths of the corners.
+template <class T>
+struct FaceLanes {
+  Lanes<T> mx[4], my[4], z[4];
+};
+
+// Sums kNumbers numbers per face over its pixels: add(j, i, ids, pixels, sums) adds those of the
+// eight pixels from (j, i) on, start_row(j) is called before. gradients(sums, slot, faces, out)
+// then computes the gradients of eight faces: out[3 k + c] is that of coordinate c of corner k.
+template <int64_t kNumbers, class T, class StartRow, class Add, class Gradients>
+NMR_INLINE void backward_block(const FragmentBlock<T>& block, FragmentScratch<T>& scratch,
+                               FaceGradients<T>& result, const StartRow& start_row, const Add& add,
+                               const Gradients& gradients) {
+  set_up_faces(block, scratch);
+  result.list(scratch.visible.ids.data() + 1, scratch.visible.count - 1);
+  T* sums = scratch.sums.data();
+  std::fill_n(sums, kNumbers * (scratch.visible.count + kLanes), T(0));
+  for (int64_t j = block.first; j < block.last; ++j) {
+    start_row(j);
+    for_covered(
+        block, j,
+        [&](int64_t i, Lanes32 ids, Lanes<T> y) {
+          add(j, i, ids, evaluate<T>(scratch, ids, i, y), sums);
+        },
+        [](int64_t) {});
+  }
+  const T* table = scratch.table.data();
+  for (int64_t slot = 1; slot < scratch.visible.count; slot += kLanes) {
+    FaceLanes<T> faces;
+    load_face_quads<T>(table, slot, kFaceEntry, faces.mx);
+    load_face_quads<T>(table + 4, slot, kFaceEntry, faces.my);
+    load_face_quads<T>(table + 12, slot, kFaceEntry, faces.z);
+    Lanes<T> out[9];
+    gradients(sums, slot, faces, out);
+    store_face_gradients<T>(out, slot, result);
+  }
+}
+
 // With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k
 // = S_k sum_m M_m0 / z_m. Without perspective c = g:  grad z_k = S_k,  grad X_k = -S_k sum_m M_m0
 // z_m.
 template <class T>
-void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& block, int64_t b,
+void depth_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block,
                           FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t W = block.raster.width, w = args.image.width;
-  set_up_faces(block, scratch);
-  result.list(scratch.visible.ids.data() + 1, scratch.visible.count - 1);
-  T *grad = scratch.rows.data(), *sums = scratch.sums.data();
+  T* grad = scratch.rows.data();
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));
-  std::fill_n(sums, 4 * (scratch.visible.count + kLanes), T(0));
+  const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
+                 half_height = splat(static_cast<T>(block.raster.height) / 2);
   std::fill_n(grad + W, kLanes, T(0));
-  for (int64_t j = block.first; j < block.last; ++j) {
+  const auto start_row = [&](int64_t j) {
     const T* upstream =
-        args.grad_depth + b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
+        args.grad_depth + block.b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
     if (!args.anti_aliasing) {
       std::copy_n(upstream, w, grad);
     } else if (j % 2 == 0) {  // blocks begin with an even row
       for (int64_t i = 0; i < w; ++i) grad[2 * i] = grad[2 * i + 1] = upstream[i] / 4;
     }
-    for_covered(
-        block, j,
-        [&](int64_t i, Lanes32 ids, Lanes<T> y) {
-          const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
-          const Lanes<T> z = scratch.perspective ? depth_or_zero<T>(p.z) : one;
-          const Lanes<T> c = load_lanes<Lanes<T>>(grad + i) * z * z;
-          add_to_faces<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p, 4, sums);
-        },
-        [](int64_t) {});
-  }
-  const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
-                 half_height = splat(static_cast<T>(block.raster.height) / 2);
-  for (int64_t slot = 1; slot < scratch.visible.count; slot += kLanes) {
-    Lanes<T> sum[4], mx[4], my[4], z[4], out[9];
-    const T* table = scratch.table.data();
+  };
+  const auto add = [&](int64_t, int64_t i, Lanes32, const FragmentPixels<T>& p, T* sums) {
+    const Lanes<T> z = scratch.perspective ? depth_or_zero<T>(p.z) : one;
+    const Lanes<T> c = load_lanes<Lanes<T>>(grad + i) * z * z;
+    add_to_faces<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p, 4, sums);
+  };
+  const auto gradients = [&](const T* sums, int64_t slot, const FaceLanes<T>& faces,
+                             Lanes<T>(&out)[9]) {
+    Lanes<T> sum[4];
     load_face_quads<T>(sums, slot, 4, sum);
-    load_face_quads<T>(table, slot, kEntry, mx);
-    load_face_quads<T>(table + 4, slot, kEntry, my);
-    load_face_quads<T>(table + 12, slot, kEntry, z);
+    const Lanes<T>(&z)[4] = faces.z;
     const auto slope = [&](const Lanes<T>(&m)[4]) {
       return moderate_or_zero<T>(scratch.perspective
                                      ? m[0] / z[0] + m[1] / z[1] + m[2] / z[2]
                                      : zero - (m[0] * z[0] + m[1] * z[1] + m[2] * z[2]));
     };
-    const Lanes<T> slope_x = slope(mx) * half_width, slope_y = slope(my) * half_height;
+    const Lanes<T> slope_x = slope(faces.mx) * half_width, slope_y = slope(faces.my) * half_height;
     for (int k = 0; k < 3; ++k) {
       out[3 * k] = sum[k] * slope_x;
       out[3 * k + 1] = sum[k] * slope_y;
       out[3 * k + 2] =
           scratch.perspective ? sum[k] * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k];
     }
-    store_face_gradients<T>(out, slot, result);
-  }
+  };
+  backward_block<4>(block, scratch, result, start_row, add, gradients);
 }
 
 // With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m /
@@ -297,65 +295,51 @@ void depth_backward_block(const DepthImage<T>& args, const FragmentBlock<T>& blo
 // pixels of h_m w_k. Without perspective h_m = u_m + g z_m:  grad z_m = sum over pixels of g w_m,
 // grad X_k = -sum_m H_mk M_m0.
 template <class T>
-void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block, int64_t b,
+void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block,
                               FragmentScratch<T>& scratch, FaceGradients<T>& result) {
   const int64_t W = block.raster.width;
-  set_up_faces(block, scratch);
-  result.list(scratch.visible.ids.data() + 1, scratch.visible.count - 1);
-  T* sums = scratch.sums.data();
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));
-  std::fill_n(sums, 12 * (scratch.visible.count + kLanes), T(0));
-  for (int64_t j = block.first; j < block.last; ++j) {
-    const int64_t row = b * block.raster.pixels() + j * W;
-    for_covered(
-        block, j,
-        [&](int64_t i, Lanes32 ids, Lanes<T> y) {
-          const FragmentPixels<T> p = evaluate<T>(scratch, ids, i, y);
-          const int64_t count = std::min(kLanes, W - i);
-          Lanes<T> h[3] = {zero, zero, zero}, by_depth = zero;
-          if (args.grad_depth) {
-            T grad[kLanes] = {};
-            std::copy_n(args.grad_depth + row + i, count, grad);
-            const Lanes<T> g = load_lanes<Lanes<T>>(grad), deep = depth_or_zero<T>(p.z);
-            if (scratch.perspective) {
-              h[0] = h[1] = h[2] = (zero - g) * deep * deep;
-            } else {
-              by_depth = g;
-              for (int m = 0; m < 3; ++m) h[m] = g * depth_or_zero<T>(p.corner_z[m]);
-            }
-          }
-          if (args.grad_weights) {
-            T grad[3][kLanes] = {};
-            for (int64_t n = 0; n < count; ++n)
-              for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (row + i + n) + m];
-            const LaneMask<T> reversed =
-                widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
-            const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]),
-                           last = load_lanes<Lanes<T>>(grad[2]);
-            const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
-                                   choose(reversed, first, last)};
-            Lanes<T> mean = zero;
-            if (scratch.perspective)
-              for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
-            const Lanes<T> scale = scratch.perspective ? p.z : one;
-            for (int m = 0; m < 3; ++m) h[m] = h[m] + scale * (u[m] - mean);
-          }
-          for (int m = 0; m < 3; ++m)
-            add_to_faces<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p, 12,
-                            sums + 4 * m);
-        },
-        [](int64_t) {});
-  }
   const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
                  half_height = splat(static_cast<T>(block.raster.height) / 2);
-  for (int64_t slot = 1; slot < scratch.visible.count; slot += kLanes) {
-    Lanes<T> sum[3][4], mx[4], my[4], z[4], slope_x[3], slope_y[3], out[9];
-    const T* table = scratch.table.data();
-    for (int m = 0; m < 3; ++m) load_face_quads<T>(sums + 4 * m, slot, 12, sum[m]);
-    load_face_quads<T>(table, slot, kEntry, mx);
-    load_face_quads<T>(table + 4, slot, kEntry, my);
-    load_face_quads<T>(table + 12, slot, kEntry, z);
+  const auto add = [&](int64_t j, int64_t i, Lanes32 ids, const FragmentPixels<T>& p, T* sums) {
+    const int64_t at = block.b * block.raster.pixels() + j * W + i, count = std::min(kLanes, W - i);
+    Lanes<T> h[3] = {zero, zero, zero}, by_depth = zero;
+    if (args.grad_depth) {
+      T grad[kLanes] = {};
+      std::copy_n(args.grad_depth + at, count, grad);
+      const Lanes<T> g = load_lanes<Lanes<T>>(grad), deep = depth_or_zero<T>(p.z);
+      if (scratch.perspective) {
+        h[0] = h[1] = h[2] = (zero - g) * deep * deep;
+      } else {
+        by_depth = g;
+        for (int m = 0; m < 3; ++m) h[m] = g * depth_or_zero<T>(p.corner_z[m]);
+      }
+    }
+    if (args.grad_weights) {
+      T grad[3][kLanes] = {};
+      for (int64_t n = 0; n < count; ++n)
+        for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (at + n) + m];
+      const LaneMask<T> reversed =
+          widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
+      const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]), last = load_lanes<Lanes<T>>(grad[2]);
+      const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
+                             choose(reversed, first, last)};
+      Lanes<T> mean = zero;
+      if (scratch.perspective)
+        for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
+      const Lanes<T> scale = scratch.perspective ? p.z : one;
+      for (int m = 0; m < 3; ++m) h[m] = h[m] + scale * (u[m] - mean);
+    }
+    for (int m = 0; m < 3; ++m)
+      add_to_faces<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p, 12,
+                      sums + 4 * m);
+  };
+  const auto gradients = [&](const T* sums, int64_t slot, const FaceLanes<T>& faces,
+                             Lanes<T>(&out)[9]) {
+    const auto& [mx, my, z] = faces;
+    Lanes<T> sum[3][4], slope_x[3], slope_y[3];
     for (int m = 0; m < 3; ++m) {
+      load_face_quads<T>(sums + 4 * m, slot, 12, sum[m]);
       slope_x[m] = moderate_or_zero<T>(scratch.perspective ? mx[m] / z[m] : mx[m]) * half_width;
       slope_y[m] = moderate_or_zero<T>(scratch.perspective ? my[m] / z[m] : my[m]) * half_height;
     }
@@ -368,6 +352,6 @@ void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& 
                            ? (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k]))
                            : sum[k][3];
     }
-    store_face_gradients<T>(out, slot, result);
-  }
+  };
+  backward_block<12>(block, scratch, result, [](int64_t) {}, add, gradients);
 }

@@ -3,12 +3,18 @@
 // an edge, so the order of operations is part of the definition.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 
 #include "parallel.h"
 
 namespace nmr {
+
+// The face that a face index names, which may be a reversed copy; -1 on background.
+NMR_INLINE int64_t face_of(int64_t id, int64_t num_faces) {
+  return id < num_faces ? id : id - num_faces;
+}
 
 // Centre of raster column (or row) i in [-1, 1]; size: the number of columns (or rows).
 template <class T>
@@ -21,6 +27,18 @@ NMR_INLINE T pixel_centre(int64_t i, int64_t size) {
 template <class T>
 NMR_INLINE T to_pixel(T x, T size) {
   return (x * size + size - 1) / 2;
+}
+
+// The pixels from `margin` before to `margin` + 1 behind those whose centres lie in [lo, hi], up to
+// rounding.
+template <class T>
+NMR_INLINE void pixels_around(T lo, T hi, int64_t size, int64_t margin, int64_t& first,
+                              int64_t& last) {
+  const T n = static_cast<T>(size), from = to_pixel(lo, n), to = to_pixel(hi, n);
+  first =
+      std::max<int64_t>(0, static_cast<int64_t>(from > 0 ? (from < n ? from : n) : T(0)) - margin);
+  last = std::min<int64_t>(size - 1,
+                           static_cast<int64_t>(to > -1 ? (to < n ? to : n) : T(-2)) + 1 + margin);
 }
 
 // One face on the screen: corners in [-1, 1] and depths, in drawing order.
@@ -78,6 +96,23 @@ template <class T>
 NMR_INLINE T clamp_weight(T w) {
   w = w > 0 ? w : T(0);
   return w < 1 ? w : T(1);
+}
+
+// Weights of the corners at pixel coordinates (X, Y): clamped, and divided by their sum. NaN if all
+// are 0, which no drawn face has.
+template <class T>
+NMR_INLINE void weights_at(const BarycentricMatrix<T>& matrix, T X, T Y, T (&w)[3]) {
+  for (int k = 0; k < 3; ++k)
+    w[k] = clamp_weight(matrix.m[k][0] * X + matrix.m[k][1] * Y + matrix.m[k][2]);
+  const T sum = w[0] + w[1] + w[2];
+  for (T& weight : w) weight /= sum;
+}
+
+// Depth at such weights, of a face with corners at depths z.
+template <class T>
+NMR_INLINE T depth_at(const T* w, const T* z, bool perspective) {
+  return perspective ? 1 / (w[0] / z[0] + w[1] / z[1] + w[2] / z[2])
+                     : w[0] * z[0] + w[1] * z[1] + w[2] * z[2];
 }
 
 template <class T>

@@ -1,36 +1,38 @@
-// The K nearest faces at each pixel, by the same tests and the same depth as in the rasterizer: the
-// first layer is its face index map.
+// The K nearest faces at each pixel: of those that cover it, by the same tests and the same depth
+// as in the rasterizer, so that the first layer is its face index map; or of those that reach it,
+// as SoftRas takes them.
 //
 // Faces are visited in ascending order, all originals, then all reversed copies, and inserted into
-// the sorted list of each pixel that they cover, behind those that are equally near. Bands of rows
-// are independent.
+// the sorted list of each pixel, behind those that are equally near. Bands of rows are independent.
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <vector>
 
-#include "geometry.h"
-#include "insert_sorted.h"
-#include "parallel.h"
-#include "stages.h"
+#include "blocks.h"
+#include "soft_faces.h"
+#include "soft_weights.h"
 
 namespace nmr {
 namespace {
 
-constexpr int64_t kGroup = 16;     // pixels evaluated together
-constexpr int64_t kBandRows = 32;  // rows per task
-
-// Rows [first, last] of one image, from the bottom.
+// The lists of the rows first, ..., last - 1 (from the bottom) of one image.
 template <class T>
 struct LayerBand {
+  RasterSettings<T> settings;
+  int64_t layers, first, last;
+  T* depth;             // [rows, W, K], sorted; `far` without a face
+  int32_t* face_index;  // [H, W, K] of the image, row 0 = top
+};
+
+// One image whose faces cover pixels.
+template <class T>
+struct HardImage {
   const T* vertices;
   const int64_t* faces;
   int64_t num_faces;
-  RasterSettings<T> settings;
-  int64_t layers, first, last;
-  const T* centres;     // centres of the columns, padded to whole groups
-  T* depth;             // [rows, W, K], sorted; `far` without a face
-  int32_t* face_index;  // [H, W, K] of the image, row 0 = top
+  const T* columns;  // pixel centres, padded to whole groups
 };
 
 }  // namespace
@@ -41,35 +43,45 @@ struct LayerBand {
 #include "levels.h"
 
 namespace nmr {
+namespace {
+
+// Calls fill(b, band) for bands of all images, with empty lists.
+template <class Args, class T, class Fill>
+void fill_bands(const Args& args, const RasterSettings<T>& settings, const Fill& fill) {
+  const int64_t H = settings.raster.height, row = settings.raster.width * args.layers;
+  const auto start = [&](int64_t b, int64_t first, int64_t last) {
+    std::vector<T> depth((last - first) * row, settings.far);
+    int32_t* face_index = args.face_index + b * H * row;
+    std::fill_n(face_index + (H - last) * row, (last - first) * row, -1);
+    fill(b, LayerBand<T>{settings, args.layers, first, last, depth.data(), face_index});
+  };
+  for_bands(args.mesh.batch, H, kBandRows, args.num_threads, start);
+}
+
+}  // namespace
 
 template <class T>
 void rasterize_layers(const RasterizeLayers<T>& args) {
-  const Size raster = args.settings.raster;
-  const int64_t K = args.layers, bands = (raster.height + kBandRows - 1) / kBandRows;
-  std::vector<T> centres(raster.width + kGroup);
-  for (int64_t i = 0; i < raster.width + kGroup; ++i) centres[i] = pixel_centre<T>(i, raster.width);
-  parallel_for(args.mesh.batch * bands, args.num_threads, [&](int64_t task) {
-    const int64_t b = task / bands, first = task % bands * kBandRows,
-                  last = std::min(first + kBandRows, raster.height) - 1;
-    std::vector<T> depth((last - first + 1) * raster.width * K, args.settings.far);
-    int32_t* face_index = args.face_index + b * raster.pixels() * K;
-    std::fill_n(face_index + (raster.height - 1 - last) * raster.width * K,
-                (last - first + 1) * raster.width * K, -1);
-    const LayerBand<T> band{args.mesh.image_vertices(b),
-                            args.mesh.image_faces(b),
-                            args.mesh.face_count(b),
-                            args.settings,
-                            K,
-                            first,
-                            last,
-                            centres.data(),
-                            depth.data(),
-                            face_index};
-    NMR_AT_BEST_LEVEL(fill_layers, band);
+  const int64_t W = args.settings.raster.width;
+  std::vector<T> columns(W + kGroup);
+  for (int64_t i = 0; i < W + kGroup; ++i) columns[i] = pixel_centre<T>(i, W);
+  fill_bands(args, args.settings, [&](int64_t b, const LayerBand<T>& band) {
+    const HardImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b),
+                             args.mesh.face_count(b), columns.data()};
+    NMR_AT_BEST_LEVEL(fill_hard, image, band);
   });
 }
 
-template void rasterize_layers(const RasterizeLayers<float>&);
-template void rasterize_layers(const RasterizeLayers<double>&);
+template <class T>
+void soft_layers(const SoftLayers<T>& args) {
+  const std::vector<T> columns = scaled_columns<T>(args.settings.raster.raster);
+  fill_bands(args, args.settings.raster, [&](int64_t b, const LayerBand<T>& band) {
+    const SoftImage<T> image = soft_image(args.mesh, args.settings, b, columns.data());
+    NMR_AT_BEST_LEVEL(fill_soft, image, band);
+  });
+}
+
+NMR_FLOAT_AND_DOUBLE(rasterize_layers, RasterizeLayers)
+NMR_FLOAT_AND_DOUBLE(soft_layers, SoftLayers)
 
 }  // namespace nmr

@@ -1,8 +1,6 @@
-// Eight values that are processed together (lanes), for one level: levels.h includes this file in
+// kLanes values that are processed together (lanes), for one level: levels.h includes this file in
 // the namespace of each. A vector that does not fit into a register of the level is two halves.
 // Every operation treats each lane separately, so results do not depend on the level.
-
-constexpr int64_t kLanes = 8;
 
 // Two vectors of half the lanes.
 template <class V>
@@ -182,6 +180,21 @@ NMR_INLINE E least_lane(Lanes<E> v) {
 template <class T>
 NMR_INLINE Lanes<T> pixel_coordinates(Lanes<T> x, Lanes<T> size) {
   return (x * size + size - splat(T(1))) / splat(T(2));
+}
+
+// weights_at of geometry.h, from weights that are neither clamped nor divided by their sum.
+template <class V>
+NMR_INLINE void normalize_weights(V (&w)[3], V zero, V one) {
+  for (V& weight : w) weight = min_of(max_of(weight, zero), one);
+  const V sum = w[0] + w[1] + w[2];
+  for (V& weight : w) weight = weight / sum;
+}
+
+// depth_at of geometry.h
+template <class V>
+NMR_INLINE V lane_depths(const V (&w)[3], const V (&z)[3], V one, bool perspective) {
+  if (!perspective) return w[0] * z[0] + w[1] * z[1] + w[2] * z[2];
+  return one / (w[0] / z[0] + w[1] / z[1] + w[2] / z[2]);
 }
 
 // Each lane converted to the element type of `To`; to integers truncated, and then every lane must

@@ -1,4 +1,4 @@
-// Lights on the visible faces, and their normals. struct Lit in stages.h has the definition.
+// Lights on the visible faces, and their normals. struct LitColors in stages.h has the definition.
 //
 // Where the light depends only on the face (flat, no point lights, no highlights) it is computed
 // once per visible face.
@@ -73,7 +73,7 @@ struct Lights {
 
 // Calls body(first value in `parameters`, value) for every parameter of image b.
 template <class T, class Body>
-void for_parameters(const Lit<T>& args, int64_t b, Lights<T>& lights, const Body& body) {
+void for_parameters(const LitColors<T>& args, int64_t b, Lights<T>& lights, const Body& body) {
   const auto at = [&](LightParameter name, int64_t n, int64_t width) {
     const int64_t* l = args.layout + 3 * static_cast<int>(name);
     return l[0] + ((l[1] == 1 ? 0 : b) * l[2] + (l[2] == 1 ? 0 : n)) * width;
@@ -101,7 +101,7 @@ void for_parameters(const Lit<T>& args, int64_t b, Lights<T>& lights, const Body
 
 // Number of lights of a kind: the largest of its parameters, 0 if one has none.
 template <class T>
-int64_t light_count(const Lit<T>& args, LightParameter first, int64_t parameters) {
+int64_t light_count(const LitColors<T>& args, LightParameter first, int64_t parameters) {
   int64_t most = 0;
   for (int64_t n = 0; n < parameters; ++n) {
     const int64_t count = args.layout[3 * (static_cast<int64_t>(first) + n) + 2];
@@ -112,7 +112,7 @@ int64_t light_count(const Lit<T>& args, LightParameter first, int64_t parameters
 }
 
 template <class T>
-Lights<T> lights_of(const Lit<T>& args, int64_t b) {
+Lights<T> lights_of(const LitColors<T>& args, int64_t b) {
   Lights<T> lights{};
   lights.ambient_color.setZero();
   if (!args.parameters) return lights;
@@ -128,7 +128,7 @@ Lights<T> lights_of(const Lit<T>& args, int64_t b) {
 
 // Whether the light varies over a face.
 template <class T>
-bool uses_position(const Lit<T>& args) {
+bool uses_position(const LitColors<T>& args) {
   return args.parameters && (light_count(args, LightParameter::point, 4) > 0 ||
                              light_count(args, LightParameter::specular, 2) > 0);
 }
@@ -253,7 +253,7 @@ void light_backward(const Lights<T>& lights, const SurfacePoint<T>& surface,
 
 // --- pixels
 
-constexpr double kShortest =
+constexpr double kShortestNormal =
     1e-5;  // an interpolated normal that is shorter stays short: its gradient is finite
 
 // Pointers to the values of image b, and the sign of its front normals.
@@ -264,7 +264,7 @@ struct View {
   int64_t first_normal;  // row of normals
   T side;                // factor of normals of faces that are seen from their front
 
-  View(const Lit<T>& args, int64_t b)
+  View(const LitColors<T>& args, int64_t b)
       : image(image_attributes(args.at, b)), viewer(args.viewer + 5 * b), side(viewer[4]) {
     const int64_t* s = args.at.starts ? args.at.starts + 2 * b : nullptr;
     vertices = args.at.attributes + 3 * image.first_row;
@@ -287,18 +287,18 @@ struct Pixel {
 };
 
 template <class T>
-NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id, const T* weights,
-                             bool position) {
+NMR_INLINE Pixel<T> pixel_of(const LitColors<T>& args, const View<T>& view, int64_t id,
+                             const T* weights, bool position) {
   const int64_t F = view.image.num_faces;
   Pixel<T> p;
-  p.face = id < F ? id : id - F;
+  p.face = face_of(id, F);
   p.corners = view.image.corners + 3 * p.face;
   p.sign = id < F ? view.side : -view.side;
   p.length = 1;
   if (args.smooth) {
     p.mean.setZero();
     for (int k = 0; k < 3; ++k) p.mean += weights[k] * load3(view.normals + 3 * p.corners[k]);
-    p.length = std::max(p.mean.norm(), T(kShortest));
+    p.length = std::max(p.mean.norm(), T(kShortestNormal));
   } else {
     p.mean = load3(view.normals + 3 * p.face);
   }
@@ -314,30 +314,29 @@ NMR_INLINE Pixel<T> pixel_of(const Lit<T>& args, const View<T>& view, int64_t id
   return p;
 }
 
-constexpr int64_t kSums = 18;  // per visible face: of the normal (smooth: of three corners), of the
-                               // positions of the corners
+constexpr int64_t kLitSums = 18;  // per visible face: of the normal (smooth: of three corners), of
+                                  // the positions of the corners
 
 // The sums of a block: of visible faces, and of the lights.
 template <class T>
-struct LitSums {
-  VisibleFaces visible;
-  std::vector<T> values;  // [count, kSums]
-  std::vector<T> faces;   // [count, 3] light of each face, or its gradient
+struct LitSums : FaceSums<T> {
+  std::vector<T> faces;  // [count, 3] light of each face, or its gradient
   Lights<T> lights;
 };
 
 // The gradients of one pixel, or of one face if all its pixels are lit alike (weights: nullptr).
 template <class T>
-NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Lights<T>& lights,
-                               const Pixel<T>& p, const T* weights, const PixelLight<T>& grad,
-                               bool position, Lights<T>& grad_lights, T* sums, T* grad_weights) {
+NMR_INLINE void pixel_backward(const LitColors<T>& args, const View<T>& view,
+                               const Lights<T>& lights, const Pixel<T>& p, const T* weights,
+                               const PixelLight<T>& grad, bool position, Lights<T>& grad_lights,
+                               T* sums, T* grad_weights) {
   SurfacePoint<T> grad_surface{Vec3<T>::Zero(), Vec3<T>::Zero(), Vec3<T>::Zero()};
   if (args.parameters)
     light_backward(lights, p.surface, grad, grad_lights, grad_surface);
   else
     grad_surface.normal = grad.diffuse;
   Vec3<T> grad_mean = p.sign * grad_surface.normal;
-  if (args.smooth && p.length > T(kShortest)) {
+  if (args.smooth && p.length > T(kShortestNormal)) {
     const Vec3<T> unit = p.mean / p.length;
     grad_mean = (grad_mean - unit * unit.dot(grad_mean)) / p.length;
   } else if (args.smooth) {
@@ -361,7 +360,7 @@ NMR_INLINE void pixel_backward(const Lit<T>& args, const View<T>& view, const Li
 
 // The light of each visible face of the block, or its normal. Weights do not matter.
 template <class T>
-void light_faces(const Lit<T>& args, const View<T>& view, const Lights<T>& lights,
+void light_faces(const LitColors<T>& args, const View<T>& view, const Lights<T>& lights,
                  LitSums<T>& sums) {
   T* face = reserve(sums.faces, 3 * sums.visible.count);
   for (int64_t n = 1; n < sums.visible.count; ++n) {
@@ -372,17 +371,11 @@ void light_faces(const Lit<T>& args, const View<T>& view, const Lights<T>& light
   }
 }
 
-template <class T>
-void find_visible(const Lit<T>& args, const View<T>& view, const RowBlocks& blocks, int64_t begin,
-                  int64_t end, LitSums<T>& sums) {
-  sums.visible.reserve_for(view.image.num_faces, blocks.most_visible(view.image.num_faces));
-  sums.visible.find(args.at.face_index + begin, end - begin, view.image.num_faces);
-}
-
 // Pixels [begin, end) if the light depends only on the face. kColors: channels of colours; 0 means
 // white.
 template <int64_t kColors, class T>
-void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const LitSums<T>& sums) {
+void lit_faces_forward(const LitColors<T>& args, int64_t begin, int64_t end,
+                       const LitSums<T>& sums) {
   const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;
   const T *faces = sums.faces.data(), *colors = args.colors;
   T* lit = args.lit + 3 * begin;
@@ -399,7 +392,7 @@ void lit_faces_forward(const Lit<T>& args, int64_t begin, int64_t end, const Lit
 // Gradients of lit_faces_forward: those of colours, and in sums.values, from entry 9 of each face
 // on, of its light.
 template <int64_t kColors, class T>
-void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<T>& sums) {
+void lit_faces_backward(const LitColors<T>& args, int64_t begin, int64_t end, LitSums<T>& sums) {
   const int32_t *face_index = args.at.face_index, *slots = sums.visible.slots.data() + 1;
   const T *faces = sums.faces.data(), *grads = args.grad_lit, *colors = args.colors;
   T *grad_colors = kColors ? args.grad_colors : nullptr, *values = sums.values.data() + 9;
@@ -409,7 +402,7 @@ void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<
     if (face_index[n] < 0) continue;
     const int64_t slot = slots[face_index[n]];
     const T *grad = grads + 3 * n, *face = faces + 3 * slot;
-    T* sum = values + kSums * slot;
+    T* sum = values + kLitSums * slot;
     for (int k = 0; k < 3; ++k) {
       const int64_t at = kColors * n + (kColors == 3 ? k : 0);
       sum[k] += kColors ? colors[at] * grad[k] : grad[k];
@@ -420,15 +413,13 @@ void lit_faces_backward(const Lit<T>& args, int64_t begin, int64_t end, LitSums<
 
 // Pixels of a block.
 template <int64_t kColors, class T>
-void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block,
-                       LitSums<T>& sums) {
-  const int64_t H = args.at.raster.height, W = args.at.raster.width;
-  const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
-  const View<T> view(args, b);
-  const Lights<T> lights = lights_of(args, b);
+void lit_block_forward(const LitColors<T>& args, const RowBlock& block, LitSums<T>& sums) {
+  const int64_t begin = block.begin(), end = block.end();
+  const View<T> view(args, block.b);
+  const Lights<T> lights = lights_of(args, block.b);
   const bool position = uses_position(args), per_face = !args.smooth && !position;
   if (per_face) {
-    find_visible(args, view, blocks, begin, end, sums);
+    sums.visible.list(args.at.face_index + begin, end - begin, view.image.num_faces);
     light_faces(args, view, lights, sums);
     return lit_faces_forward<kColors>(args, begin, end, sums);
   }
@@ -452,18 +443,14 @@ void lit_block_forward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, i
 }
 
 template <int64_t kColors, class T>
-void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, int64_t block,
-                        LitSums<T>& sums) {
-  const int64_t H = args.at.raster.height, W = args.at.raster.width;
-  const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
-  const View<T> view(args, b);
-  const Lights<T> lights = lights_of(args, b);
+void lit_block_backward(const LitColors<T>& args, const RowBlock& block, LitSums<T>& sums) {
+  const int64_t begin = block.begin(), end = block.end();
+  const View<T> view(args, block.b);
+  const Lights<T> lights = lights_of(args, block.b);
   const bool position = uses_position(args), per_face = !args.smooth && !position;
   sums.lights = lights;
   sums.lights.set_zero();
-  find_visible(args, view, blocks, begin, end, sums);
-  const int64_t count = sums.visible.count;
-  std::fill_n(reserve(sums.values, kSums * count), kSums * count, T(0));
+  sums.start(args.at.face_index + begin, end - begin, view.image.num_faces, kLitSums);
   if (per_face) {
     light_faces(args, view, lights, sums);
     lit_faces_backward<kColors>(args, begin, end, sums);
@@ -476,8 +463,7 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
     for (int64_t k = 0; grad_color && k < kColors; ++k) grad_color[k] = 0;
     if (id < 0) continue;
     const T *color = kColors ? args.colors + kColors * n : nullptr, *grad = args.grad_lit + 3 * n;
-    const int64_t slot = sums.visible.slots[id + 1];
-    T* sum = sums.values.data() + kSums * slot;
+    T* sum = sums.of(id, kLitSums);
     const T* weights = args.at.weights + 3 * n;
     const Pixel<T> p = pixel_of(args, view, id, weights, position);
     PixelLight<T> grads{load3(grad), load3(grad)};
@@ -489,8 +475,8 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
     }
     pixel_backward(args, view, lights, p, weights, grads, position, sums.lights, sum, grad_weights);
   }
-  for (int64_t n = 1; per_face && n < count; ++n) {
-    T* sum = sums.values.data() + kSums * n;
+  for (int64_t n = 1; per_face && n < sums.visible.count; ++n) {
+    T* sum = sums.values.data() + kLitSums * n;
     const Pixel<T> p = pixel_of<T>(args, view, sums.visible.ids[n], nullptr, false);
     const PixelLight<T> grads{load3(sum + 9), Vec3<T>::Zero()};
     pixel_backward<T>(args, view, lights, p, nullptr, grads, false, sums.lights, sum, nullptr);
@@ -499,14 +485,13 @@ void lit_block_backward(const Lit<T>& args, const RowBlocks& blocks, int64_t b, 
 
 // Adds the sums of a block to the gradients.
 template <class T>
-void scatter_lit(const Lit<T>& args, int64_t b, LitSums<T>& sums) {
+void scatter_lit(const LitColors<T>& args, int64_t b, LitSums<T>& sums) {
   const View<T> view(args, b);
   const bool position = uses_position(args);
-  const int64_t F = view.image.num_faces;
   for (int64_t n = 1; n < sums.visible.count; ++n) {
-    const int64_t id = sums.visible.ids[n], face = id < F ? id : id - F;
+    const int64_t face = face_of(sums.visible.ids[n], view.image.num_faces);
     const int64_t* corners = view.image.corners + 3 * face;
-    const T* sum = sums.values.data() + kSums * n;
+    const T* sum = sums.values.data() + kLitSums * n;
     if (args.grad_normals && !args.smooth)
       add3(args.grad_normals + 3 * (view.first_normal + face), load3(sum));
     for (int k = 0; k < 3; ++k) {
@@ -523,7 +508,7 @@ void scatter_lit(const Lit<T>& args, int64_t b, LitSums<T>& sums) {
 }
 
 template <class T, class Body>
-void with_colors(const Lit<T>& args, const Body& body) {
+void with_colors(const LitColors<T>& args, const Body& body) {
   if (!args.colors) return body(std::integral_constant<int64_t, 0>());
   if (args.channels == 1) return body(std::integral_constant<int64_t, 1>());
   body(std::integral_constant<int64_t, 3>());
@@ -532,48 +517,35 @@ void with_colors(const Lit<T>& args, const Body& body) {
 }  // namespace
 
 template <class T>
-void lit_forward(const Lit<T>& args) {
-  const auto blocks_of = [&](int64_t b) {
-    return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces);
-  };
-  int64_t most_blocks = 1;
-  for (int64_t b = 0; b < args.at.batch; ++b)
-    most_blocks = std::max(most_blocks, blocks_of(b).count);
-  parallel_for(args.at.batch * most_blocks, args.at.num_threads, [&](int64_t task) {
-    const int64_t b = task / most_blocks, block = task % most_blocks;
-    const RowBlocks blocks = blocks_of(b);
-    if (block >= blocks.count) return;
-    with_colors(args, [&](auto known) {
-      lit_block_forward<known()>(args, blocks, b, block, thread_scratch<LitSums<T>>());
-    });
-  });
+void lit_forward(const LitColors<T>& args) {
+  const auto face_count = [&](int64_t b) { return image_attributes(args.at, b).num_faces; };
+  for_blocks(args.at.batch, args.at.raster, args.at.num_threads, face_count,
+             [&](const RowBlock& block) {
+               with_colors(args, [&](auto known) {
+                 lit_block_forward<known()>(args, block, thread_scratch<LitSums<T>>());
+               });
+             });
 }
 
 // Parameters, normals and vertices are summed in the order of images and blocks.
 template <class T>
-void lit_backward(const Lit<T>& args) {
+void lit_backward(const LitColors<T>& args) {
   const int64_t images = args.at.starts ? 1 : args.normal_batch;
   const int64_t normals = images * (args.smooth ? args.at.num_attributes : args.at.num_faces);
   const int64_t vertices = args.at.num_attributes * (args.at.starts ? 1 : args.at.attribute_batch);
   if (args.grad_normals) std::fill_n(args.grad_normals, 3 * normals, T(0));
   if (args.at.grad_attributes) std::fill_n(args.at.grad_attributes, 3 * vertices, T(0));
   if (args.grad_parameters) std::fill_n(args.grad_parameters, args.num_parameters, T(0));
-  const auto blocks_of = [&](int64_t b) {
-    return RowBlocks(args.at.raster, image_attributes(args.at, b).num_faces);
-  };
   sum_blocks<LitSums<T>>(
-      args.at.batch, true, args.at.num_threads, [&](int64_t b) { return blocks_of(b).count; },
-      [&](int64_t b, int64_t block, LitSums<T>& sums) {
-        with_colors(args, [&](auto known) {
-          lit_block_backward<known()>(args, blocks_of(b), b, block, sums);
-        });
+      args.at.batch, args.at.raster, true, args.at.num_threads,
+      [&](int64_t b) { return image_attributes(args.at, b).num_faces; },
+      [&](const RowBlock& block, LitSums<T>& sums) {
+        with_colors(args, [&](auto known) { lit_block_backward<known()>(args, block, sums); });
       },
       [&](int64_t b, LitSums<T>& sums) { scatter_lit(args, b, sums); });
 }
 
-template void lit_forward(const Lit<float>&);
-template void lit_forward(const Lit<double>&);
-template void lit_backward(const Lit<float>&);
-template void lit_backward(const Lit<double>&);
+NMR_FLOAT_AND_DOUBLE(lit_forward, LitColors)
+NMR_FLOAT_AND_DOUBLE(lit_backward, LitColors)
 
 }  // namespace nmr

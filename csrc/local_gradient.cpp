@@ -41,7 +41,7 @@ struct LocalRaster {
   int32_t id(int64_t row, int64_t column) const { return face_index[row * raster.width + column]; }
   // The triangle of a face; a reversed copy is the same surface.
   Triangle<T> triangle(int32_t id) const {
-    return load_triangle(vertices, faces + 3 * (id < num_faces ? id : id - num_faces), false);
+    return load_triangle(vertices, faces + 3 * face_of(id, num_faces), false);
   }
   int64_t image_pixel(int64_t row, int64_t column) const {
     return anti_aliasing ? row / 2 * size.width + column / 2 : row * size.width + column;
@@ -148,20 +148,6 @@ struct Rates {
   }
 };
 
-// Screen weights of a face's corners at the centre of a pixel, in drawing order, computed as in the
-// rasterizer. False if they are not defined; the rasterizer never draws such a face.
-template <class T>
-bool screen_weights(const Triangle<T>& t, int64_t row, int64_t column, Size raster, T (&w)[3]) {
-  const T width = static_cast<T>(raster.width), height = static_cast<T>(raster.height);
-  const BarycentricMatrix<T> matrix = barycentric_matrix(t, width, height);
-  const T x = static_cast<T>(column), y = static_cast<T>(raster.height - 1 - row);
-  for (int k = 0; k < 3; ++k)
-    w[k] = clamp_weight(matrix.m[k][0] * x + matrix.m[k][1] * y + matrix.m[k][2]);
-  const T sum = w[0] + w[1] + w[2];
-  for (T& weight : w) weight /= sum;
-  return sum > 0;
-}
-
 // The gradient of the point seen in a pixel.
 template <class T>
 struct Pull {
@@ -208,15 +194,16 @@ void find_pull(const Image& image, int64_t row, int64_t column, Pulls<T>& pulls)
 // Adds them to the corners of their faces, in the order of the pixels.
 template <class T>
 void add_pulls(const LocalRaster<T>& image, const Pulls<T>& pulls, T* grad_vertices) {
+  const T width = static_cast<T>(image.raster.width), height = static_cast<T>(image.raster.height);
   for (int64_t n = 0; n < pulls.count; ++n) {
     const Pull<T>& pull = pulls.list[n];
     const int32_t id = image.id(pull.row, pull.column);
     const bool reversed = id >= image.num_faces;
-    const int64_t* face = image.faces + 3 * (reversed ? id - image.num_faces : id);
+    const int64_t* face = image.faces + 3 * face_of(id, image.num_faces);
     T w[3];
-    if (!screen_weights(load_triangle(image.vertices, face, reversed), pull.row, pull.column,
-                        image.raster, w))
-      continue;
+    weights_at(barycentric_matrix(load_triangle(image.vertices, face, reversed), width, height),
+               static_cast<T>(pull.column), height - 1 - static_cast<T>(pull.row), w);
+    if (std::isnan(w[0])) continue;  // the rasterizer never draws such a face
     for (int k = 0; k < 3; ++k) {
       T* grad = grad_vertices + 3 * face[reversed ? 2 - k : k];
       grad[0] += w[k] * pull.x;
@@ -230,14 +217,13 @@ template <class T, class ImageOf>
 void local_pulls(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads,
                  const ImageOf& image_of) {
   std::fill_n(grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
-  const RowBlocks blocks(raster, 0);
   sum_blocks<Pulls<T>>(
-      mesh.batch, false, num_threads, [&](int64_t) { return blocks.count; },
-      [&](int64_t b, int64_t block, Pulls<T>& pulls) {
-        const auto image = image_of(b);
-        reserve(pulls.list, blocks.rows * raster.width);
+      mesh.batch, raster, false, num_threads, [](int64_t) { return 0; },
+      [&](const RowBlock& block, Pulls<T>& pulls) {
+        const auto image = image_of(block.b);
+        reserve(pulls.list, block.blocks.rows * raster.width);
         pulls.count = 0;
-        for (int64_t row = blocks.first(block); row < blocks.last(block); ++row)
+        for (int64_t row = block.first(); row < block.last(); ++row)
           for (int64_t column = 0; column < raster.width; ++column)
             find_pull(image, row, column, pulls);
       },
@@ -287,9 +273,7 @@ void local_edges_backward(const EdgesBackward<T>& args) {
   });
 }
 
-template void local_edges_backward(const EdgesBackward<float>&);
-template void local_edges_backward(const EdgesBackward<double>&);
-template void local_gradient(const SilhouetteBackward<float>&);
-template void local_gradient(const SilhouetteBackward<double>&);
+NMR_FLOAT_AND_DOUBLE(local_edges_backward, EdgesBackward)
+NMR_FLOAT_AND_DOUBLE(local_gradient, SilhouetteBackward)
 
 }  // namespace nmr

@@ -17,10 +17,10 @@ template <class T>
 using Matrix34 = Eigen::Matrix<T, 3, 4, Eigen::RowMajor>;
 using Vec3d = Vec3<double>;
 
-constexpr double kShortest =
+constexpr double kShortestAxis =
     1e-5;  // as published: a shorter vector is divided by this, and stays short
 constexpr double kRadians = 3.14159265358979323846 / 180;  // of a degree
-constexpr double kLargest =
+constexpr double kLargestAxis =
     1e15;  // up to this size lengths and their derivatives do not overflow, even in float
 
 // Lengths and cross products round as the published ones, which were compiled with fused
@@ -39,12 +39,12 @@ Vec3<T> cross(const Vec3<T>& a, const Vec3<T>& b) {
 
 template <class T>
 Vec3<T> normalized(const Vec3<T>& v) {
-  return v / std::max(length(v), T(kShortest));
+  return v / std::max(length(v), T(kShortestAxis));
 }
 
 Vec3<double> normalized_backward(const Vec3<double>& v, const Vec3<double>& grad) {
   const double size = v.norm();
-  if (!(size > kShortest)) return grad / kShortest;
+  if (!(size > kShortestAxis)) return grad / kShortestAxis;
   const Vec3<double> n = v / size;
   return (grad - n * n.dot(grad)) / size;
 }
@@ -71,7 +71,8 @@ struct Axes {
     forward = (args.along ? target : Vec3d(target - place)).template cast<T>();
     up = parameter(args.up, args.up_each, b).template cast<T>();
     for (int k = 0; k < 3; ++k)
-      usable = usable && std::abs(forward[k]) < T(kLargest) && std::abs(up[k]) < T(kLargest);
+      usable =
+          usable && std::abs(forward[k]) < T(kLargestAxis) && std::abs(up[k]) < T(kLargestAxis);
     if (!usable) return;
     z = normalized(forward);
     sideways = cross(up, z);
@@ -179,9 +180,7 @@ void look_at_backward(const LookAt<T>& args) {
   }
 }
 
-template void look_at_forward(const LookAt<float>&);
-template void look_at_forward(const LookAt<double>&);
-template void look_at_backward(const LookAt<float>&);
-template void look_at_backward(const LookAt<double>&);
+NMR_FLOAT_AND_DOUBLE(look_at_forward, LookAt)
+NMR_FLOAT_AND_DOUBLE(look_at_backward, LookAt)
 
 }  // namespace nmr

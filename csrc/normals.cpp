@@ -16,13 +16,13 @@ namespace {
 
 using Vec3 = Eigen::Vector3d;
 
-constexpr double kLargest = 1e12;  // coordinates beyond this do not count
+constexpr double kLargestCoordinate = 1e12;  // coordinates beyond this do not count
 
 // A shorter product counts as no area: its derivative could overflow.
 template <class T>
-constexpr double kShortest = 1e-290;
+constexpr double kLeastArea = 1e-290;
 template <>
-constexpr double kShortest<float> = std::numeric_limits<float>::min();
+constexpr double kLeastArea<float> = std::numeric_limits<float>::min();
 
 struct Direction {
   Vec3 unit;
@@ -32,7 +32,7 @@ struct Direction {
 template <class T>
 NMR_INLINE Direction direction_of(const Vec3& v) {
   const double scale = v.cwiseAbs().maxCoeff();
-  if (!(scale >= kShortest<T>)) return {Vec3::Zero(), 0};
+  if (!(scale >= kLeastArea<T>)) return {Vec3::Zero(), 0};
   const double length = (v / scale).norm() * scale;
   return {v / length, length};
 }
@@ -43,11 +43,12 @@ NMR_INLINE Vec3 direction_backward(const Direction& d, const Vec3& grad) {
   return (grad - d.unit * d.unit.dot(grad)) / d.length;
 }
 
-// Whether a vertex is used: finite, with coordinates below kLargest. Others count as the origin.
+// Whether a vertex is used: finite, with coordinates below kLargestCoordinate. Others count as the
+// origin.
 template <class T>
 NMR_INLINE bool counts(const T* vertex) {
-  return std::abs(vertex[0]) < T(kLargest) && std::abs(vertex[1]) < T(kLargest) &&
-         std::abs(vertex[2]) < T(kLargest);
+  return std::abs(vertex[0]) < T(kLargestCoordinate) &&
+         std::abs(vertex[1]) < T(kLargestCoordinate) && std::abs(vertex[2]) < T(kLargestCoordinate);
 }
 
 template <class T>
@@ -158,9 +159,7 @@ void normals_backward(const Normals<T>& args) {
   });
 }
 
-template void normals_forward(const Normals<float>&);
-template void normals_forward(const Normals<double>&);
-template void normals_backward(const Normals<float>&);
-template void normals_backward(const Normals<double>&);
+NMR_FLOAT_AND_DOUBLE(normals_forward, Normals)
+NMR_FLOAT_AND_DOUBLE(normals_backward, Normals)
 
 }  // namespace nmr

@@ -29,6 +29,9 @@
 
 namespace nmr {
 
+constexpr int64_t kLanes = 8;   // values in a vector of level_lanes.h
+constexpr int64_t kGroup = 16;  // values that plain loops work on together: compilers make vectors
+
 // Number of the lowest bit that is set; bits must not be 0.
 NMR_INLINE int64_t lowest_bit(uint64_t bits) { return __builtin_ctzll(bits); }
 

@@ -82,6 +82,66 @@ NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices,
   }
 }
 
+// Adds the gradients of the coefficients at a distorted point (x, y) to the partial sums of lane l.
+// along: the gradient of m.
+template <int kDistortion, class T>
+NMR_INLINE void add_coefficients(const Radial<T>& radial, T along, T gqx, T gqy, T x, T y, int l,
+                                 T (*__restrict sums)[kGroup]) {
+  const T r2 = x * x + y * y, xy = x * y;
+  if (kDistortion == kFisheye) {
+    T power = along * radial.per_r;
+    for (int k = 0; k < 4; ++k) {
+      power *= radial.angle2;
+      sums[18 + k][l] += power;
+    }
+    return;
+  }
+  const T by_numerator = kDistortion == kRational ? along * radial.inverse : along;
+  sums[18][l] += by_numerator * r2;
+  sums[19][l] += by_numerator * r2 * r2;
+  sums[20][l] += 2 * gqx * xy + gqy * (r2 + 2 * y * y);
+  sums[21][l] += gqx * (r2 + 2 * x * x) + 2 * gqy * xy;
+  sums[22][l] += by_numerator * r2 * r2 * r2;
+  if (kDistortion == kRational) {
+    const T by_denominator = -by_numerator * radial.m;
+    sums[23][l] += by_denominator * r2;
+    sums[24][l] += by_denominator * r2 * r2;
+    sums[25][l] += by_denominator * r2 * r2 * r2;
+  }
+}
+
+// The gradient of p from that of q, and those of the coefficients. keep: see backward_lanes.
+template <int kDistortion, bool kSumCamera, class T>
+NMR_INLINE void distort_backward(const Lens<T>& c, const ProjectedVertex<T>& s, bool keep, T gqx,
+                                 T gqy, int l, T (*__restrict sums)[kGroup], T& gpx, T& gpy) {
+  const T x = keep ? s.cx : T(0), y = keep ? s.cy : T(0);
+  const T r2 = x * x + y * y;
+  const Radial<T> radial = radial_of<kDistortion>(c.d, r2);
+  const T along = gqx * x + gqy * y;  // gradient of m
+  gpx = gqx * radial.m;
+  gpy = gqy * radial.m;
+  if (kDistortion == kFisheye) {
+    gpx += 2 * along * radial.slope * x;
+    gpy += 2 * along * radial.slope * y;
+  } else {
+    const T g_r2 = along * radial.slope + gqx * c.d[3] + gqy * c.d[2];
+    const T cross = 2 * (gqx * c.d[2] + gqy * c.d[3]);  // gradient of x y
+    gpx = gpx + cross * y + 4 * gqx * c.d[3] * x + 2 * g_r2 * x;
+    gpy = gpy + cross * x + 4 * gqy * c.d[2] * y + 2 * g_r2 * y;
+  }
+  const bool within = s.share == T(1);
+  // Beyond the reach: q = q(c) + p - c, with c = share p. The length of c is the reach, a constant.
+  const T length2 = within ? T(1) : s.px * s.px + s.py * s.py,
+          length = std::sqrt(keep ? length2 : T(1));
+  const T nx = s.px / length, ny = s.py / length, vx = gpx - gqx, vy = gpy - gqy,
+          out = vx * nx + vy * ny;
+  gpx = within ? gpx : gqx + s.share * (vx - nx * out);
+  gpy = within ? gpy : gqy + s.share * (vy - ny * out);
+  if (kSumCamera)  // beyond the reach: 0
+    add_coefficients<kDistortion>(radial, within ? along : T(0), within ? gqx : T(0),
+                                  within ? gqy : T(0), x, y, l, sums);
+}
+
 // Adds the gradient of kGroup vertices to grad_vertices, and that of the camera to the partial
 // sums. A vertex without an image, or whose gradient would overflow although the upstream gradient
 // is finite, gets gradient 0 and contributes 0 to the camera. If the upstream gradient is infinite
@@ -116,54 +176,8 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices,
     const T gqx = (c.k[0] * gx + c.k[3] * gy) * c.inverse_extent;
     const T gqy = (c.k[1] * gx + c.k[4] * gy) * c.inverse_extent;
     T gpx = gqx, gpy = gqy;
-    if (kDistortion) {
-      const T x = keep ? s.cx : T(0), y = keep ? s.cy : T(0);
-      const T r2 = x * x + y * y, xy = x * y;
-      const Radial<T> radial = radial_of<kDistortion>(c.d, r2);
-      const T along = gqx * x + gqy * y;  // gradient of m
-      gpx = gqx * radial.m, gpy = gqy * radial.m;
-      if (kDistortion == kFisheye) {
-        gpx += 2 * along * radial.slope * x;
-        gpy += 2 * along * radial.slope * y;
-      } else {
-        const T g_r2 = along * radial.slope + gqx * c.d[3] + gqy * c.d[2];
-        const T cross = 2 * (gqx * c.d[2] + gqy * c.d[3]);  // gradient of x y
-        gpx = gpx + cross * y + 4 * gqx * c.d[3] * x + 2 * g_r2 * x;
-        gpy = gpy + cross * x + 4 * gqy * c.d[2] * y + 2 * g_r2 * y;
-      }
-      const bool within = s.share == T(1);
-      // Beyond the reach: q = q(c) + p - c, with c = share p. The length of c is the reach, a
-      // constant.
-      const T length2 = within ? T(1) : s.px * s.px + s.py * s.py,
-              length = std::sqrt(keep ? length2 : T(1));
-      const T nx = s.px / length, ny = s.py / length, vx = gpx - gqx, vy = gpy - gqy,
-              out = vx * nx + vy * ny;
-      gpx = within ? gpx : gqx + s.share * (vx - nx * out);
-      gpy = within ? gpy : gqy + s.share * (vy - ny * out);
-      if (kSumCamera) {  // beyond the reach: 0
-        const T g = within ? along : T(0), gx_in = within ? gqx : T(0), gy_in = within ? gqy : T(0);
-        if (kDistortion == kFisheye) {
-          T power = g * radial.per_r;
-          for (int k = 0; k < 4; ++k) {
-            power *= radial.angle2;
-            sums[18 + k][l] += power;
-          }
-        } else {
-          const T by_numerator = kDistortion == kRational ? g * radial.inverse : g;
-          sums[18][l] += by_numerator * r2;
-          sums[19][l] += by_numerator * r2 * r2;
-          sums[20][l] += 2 * gx_in * xy + gy_in * (r2 + 2 * y * y);
-          sums[21][l] += gx_in * (r2 + 2 * x * x) + 2 * gy_in * xy;
-          sums[22][l] += by_numerator * r2 * r2 * r2;
-          if (kDistortion == kRational) {
-            const T by_denominator = -by_numerator * radial.m;
-            sums[23][l] += by_denominator * r2;
-            sums[24][l] += by_denominator * r2 * r2;
-            sums[25][l] += by_denominator * r2 * r2 * r2;
-          }
-        }
-      }
-    }
+    if (kDistortion)
+      distort_backward<kDistortion, kSumCamera>(c, s, keep, gqx, gqy, l, sums, gpx, gpy);
     const T gux = kPerspective ? gpx * s.inverse_z : gpx,
             guy = kPerspective ? gpy * s.inverse_z : gpy;
     const T guz = kPerspective ? gz - (gux * s.px + guy * s.py) : gz;
@@ -210,32 +224,36 @@ NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, cons
   std::copy_n(last.out, 3 * rest, points + 3 * whole);
 }
 
+// Calls body(perspective, distortion) with compile-time constants: of the camera, and its number of
+// coefficients.
+template <class T, class Body>
+NMR_INLINE void with_lens(const Project<T>& args, const Body& body) {
+  using None = std::integral_constant<int, 0>;
+  if (!args.perspective) return body(std::false_type(), None());
+  if (!args.distortion) return body(std::true_type(), None());
+  if (args.coefficients == 4) return body(std::true_type(), std::integral_constant<int, 4>());
+  if (args.coefficients == 5) return body(std::true_type(), std::integral_constant<int, 5>());
+  body(std::true_type(), std::integral_constant<int, 8>());
+}
+
 template <class T>
 void forward_run(const Project<T>& args, const Run& run) {
   const Lens<T> lens(args, run.image);
-  if (!lens.usable) {
-    T* points = args.points + 3 * run.points;
-    for (int64_t n = 0; n < run.count; ++n) {
-      points[3 * n] = points[3 * n + 1] = std::numeric_limits<T>::infinity();
-      points[3 * n + 2] = 0;
-    }
-  } else if (!args.perspective) {
-    forward_run_of<T, false, 0>(args, lens, run);
-  } else if (!args.distortion) {
-    forward_run_of<T, true, 0>(args, lens, run);
-  } else if (args.coefficients == 4) {
-    forward_run_of<T, true, 4>(args, lens, run);
-  } else if (args.coefficients == 5) {
-    forward_run_of<T, true, 5>(args, lens, run);
-  } else {
-    forward_run_of<T, true, 8>(args, lens, run);
+  if (lens.usable)
+    return with_lens(args, [&](auto perspective, auto distortion) {
+      forward_run_of<T, perspective(), distortion()>(args, lens, run);
+    });
+  T* points = args.points + 3 * run.points;
+  for (int64_t n = 0; n < run.count; ++n) {
+    points[3 * n] = points[3 * n + 1] = std::numeric_limits<T>::infinity();
+    points[3 * n + 2] = 0;
   }
 }
 
 template <class T, bool kPerspective, int kDistortion, bool kSumCamera>
 NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run,
                                 T* grad_vertices, double* total) {
-  T sums[kSums][kGroup] = {};
+  T sums[kCameraSums][kGroup] = {};
   const T* vertices = args.vertices + 3 * run.vertices;
   const T* grad_points = args.grad_points + 3 * run.points;
   const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
@@ -251,40 +269,32 @@ NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, con
   }
   std::copy_n(last.out, 3 * rest, grad_vertices + 3 * whole);
   if (!kSumCamera) return;
-  for (int k = 0; k < kSums; ++k) {
+  for (int k = 0; k < kCameraSums; ++k) {
     total[k] = 0;
     for (int l = 0; l < kGroup; ++l) total[k] += static_cast<double>(sums[k][l]);
   }
   // u depends on v - origin and q on p / extent.
   const double* t = total;
   for (int j = 0; j < 3; ++j)
-    total[kSums + j] =
+    total[kCameraSums + j] =
         -(double(lens.a[j]) * t[3] + double(lens.a[4 + j]) * t[7] + double(lens.a[8 + j]) * t[11]);
-  total[kSums + 3] = -(double(lens.k[0]) * t[12] + double(lens.k[1]) * t[13] +
-                       double(lens.k[3]) * t[15] + double(lens.k[4]) * t[16]) /
-                     double(lens.extent);
+  total[kCameraSums + 3] = -(double(lens.k[0]) * t[12] + double(lens.k[1]) * t[13] +
+                             double(lens.k[3]) * t[15] + double(lens.k[4]) * t[16]) /
+                           double(lens.extent);
 }
 
 // total: kTotals gradients of the camera, summed over this run, or nullptr.
 template <class T>
 void backward_run(const Project<T>& args, const Run& run, T* grad_vertices, double* total) {
   const Lens<T> lens(args, run.image);
-  if (!lens.usable) {
-    if (total) std::fill_n(total, kTotals, 0.0);
-  } else if (!args.perspective) {
-    total ? backward_run_of<T, false, 0, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, false, 0, false>(args, lens, run, grad_vertices, total);
-  } else if (!args.distortion) {
-    total ? backward_run_of<T, true, 0, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, 0, false>(args, lens, run, grad_vertices, total);
-  } else if (args.coefficients == 4) {
-    total ? backward_run_of<T, true, 4, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, 4, false>(args, lens, run, grad_vertices, total);
-  } else if (args.coefficients == 5) {
-    total ? backward_run_of<T, true, 5, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, 5, false>(args, lens, run, grad_vertices, total);
-  } else {
-    total ? backward_run_of<T, true, 8, true>(args, lens, run, grad_vertices, total)
-          : backward_run_of<T, true, 8, false>(args, lens, run, grad_vertices, total);
-  }
+  if (lens.usable)
+    return with_lens(args, [&](auto perspective, auto distortion) {
+      if (total)
+        backward_run_of<T, perspective(), distortion(), true>(args, lens, run, grad_vertices,
+                                                              total);
+      else
+        backward_run_of<T, perspective(), distortion(), false>(args, lens, run, grad_vertices,
+                                                               nullptr);
+    });
+  if (total) std::fill_n(total, kTotals, 0.0);
 }

@@ -22,23 +22,20 @@
 namespace nmr {
 namespace {
 
-// Faces or pixels of a row that are worked on together, and pixels per side of a block.
-constexpr int64_t kTogether = 8;
 constexpr int64_t kBandPixels =
     int64_t(1) << 16;  // pixels of a band that fits into a core's cache: 12 bytes each
 constexpr int64_t kPixelsPerFace = 64;  // bands get that small only with this many pixels per face
-constexpr int64_t kChunk = 2048;        // faces that one thread sets up together
+constexpr int64_t kFaceChunk = 2048;    // faces that one thread sets up together
 
-// Data of eight faces for the fill.
+// Data of kLanes faces for the fill.
 template <class T>
 struct FaceBlock {
-  T x[3][kTogether], y[3][kTogether];                          // corners, in the face's own order
-  T slope_x[kTogether], slope_y[kTogether], level[kTogether];  // coefficients of q
-  T margin[kTogether];                                         // infinity: no bounds
-  T nearest[kTogether];                                        // largest q at any pixel
+  T x[3][kLanes], y[3][kLanes];                       // corners, in the face's own order
+  T slope_x[kLanes], slope_y[kLanes], level[kLanes];  // coefficients of q
+  T margin[kLanes];                                   // infinity: no bounds
+  T nearest[kLanes];                                  // largest q at any pixel
   // Pixels inside the box.
-  int32_t column_first[kTogether], column_last[kTogether], row_first[kTogether],
-      row_last[kTogether];
+  int32_t column_first[kLanes], column_last[kLanes], row_first[kLanes], row_last[kLanes];
 };
 
 // Pixels from the first to the last column and row, inclusive.
@@ -56,12 +53,12 @@ struct FaceTable {
   std::vector<PixelBox> boxes;               // [chunks] around the boxes of all their faces
 
   void reserve_faces(int64_t num_faces) {
-    const size_t size = static_cast<size_t>(num_faces + 2 * kTogether);
-    reserve(blocks, size / kTogether);
+    const size_t size = static_cast<size_t>(num_faces + 2 * kLanes);
+    reserve(blocks, size / kLanes);
     for (std::vector<int32_t>* v : {&front, &back}) reserve(*v, size);
-    for (std::vector<int32_t>* v : {&num_front, &num_back}) reserve(*v, size / kChunk + 1);
-    for (std::vector<T>* v : {&front_sum, &back_sum}) reserve(*v, size / kChunk + 1);
-    reserve(boxes, size / kChunk + 1);
+    for (std::vector<int32_t>* v : {&num_front, &num_back}) reserve(*v, size / kFaceChunk + 1);
+    for (std::vector<T>* v : {&front_sum, &back_sum}) reserve(*v, size / kFaceChunk + 1);
+    reserve(boxes, size / kFaceChunk + 1);
   }
 };
 
@@ -108,7 +105,7 @@ struct FacePlane {
 template <class T>
 NMR_INLINE FacePlane<T> face_plane(const Image<T>& image, int32_t id) {
   const bool reversed = id >= image.num_faces;
-  const int64_t* face = image.faces + 3 * (reversed ? id - image.num_faces : id);
+  const int64_t* face = image.faces + 3 * face_of(id, image.num_faces);
   const Triangle<T> t = load_triangle(image.vertices, face, reversed);
   const Size raster = image.settings.raster;
   return {barycentric_matrix(t, static_cast<T>(raster.width), static_cast<T>(raster.height)),
@@ -140,39 +137,37 @@ void rasterize(const Rasterize<T>& args) {
     const int64_t small =
         std::min(H * W / kBandPixels, H * W / (kPixelsPerFace * std::max<int64_t>(num_faces, 1)));
     const int64_t bands = std::clamp<int64_t>(std::max<int64_t>(share ? threads * 4 : 1, small), 1,
-                                              (H + 2 * kTogether - 1) / (2 * kTogether));
-    parallel_for((num_faces + kChunk - 1) / kChunk, threads,
+                                              (H + 2 * kLanes - 1) / (2 * kLanes));
+    parallel_for((num_faces + kFaceChunk - 1) / kFaceChunk, threads,
                  [&](int64_t chunk) { NMR_AT_BEST_LEVEL(set_up_faces, image, chunk); });
     parallel_for(bands, threads, [&](int64_t n) {
       BandScratch<T>& scratch = thread_scratch<BandScratch<T>>();
       if (!(scratch.raster == raster)) {
-        scratch.columns.resize(W + kTogether);
-        scratch.rows.resize(H + kTogether);
-        for (int64_t i = 0; i < W + kTogether; ++i) scratch.columns[i] = pixel_centre<T>(i, W);
-        for (int64_t j = 0; j < H + kTogether; ++j) scratch.rows[j] = pixel_centre<T>(j, H);
+        scratch.columns.resize(W + kLanes);
+        scratch.rows.resize(H + kLanes);
+        for (int64_t i = 0; i < W + kLanes; ++i) scratch.columns[i] = pixel_centre<T>(i, W);
+        for (int64_t j = 0; j < H + kLanes; ++j) scratch.rows[j] = pixel_centre<T>(j, H);
         scratch.raster = raster;
       }
       Band<T> band{n * H / bands,
                    (n + 1) * H / bands - 1,
                    raster,
-                   W + kTogether,
+                   W + kLanes,
                    scratch.columns.data(),
                    scratch.rows.data(),
                    nullptr,
                    nullptr,
                    nullptr};
-      const int64_t rows = band.row_last - band.row_first + 1,
-                    blocks = (W + kTogether - 1) / kTogether;
-      band.most = reserve(scratch.most, rows * band.stride + kTogether);
-      band.least = reserve(scratch.least, rows * band.stride + kTogether);
-      band.face_index = reserve(scratch.face_index, rows * band.stride + kTogether);
-      T* block_least = reserve(scratch.block_least, (rows / kTogether + 1) * blocks);
+      const int64_t rows = band.row_last - band.row_first + 1, blocks = (W + kLanes - 1) / kLanes;
+      band.most = reserve(scratch.most, rows * band.stride + kLanes);
+      band.least = reserve(scratch.least, rows * band.stride + kLanes);
+      band.face_index = reserve(scratch.face_index, rows * band.stride + kLanes);
+      T* block_least = reserve(scratch.block_least, (rows / kLanes + 1) * blocks);
       NMR_AT_BEST_LEVEL(fill_band, image, band, blocks, block_least, args.face_index + b * H * W);
     });
   });
 }
 
-template void rasterize(const Rasterize<float>&);
-template void rasterize(const Rasterize<double>&);
+NMR_FLOAT_AND_DOUBLE(rasterize, Rasterize)
 
 }  // namespace nmr

@@ -76,10 +76,9 @@ NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, i
 template <class T>
 void silhouette_forward(const SilhouetteForward<T>& args) {
   const Size image = args.image, raster = raster_of(image, args.anti_aliasing);
-  const int64_t bands = std::min(image.height, image.pixels() / kBandPixels + 1);
-  parallel_for(args.batch * bands, args.num_threads, [&](int64_t n) {
-    const int64_t b = n / bands, k = n % bands, first = k * image.height / bands;
-    const Size band{(k + 1) * image.height / bands - first, image.width};
+  const int64_t rows = std::max<int64_t>(kBandPixels / image.width, 1);
+  const auto average = [&](int64_t b, int64_t first, int64_t last) {
+    const Size band{last - first, image.width};
     const int32_t* face_index =
         args.face_index + b * raster.pixels() + first * (raster.pixels() / image.height);
     T* alpha = args.alpha + b * image.pixels() + first * image.width;
@@ -88,7 +87,8 @@ void silhouette_forward(const SilhouetteForward<T>& args) {
       return;
     }
     average_coverage(face_index, band, alpha);
-  });
+  };
+  for_bands(args.batch, image.height, rows, args.num_threads, average);
 }
 
 // The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, if it is
@@ -146,11 +146,8 @@ void resolve_backward(const Resolve<T>& args) {
     });
 }
 
-template void silhouette_forward(const SilhouetteForward<float>&);
-template void silhouette_forward(const SilhouetteForward<double>&);
-template void resolve_forward(const Resolve<float>&);
-template void resolve_forward(const Resolve<double>&);
-template void resolve_backward(const Resolve<float>&);
-template void resolve_backward(const Resolve<double>&);
+NMR_FLOAT_AND_DOUBLE(silhouette_forward, SilhouetteForward)
+NMR_FLOAT_AND_DOUBLE(resolve_forward, Resolve)
+NMR_FLOAT_AND_DOUBLE(resolve_backward, Resolve)
 
 }  // namespace nmr

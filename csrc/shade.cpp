@@ -88,7 +88,7 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
         const int64_t id = args.face_index[n];
         if (id >= 0)
           blend<kChannels>(texels_of(args.weights + 3 * n, ts, args.eps),
-                           textures + (id < F ? id : id - F) * cube, C, color);
+                           textures + face_of(id, F) * cube, C, color);
         else
           for (int64_t k = 0; k < C; ++k) color[k] = 0;
       }
@@ -108,7 +108,7 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
   const int64_t F = face_count(args, b), pixels = args.raster.pixels();
   T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
   for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
-    const int64_t id = args.face_index[n], f = id < F ? id : id - F;
+    const int64_t f = face_of(args.face_index[n], F);
     if (f < first_face || f >= last_face) continue;  // background as well
     const Texels<T> texels = texels_of(args.weights + 3 * n, ts, args.eps);
     const T* grad = args.grad_colors + n * C;
@@ -148,23 +148,18 @@ namespace {
 
 // grad_weights of a block's pixels, and its sums of b_k g.
 template <int64_t kChannels, class T>
-void interpolate_block_backward(const Interpolate<T>& args, const ImageAttributes<T>& image,
-                                const RowBlocks& blocks, int64_t b, int64_t block,
-                                CornerSums<T>& sums) {
-  const int64_t H = args.raster.height, W = args.raster.width,
-                C = kChannels ? kChannels : args.channels, F = image.num_faces;
-  const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
-  if (args.grad_attributes) {
-    sums.visible.reserve_for(F, blocks.most_visible(F));
-    sums.visible.find(args.face_index + begin, end - begin, F);
-    std::fill_n(reserve(sums.values, sums.visible.count * 3 * C), sums.visible.count * 3 * C, T(0));
-  }
+void interpolate_block_backward(const Interpolate<T>& args, const RowBlock& block,
+                                FaceSums<T>& sums) {
+  const ImageAttributes<T> image = image_attributes(args, block.b);
+  const int64_t C = kChannels ? kChannels : args.channels, begin = block.begin(), end = block.end();
+  if (args.grad_attributes)
+    sums.start(args.face_index + begin, end - begin, image.num_faces, 3 * C);
   for (int64_t n = begin; n < end; ++n) {
     const int64_t id = args.face_index[n];
     const T *grad = args.grad_values + n * C, *weights = args.weights + 3 * n;
     if (args.grad_weights && id < 0) std::fill_n(args.grad_weights + 3 * n, 3, T(0));
     if (id < 0) continue;
-    const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
+    const int64_t* corners = image.corners_of(id);
     for (int k = 0; k < 3; ++k) {
       if (args.grad_weights) {
         const T* row = args.attributes + (image.first_row + corners[k]) * C;
@@ -173,7 +168,7 @@ void interpolate_block_backward(const Interpolate<T>& args, const ImageAttribute
         args.grad_weights[3 * n + k] = dot;
       }
       if (args.grad_attributes) {
-        T* sum = sums.values.data() + (3 * sums.visible.slots[id + 1] + k) * C;
+        T* sum = sums.of(id, 3 * C) + k * C;
         for (int64_t c = 0; c < C; ++c) sum[c] += weights[k] * grad[c];
       }
     }
@@ -197,8 +192,7 @@ void interpolate_forward(const Interpolate<T>& args) {
           for (int64_t c = 0; c < C; ++c) value[c] = 0;
           continue;
         }
-        const int64_t* corners =
-            image.corners + 3 * (id < image.num_faces ? id : id - image.num_faces);
+        const int64_t* corners = image.corners_of(id);
         const T* w = args.weights + 3 * n;
         const T *p = attributes + corners[0] * C, *q = attributes + corners[1] * C,
                 *r = attributes + corners[2] * C;
@@ -212,31 +206,24 @@ template <class T>
 void interpolate_backward(const Interpolate<T>& args) {
   const int64_t rows = args.num_attributes * (args.starts ? 1 : args.attribute_batch);
   if (args.grad_attributes) std::fill_n(args.grad_attributes, rows * args.channels, T(0));
-  const auto blocks_of = [&](int64_t b) {
-    return RowBlocks(args.raster, image_attributes(args, b).num_faces);
-  };
-  sum_blocks<CornerSums<T>>(
-      args.batch, !args.starts && args.attribute_batch == 1, args.num_threads,
-      [&](int64_t b) { return blocks_of(b).count; },
-      [&](int64_t b, int64_t block, CornerSums<T>& sums) {
+  sum_blocks<FaceSums<T>>(
+      args.batch, args.raster, !args.starts && args.attribute_batch == 1, args.num_threads,
+      [&](int64_t b) { return image_attributes(args, b).num_faces; },
+      [&](const RowBlock& block, FaceSums<T>& sums) {
         with_channels<T>(args.channels, [&](auto known) {
-          interpolate_block_backward<known()>(args, image_attributes(args, b), blocks_of(b), b,
-                                              block, sums);
+          interpolate_block_backward<known()>(args, block, sums);
         });
       },
-      [&](int64_t b, const CornerSums<T>& sums) {
+      [&](int64_t b, const FaceSums<T>& sums) {
         if (args.grad_attributes)
-          scatter_corner_sums(sums, image_attributes(args, b), args.channels, args.grad_attributes);
+          scatter_corner_sums<0>(sums, image_attributes(args, b), args.channels,
+                                 args.grad_attributes);
       });
 }
 
-template void texture_cubes_forward(const TextureCubes<float>&);
-template void texture_cubes_forward(const TextureCubes<double>&);
-template void texture_cubes_backward(const TextureCubes<float>&);
-template void texture_cubes_backward(const TextureCubes<double>&);
-template void interpolate_forward(const Interpolate<float>&);
-template void interpolate_forward(const Interpolate<double>&);
-template void interpolate_backward(const Interpolate<float>&);
-template void interpolate_backward(const Interpolate<double>&);
+NMR_FLOAT_AND_DOUBLE(texture_cubes_forward, TextureCubes)
+NMR_FLOAT_AND_DOUBLE(texture_cubes_backward, TextureCubes)
+NMR_FLOAT_AND_DOUBLE(interpolate_forward, Interpolate)
+NMR_FLOAT_AND_DOUBLE(interpolate_backward, Interpolate)
 
 }  // namespace nmr

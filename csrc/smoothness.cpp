@@ -17,7 +17,6 @@ namespace nmr {
 namespace {
 
 constexpr double kGuard = 1e-6;  // added to every squared length and denominator
-constexpr int kGroup = 16;
 constexpr int kCoordinates =
     12;  // x, y, z of an edge's first and second vertex and of the two opposite ones
 
@@ -73,9 +72,7 @@ void smoothness_backward(const Smoothness<T>& args) {
              [&](int64_t b) { NMR_AT_BEST_LEVEL(mesh_backward, args, b); });
 }
 
-template void smoothness_forward(const Smoothness<float>&);
-template void smoothness_forward(const Smoothness<double>&);
-template void smoothness_backward(const Smoothness<float>&);
-template void smoothness_backward(const Smoothness<double>&);
+NMR_FLOAT_AND_DOUBLE(smoothness_forward, Smoothness)
+NMR_FLOAT_AND_DOUBLE(smoothness_backward, Smoothness)
 
 }  // namespace nmr

@@ -8,9 +8,8 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <vector>
 
-#include "blocks.h"
+#include "corner_values.h"
 #include "soft_weights.h"
 
 namespace nmr {
@@ -27,7 +26,7 @@ struct SoftFragment {
     const T shorter = static_cast<T>(std::min(raster.height, raster.width));
     scale_x = static_cast<T>(raster.width) / shorter,
     scale_y = static_cast<T>(raster.height) / shorter;
-    face = args.mesh.image_faces(b) + 3 * (id % args.mesh.face_count(b));
+    face = args.mesh.image_faces(b) + 3 * face_of(id, args.mesh.face_count(b));
     for (int k = 0; k < 3; ++k) {
       const T* v = args.mesh.image_vertices(b) + 3 * face[k];
       x[k] = v[0] * scale_x, y[k] = v[1] * scale_y, z[k] = v[2];
@@ -65,8 +64,8 @@ bool inside(const SoftWeights<T>& weights) {
 
 // Adds the gradient of one fragment to the corners of its face, [3, 3].
 template <class T>
-void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad_weights,
-                       T grad_depth, T grad_distance, T* grads) {
+NMR_INLINE void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad_weights,
+                                  T grad_depth, T grad_distance, T* grads) {
   const SoftWeights<T> weights(f.x, f.y, f.px, f.py);
   const T *v = weights.v, *z = f.z;
   T grad_v[3], mean = 0;
@@ -106,13 +105,6 @@ void fragment_backward(const SoftFragment<T>& f, bool perspective, const T* grad
   }
 }
 
-// The gradients of the faces that own an entry of a block of rows.
-template <class T>
-struct SoftSums {
-  VisibleFaces visible;
-  std::vector<T> values;  // [count, 3, 3]
-};
-
 }  // namespace
 
 template <class T>
@@ -140,40 +132,29 @@ template <class T>
 void soft_fragments_backward(const SoftFragments<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   const int64_t H = args.raster.height, wide = args.raster.width * args.layers;
-  const auto blocks_of = [&](int64_t b) { return RowBlocks({H, wide}, mesh.face_count(b)); };
   std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
-  sum_blocks<SoftSums<T>>(
-      mesh.batch, false, args.num_threads, [&](int64_t b) { return blocks_of(b).count; },
-      [&](int64_t b, int64_t block, SoftSums<T>& sums) {
-        const RowBlocks blocks = blocks_of(b);
-        const int64_t F = mesh.face_count(b), first = (b * H + blocks.first(block)) * wide,
-                      last = (b * H + blocks.last(block)) * wide;
-        sums.visible.reserve_for(F, blocks.most_visible(F));
-        sums.visible.find(args.face_index + first, last - first, F);
-        T* values = reserve(sums.values, 9 * sums.visible.count);
-        std::fill_n(values, 9 * sums.visible.count, T(0));
+  sum_blocks<FaceSums<T>>(
+      mesh.batch, {H, wide}, false, args.num_threads, [&](int64_t b) { return mesh.face_count(b); },
+      [&](const RowBlock& block, FaceSums<T>& sums) {
+        const int64_t first = block.begin(), last = block.end();
+        sums.start(args.face_index + first, last - first, block.blocks.num_faces, 9);
+        T* values = sums.values.data();
         for (int64_t n = first; n < last; ++n) {
           const int64_t id = args.face_index[n];
           if (id < 0) continue;
-          const SoftFragment<T> f(args, b, id, n / wide % H, n % wide / args.layers);
+          const SoftFragment<T> f(args, block.b, id, n / wide % H, n % wide / args.layers);
           fragment_backward(f, args.perspective, args.grad_weights + 3 * n, args.grad_depth[n],
                             args.grad_distances[n], values + 9 * sums.visible.slots[id + 1]);
         }
       },
-      [&](int64_t b, SoftSums<T>& sums) {
-        for (int64_t n = 1; n < sums.visible.count; ++n) {
-          const int64_t* face =
-              mesh.image_faces(b) + 3 * (sums.visible.ids[n] % mesh.face_count(b));
-          for (int k = 0; k < 9; ++k)
-            args.grad_vertices[3 * (mesh.vertex_start(b) + face[k / 3]) + k % 3] +=
-                sums.values[9 * n + k];
-        }
+      [&](int64_t b, const FaceSums<T>& sums) {
+        const ImageAttributes<T> image{mesh.vertex_start(b), mesh.image_faces(b),
+                                       mesh.face_count(b)};
+        scatter_corner_sums<3>(sums, image, 3, args.grad_vertices);
       });
 }
 
-template void soft_fragments_forward(const SoftFragments<float>&);
-template void soft_fragments_forward(const SoftFragments<double>&);
-template void soft_fragments_backward(const SoftFragments<float>&);
-template void soft_fragments_backward(const SoftFragments<double>&);
+NMR_FLOAT_AND_DOUBLE(soft_fragments_forward, SoftFragments)
+NMR_FLOAT_AND_DOUBLE(soft_fragments_backward, SoftFragments)
 
 }  // namespace nmr

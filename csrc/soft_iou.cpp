@@ -8,7 +8,7 @@
 namespace nmr {
 namespace {
 
-constexpr int64_t kChunk = 4096;  // a multiple of 16
+constexpr int64_t kValueChunk = 4096;  // a multiple of 16
 
 struct Totals {
   double product = 0;  // sum p t
@@ -51,9 +51,7 @@ void soft_iou_backward(const SoftIou<T>& args) {
   });
 }
 
-template void soft_iou_forward(const SoftIou<float>&);
-template void soft_iou_forward(const SoftIou<double>&);
-template void soft_iou_backward(const SoftIou<float>&);
-template void soft_iou_backward(const SoftIou<double>&);
+NMR_FLOAT_AND_DOUBLE(soft_iou_forward, SoftIou)
+NMR_FLOAT_AND_DOUBLE(soft_iou_backward, SoftIou)
 
 }  // namespace nmr

@@ -8,13 +8,14 @@ NMR_INLINE void add_pairs(const T* p, const T* t, Lanes<T>& product, Lanes<T>& s
   sum = sum + (a + b);
 }
 
-// Two vectors of partial sums run side by side. After every kChunk values they are added, in order,
-// to totals in double precision. The order depends on the number of values alone.
+// Two vectors of partial sums run side by side. After every kValueChunk values they are added, in
+// order, to totals in double precision. The order depends on the number of values alone.
 template <class T>
 Totals totals_of(const T* p, const T* t, int64_t count) {
   Totals totals;
-  for (int64_t begin = 0; begin < count; begin += kChunk) {
-    const int64_t end = std::min(begin + kChunk, count), whole = end - (end - begin) % (2 * kLanes);
+  for (int64_t begin = 0; begin < count; begin += kValueChunk) {
+    const int64_t end = std::min(begin + kValueChunk, count),
+                  whole = end - (end - begin) % (2 * kLanes);
     Lanes<T> product[2] = {splat(T(0)), splat(T(0))}, sum[2] = {splat(T(0)), splat(T(0))};
     for (int64_t n = begin; n < whole; n += 2 * kLanes) {
       add_pairs(p + n, t + n, product[0], sum[0]);

@@ -23,10 +23,7 @@ struct SoftWeights {
     sum = v[0] + v[1] + v[2];
     for (int k = 0; k < 3; ++k) v[k] /= sum;
   }
-  NMR_INLINE T depth(const T* z, bool perspective) const {
-    return perspective ? 1 / (v[0] / z[0] + v[1] / z[1] + v[2] / z[2])
-                       : v[0] * z[0] + v[1] * z[1] + v[2] * z[2];
-  }
+  NMR_INLINE T depth(const T* z, bool perspective) const { return depth_at(v, z, perspective); }
 };
 
 }  // namespace nmr

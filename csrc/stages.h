@@ -255,33 +255,20 @@ struct SoftFragments {
 
 // Barycentric weights and depth of the nearest face at each pixel, and their derivatives
 // (fragments.cpp). On the screen 1 / depth is linear with perspective, and depth itself without.
+// A depth image has no weights, and with anti-aliasing depths averaged over 2x2 pixels.
 template <class T>
 struct Fragments {
   MeshBatch<T> mesh;
-  Size raster;                // H x W
+  Size image;                 // h x w
+  bool anti_aliasing;         // only of a depth image
   T far;                      // depth of the background
   const int32_t* face_index;  // [B, H, W]
   T* weights;  // forward out [B, H, W, 3]: of the face's own vertices 0, 1, 2, in space; 0 on
-               // background
-  T* depth;    // forward out [B, H, W]
+               // background. nullptr: a depth image
+  T* depth;    // forward out [B, h, w]
   const T* grad_weights;  // backward in [B, H, W, 3], or nullptr
-  const T* grad_depth;    // backward in [B, H, W], or nullptr
+  const T* grad_depth;    // backward in [B, h, w]; nullptr, if not of a depth image
   T* grad_vertices;       // backward out, like mesh.vertices
-  int num_threads;
-  bool perspective = true;
-};
-
-// Depth images: the same depth, averaged over 2x2 pixels with anti-aliasing (fragments.cpp).
-template <class T>
-struct DepthImage {
-  MeshBatch<T> mesh;
-  Size image;  // h x w
-  bool anti_aliasing;
-  T far;
-  const int32_t* face_index;
-  T* depth;             // forward out [B, h, w]
-  const T* grad_depth;  // backward in [B, h, w]
-  T* grad_vertices;     // backward out, like mesh.vertices
   int num_threads;
   bool perspective = true;
 };
@@ -465,7 +452,7 @@ enum class LightParameter : int {
 // unit vector, and c is multiplied by its length); a point light has l towards position, of length
 // 1, and c = point point_color / (1 + falloff |position - x|^2).
 template <class T>
-struct Lit {
+struct LitColors {
   Interpolate<T> at;     // attributes: vertices in world space, 3 channels, corners: the faces;
                          // grad_attributes, grad_weights
   const T* normals;      // [B or 1, F, 3], packed [M, 3]; smooth: like the vertices
@@ -601,9 +588,9 @@ void fragments_forward(const Fragments<T>& args);
 template <class T>
 void fragments_backward(const Fragments<T>& args);
 template <class T>
-void depth_forward(const DepthImage<T>& args);
+void depth_forward(const Fragments<T>& args);
 template <class T>
-void depth_backward(const DepthImage<T>& args);
+void depth_backward(const Fragments<T>& args);
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args);
 template <class T>
@@ -635,9 +622,9 @@ void normals_forward(const Normals<T>& args);
 template <class T>
 void normals_backward(const Normals<T>& args);
 template <class T>
-void lit_forward(const Lit<T>& args);
+void lit_forward(const LitColors<T>& args);
 template <class T>
-void lit_backward(const Lit<T>& args);
+void lit_backward(const LitColors<T>& args);
 template <class T>
 void resolve_forward(const Resolve<T>& args);
 template <class T>
@@ -653,5 +640,10 @@ void soft_iou_forward(const SoftIou<T>& args);
 template <class T>
 void soft_iou_backward(const SoftIou<T>& args);
 void voxelize(const Voxelize& args);
+
+// Compiles a stage for float and double, behind its definition.
+#define NMR_FLOAT_AND_DOUBLE(stage, Args)       \
+  template void stage(const Args<float>& args); \
+  template void stage(const Args<double>& args);
 
 }  // namespace nmr

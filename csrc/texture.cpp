@@ -207,11 +207,10 @@ void uv_levels(const UVLevels<T>& args) {
     const int64_t F = image.num_faces, begin = b * raster.pixels();
     const T* uv = args.uv.attributes + 2 * image.first_row;
     LevelScratch<T>& scratch = thread_scratch<LevelScratch<T>>();
-    scratch.visible.reserve_for(F, std::min(2 * F, raster.pixels()));
-    scratch.visible.find(args.uv.face_index + begin, raster.pixels(), F);
+    scratch.visible.list(args.uv.face_index + begin, raster.pixels(), F);
     Slopes<T>* slopes = reserve(scratch.slopes, scratch.visible.count);
     for (int64_t n = 1; n < scratch.visible.count; ++n) {
-      const int64_t id = scratch.visible.ids[n], face = id < F ? id : id - F;
+      const int64_t face = face_of(scratch.visible.ids[n], F);
       const Triangle<T> t =
           load_triangle(args.mesh.image_vertices(b), args.mesh.image_faces(b) + 3 * face, false);
       slopes[n] = slopes_of(t, raster, uv, image.corners + 3 * face);
@@ -222,7 +221,7 @@ void uv_levels(const UVLevels<T>& args) {
       args.level[n] = 0;
       if (id < 0) continue;
       const T* weights = args.uv.weights + 3 * n;
-      const Place<T> place = place_of(uv, image.corners + 3 * (id < F ? id : id - F), weights);
+      const Place<T> place = place_of(uv, image.corners_of(id), weights);
       args.level[n] =
           level_of(slopes[scratch.visible.slots[id + 1]], place, weights, grid, args.levels);
     }
@@ -340,20 +339,14 @@ constexpr int64_t kNoRow = -1;
 // those of texels. Otherwise `rows` gets the first texel of the (up to four) rows of each pixel,
 // from which scatter_texels continues.
 template <int64_t kChannels, class T>
-void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>& image,
-                              const RowBlocks& blocks, int64_t b, int64_t block, bool direct,
-                              int32_t* rows, CornerSums<T>& sums) {
+void sample_uv_block_backward(const SampleUV<T>& args, const RowBlock& block, bool direct,
+                              int32_t* rows, FaceSums<T>& sums) {
   const Interpolate<T>& at = args.uv;
-  const int64_t H = at.raster.height, W = at.raster.width,
-                C = kChannels ? kChannels : args.channels, F = image.num_faces;
-  const int64_t begin = (b * H + blocks.first(block)) * W, end = (b * H + blocks.last(block)) * W;
+  const ImageAttributes<T> image = image_attributes(at, block.b);
+  const int64_t C = kChannels ? kChannels : args.channels, begin = block.begin(), end = block.end();
   const int64_t per_pixel = args.level ? 4 : 2;
   const T* uv = at.attributes + 2 * image.first_row;
-  if (at.grad_attributes) {
-    sums.visible.reserve_for(F, blocks.most_visible(F));
-    sums.visible.find(at.face_index + begin, end - begin, F);
-    std::fill_n(reserve(sums.values, sums.visible.count * 6), sums.visible.count * 6, T(0));
-  }
+  if (at.grad_attributes) sums.start(at.face_index + begin, end - begin, image.num_faces, 6);
   for (int64_t n = begin; n < end; ++n) {
     const int64_t id = at.face_index[n];
     if (rows) std::fill_n(rows + n * per_pixel, per_pixel, static_cast<int32_t>(kNoRow));
@@ -361,10 +354,10 @@ void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>&
       if (at.grad_weights) std::fill_n(at.grad_weights + 3 * n, 3, T(0));
       continue;
     }
-    const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
+    const int64_t* corners = image.corners_of(id);
     const T *weights = at.weights + 3 * n, *grad = args.grad_colors + n * C;
     const Place<T> place = place_of(uv, corners, weights);
-    const MipBlend<T> blend = blend_of(args, b, n);
+    const MipBlend<T> blend = blend_of(args, block.b, n);
     T grad_u = 0, grad_v = 0;
     for (int l = 0; l < blend.count; ++l) {
       const BilinearTaps<T> taps = taps_of(blend.grid[l], place, args.wrap);
@@ -387,7 +380,7 @@ void sample_uv_block_backward(const SampleUV<T>& args, const ImageAttributes<T>&
             (place.u_counts ? row[0] * grad_u : T(0)) + (place.v_counts ? row[1] * grad_v : T(0));
       }
       if (at.grad_attributes) {
-        T* sum = sums.values.data() + (3 * sums.visible.slots[id + 1] + k) * 2;
+        T* sum = sums.of(id, 6) + 2 * k;
         sum[0] += weights[k] * grad_u;
         sum[1] += weights[k] * grad_v;
       }
@@ -403,16 +396,13 @@ void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first,
                 pixels = at.raster.pixels();
   for (int64_t b = 0; b < at.batch; ++b) {
     const ImageAttributes<T> image = image_attributes(at, b);
-    const int64_t F = image.num_faces;
     for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
       bool inside = false;
       for (int64_t k = 0; k < per_pixel; ++k)
         inside |= rows[n * per_pixel + k] >= first && rows[n * per_pixel + k] < last;
       if (!inside) continue;
-      const int64_t id = at.face_index[n];
-      const int64_t* corners = image.corners + 3 * (id < F ? id : id - F);
-      const Place<T> place =
-          place_of(at.attributes + 2 * image.first_row, corners, at.weights + 3 * n);
+      const Place<T> place = place_of(at.attributes + 2 * image.first_row,
+                                      image.corners_of(at.face_index[n]), at.weights + 3 * n);
       const MipBlend<T> blend = blend_of(args, b, n);
       for (int l = 0; l < blend.count; ++l)
         add_texel_gradients<kChannels>(taps_of(blend.grid[l], place, args.wrap), blend.share[l],
@@ -432,7 +422,7 @@ void sample_uv_forward(const SampleUV<T>& args) {
     for_rows(at.batch, at.raster.height, at.num_threads, [&](int64_t b, int64_t row) {
       const ImageAttributes<T> image = image_attributes(at, b);
       const T* uv = at.attributes + 2 * image.first_row;
-      const int64_t start = (b * at.raster.height + row) * W, F = image.num_faces;
+      const int64_t start = (b * at.raster.height + row) * W;
       T* color = args.colors + start * C;
       for (int64_t n = start; n < start + W; ++n, color += C) {
         const int64_t id = at.face_index[n];
@@ -440,8 +430,7 @@ void sample_uv_forward(const SampleUV<T>& args) {
           for (int64_t c = 0; c < C; ++c) color[c] = 0;
           continue;
         }
-        const Place<T> place =
-            place_of(uv, image.corners + 3 * (id < F ? id : id - F), at.weights + 3 * n);
+        const Place<T> place = place_of(uv, image.corners_of(id), at.weights + 3 * n);
         const MipBlend<T> blend = blend_of(args, b, n);
         add_taps<kChannels, false>(taps_of(blend.grid[0], place, args.wrap), args.texels,
                                    blend.share[0], C, color);
@@ -467,20 +456,18 @@ void sample_uv_backward(const SampleUV<T>& args) {
   if (at.grad_attributes) std::fill_n(at.grad_attributes, 2 * uv_rows, T(0));
   if (args.grad_texels) std::fill_n(args.grad_texels, args.num_texels * args.channels, T(0));
   std::vector<int32_t> rows(scatter ? at.batch * at.raster.pixels() * (args.level ? 4 : 2) : 0);
-  const auto blocks_of = [&](int64_t b) {
-    return RowBlocks(at.raster, image_attributes(at, b).num_faces);
-  };
-  sum_blocks<CornerSums<T>>(
-      at.batch, shared_uv, at.num_threads, [&](int64_t b) { return blocks_of(b).count; },
-      [&](int64_t b, int64_t block, CornerSums<T>& sums) {
+  sum_blocks<FaceSums<T>>(
+      at.batch, at.raster, shared_uv, at.num_threads,
+      [&](int64_t b) { return image_attributes(at, b).num_faces; },
+      [&](const RowBlock& block, FaceSums<T>& sums) {
         with_channels<T>(args.channels, [&](auto known) {
-          sample_uv_block_backward<known()>(args, image_attributes(at, b), blocks_of(b), b, block,
-                                            direct, scatter ? rows.data() : nullptr, sums);
+          sample_uv_block_backward<known()>(args, block, direct, scatter ? rows.data() : nullptr,
+                                            sums);
         });
       },
-      [&](int64_t b, const CornerSums<T>& sums) {
+      [&](int64_t b, const FaceSums<T>& sums) {
         if (at.grad_attributes)
-          scatter_corner_sums(sums, image_attributes(at, b), 2, at.grad_attributes);
+          scatter_corner_sums<2>(sums, image_attributes(at, b), 2, at.grad_attributes);
       });
   if (!scatter) return;
   const int64_t parts = 2 * static_cast<int64_t>(at.num_threads);
@@ -492,14 +479,10 @@ void sample_uv_backward(const SampleUV<T>& args) {
   });
 }
 
-#define NMR_DEFINE_TEXTURES(T)                         \
-  template void mipmaps_forward(const Mipmaps<T>&);    \
-  template void mipmaps_backward(const Mipmaps<T>&);   \
-  template void uv_levels(const UVLevels<T>&);         \
-  template void sample_uv_forward(const SampleUV<T>&); \
-  template void sample_uv_backward(const SampleUV<T>&);
-NMR_DEFINE_TEXTURES(float)
-NMR_DEFINE_TEXTURES(double)
-#undef NMR_DEFINE_TEXTURES
+NMR_FLOAT_AND_DOUBLE(mipmaps_forward, Mipmaps)
+NMR_FLOAT_AND_DOUBLE(mipmaps_backward, Mipmaps)
+NMR_FLOAT_AND_DOUBLE(uv_levels, UVLevels)
+NMR_FLOAT_AND_DOUBLE(sample_uv_forward, SampleUV)
+NMR_FLOAT_AND_DOUBLE(sample_uv_backward, SampleUV)
 
 }  // namespace nmr

@@ -157,6 +157,14 @@ class Kernels : public std::vector<Kernel> {
   }
 };
 
+// A stage with a backward pass: read_<name> reads its arguments, which <name>_forward and
+// <name>_backward take.
+#define NMR_ADD_STAGE(kernels, name)                              \
+  kernels.add_with_backward(#name, [](auto zero, Call& call) {    \
+    const auto args = read_##name<decltype(zero)>(call);          \
+    call.backward ? name##_backward(args) : name##_forward(args); \
+  })
+
 // The kernels of each file.
 void add_camera(Kernels& kernels);
 void add_raster(Kernels& kernels);

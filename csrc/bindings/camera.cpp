@@ -64,10 +64,7 @@ void add_camera(Kernels& kernels) {
         call.backward ? look_at_backward(args) : look_at_forward(args);
       },
       "camera");
-  kernels.add_with_backward("project", [](auto zero, Call& call) {
-    const auto args = read_project<decltype(zero)>(call);
-    call.backward ? project_backward(args) : project_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, project);
 }
 
 }  // namespace nmr

@@ -49,14 +49,8 @@ Antialias<T> read_antialias(Call& call) {
 }  // namespace
 
 void add_clip_space(Kernels& kernels) {
-  kernels.add_with_backward("clip_weights", [](auto zero, Call& call) {
-    const auto args = read_clip_weights<decltype(zero)>(call);
-    call.backward ? clip_weights_backward(args) : clip_weights_forward(args);
-  });
-  kernels.add_with_backward("antialias", [](auto zero, Call& call) {
-    const auto args = read_antialias<decltype(zero)>(call);
-    call.backward ? antialias_backward(args) : antialias_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, clip_weights);
+  NMR_ADD_STAGE(kernels, antialias);
 }
 
 }  // namespace nmr

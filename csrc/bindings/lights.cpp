@@ -54,8 +54,8 @@ void require_layout(const int64_t* layout, int64_t num_parameters, int64_t batch
 }
 
 template <class T>
-Lit<T> read_lit(Call& call) {
-  Lit<T> args{};
+LitColors<T> read_lit(Call& call) {
+  LitColors<T> args{};
   args.at = read_interpolate<T>(call, "vertices", "faces", "3");
   const bool packed = args.at.starts;
   args.smooth = call.flag("smooth");
@@ -83,14 +83,8 @@ Lit<T> read_lit(Call& call) {
 }  // namespace
 
 void add_lights(Kernels& kernels) {
-  kernels.add_with_backward("normals", [](auto zero, Call& call) {
-    const auto args = read_normals<decltype(zero)>(call);
-    call.backward ? normals_backward(args) : normals_forward(args);
-  });
-  kernels.add_with_backward("lit", [](auto zero, Call& call) {
-    const auto args = read_lit<decltype(zero)>(call);
-    call.backward ? lit_backward(args) : lit_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, normals);
+  NMR_ADD_STAGE(kernels, lit);
 }
 
 }  // namespace nmr

@@ -90,10 +90,7 @@ Voxelize read_voxelize(Call& call) {
 }  // namespace
 
 void add_mesh(Kernels& kernels) {
-  kernels.add_with_backward("smoothness", [](auto zero, Call& call) {
-    const auto args = read_smoothness<decltype(zero)>(call);
-    call.backward ? smoothness_backward(args) : smoothness_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, smoothness);
   kernels.add_with_backward("soft_iou_loss",
                             [](auto zero, Call& call) { mean_of_iou<decltype(zero)>(call); });
   kernels.add("voxels", [](auto, Call& call) { voxelize(read_voxelize(call)); });

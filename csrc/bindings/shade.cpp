@@ -29,7 +29,7 @@ TextureCubes<T> read_texture_cubes(Call& call) {
 }
 
 template <class T>
-Interpolate<T> read_values(Call& call) {
+Interpolate<T> read_interpolate(Call& call) {
   Interpolate<T> args = read_interpolate<T>(call, "attributes", "corners", "C");
   call.result("values [B, H, W, C]", args.values, args.grad_values);
   return args;
@@ -38,14 +38,8 @@ Interpolate<T> read_values(Call& call) {
 }  // namespace
 
 void add_shade(Kernels& kernels) {
-  kernels.add_with_backward("texture_cubes", [](auto zero, Call& call) {
-    const auto args = read_texture_cubes<decltype(zero)>(call);
-    call.backward ? texture_cubes_backward(args) : texture_cubes_forward(args);
-  });
-  kernels.add_with_backward("interpolate", [](auto zero, Call& call) {
-    const auto args = read_values<decltype(zero)>(call);
-    call.backward ? interpolate_backward(args) : interpolate_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, texture_cubes);
+  NMR_ADD_STAGE(kernels, interpolate);
 }
 
 }  // namespace nmr

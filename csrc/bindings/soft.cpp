@@ -86,10 +86,7 @@ void add_soft(Kernels& kernels) {
   });
   kernels.add("soft_layers",
               [](auto zero, Call& call) { soft_layers(read_layers<decltype(zero)>(call)); });
-  kernels.add_with_backward("soft_fragments", [](auto zero, Call& call) {
-    const auto args = read_soft_fragments<decltype(zero)>(call);
-    call.backward ? soft_fragments_backward(args) : soft_fragments_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, soft_fragments);
 }
 
 }  // namespace nmr

@@ -74,7 +74,7 @@ UVLevels<T> read_levels(Call& call) {
 }
 
 template <class T>
-SampleUV<T> read_sample(Call& call) {
+SampleUV<T> read_sample_uv(Call& call) {
   SampleUV<T> args{};
   args.uv = read_interpolate<T>(call, "uv", "corners", "2");
   call.read("texels [N, C]", args.texels);
@@ -95,16 +95,10 @@ SampleUV<T> read_sample(Call& call) {
 }  // namespace
 
 void add_texture(Kernels& kernels) {
-  kernels.add_with_backward("mipmaps", [](auto zero, Call& call) {
-    const auto args = read_mipmaps<decltype(zero)>(call);
-    call.backward ? mipmaps_backward(args) : mipmaps_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, mipmaps);
   kernels.add("uv_levels",
               [](auto zero, Call& call) { uv_levels(read_levels<decltype(zero)>(call)); });
-  kernels.add_with_backward("sample_uv", [](auto zero, Call& call) {
-    const auto args = read_sample<decltype(zero)>(call);
-    call.backward ? sample_uv_backward(args) : sample_uv_forward(args);
-  });
+  NMR_ADD_STAGE(kernels, sample_uv);
 }
 
 }  // namespace nmr

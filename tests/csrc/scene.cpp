@@ -146,6 +146,7 @@ struct Run {
     T* weights_out = out("weights", 3 * pixels);
     const Fragments<T> args{mesh,
                             raster,
+                            false,
                             s.far,
                             face_index,
                             weights_out,
@@ -175,16 +176,18 @@ struct Run {
                           threads};
     soft_fragments_forward(soft);
     soft_fragments_backward(soft);
-    const DepthImage<T> image{mesh,
-                              s.image,
-                              s.anti_aliasing,
-                              s.far,
-                              face_index,
-                              out("depth_image", image_pixels),
-                              in("grad_depth_image", image_pixels),
-                              out("grad_depth_vertices", 3 * rows),
-                              threads,
-                              s.perspective};
+    const Fragments<T> image{mesh,
+                             s.image,
+                             s.anti_aliasing,
+                             s.far,
+                             face_index,
+                             nullptr,
+                             out("depth_image", image_pixels),
+                             nullptr,
+                             in("grad_depth_image", image_pixels),
+                             out("grad_depth_vertices", 3 * rows),
+                             threads,
+                             s.perspective};
     depth_forward(image);
     depth_backward(image);
   }
@@ -362,7 +365,7 @@ struct Run {
       viewer[5 * b + 4] = viewer[5 * b + 4] < 0 ? T(-1) : T(1);
     }
     const bool lit = seed % 8 != 6, colored = lit && seed % 5 != 0;
-    Lit<T> args{};
+    LitColors<T> args{};
     args.at = interpolate(s.vertices.data(), s.batch, 3, out("grad_lit_vertices", 3 * rows),
                           out("grad_lit_weights", 3 * pixels));
     args.normals = unit;
