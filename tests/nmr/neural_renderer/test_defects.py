@@ -24,7 +24,6 @@ def look_at_renderer(**settings):
     return renderer
 
 
-@pytest.mark.parametrize("fill_back", [True, False])
 def test_textures_stay_as_they_are(fill_back):
     vertices, faces, textures = scene()
     leaf = leaf_of(textures)

@@ -89,7 +89,7 @@ def test_sizes_that_are_whole_numbers(size):
     assert torch.equal(*(nr.rasterize_silhouettes(corners, n) for n in (size, 8)))
 
 
-@pytest.mark.parametrize("flags", itertools.product((False, True), repeat=3))
+@pytest.mark.parametrize("flags", [*itertools.product((False, True), repeat=3)])
 def test_outputs_that_are_not_wanted_are_none(flags):
     scale = 8, True, 0.1, 100, 1e-4, (0, 0, 0)
     images = nr.rasterize_rgbad(*scene(), *scale)

@@ -142,7 +142,6 @@ def test_calibrated_cameras_are_stored_as_published():
     assert nr.Renderer(**given | {"t": leaf}).t is leaf
 
 
-@pytest.mark.parametrize("perspective", [True, False])
 @pytest.mark.parametrize("mode", ["look", "look_at"])
 def test_up_of_the_camera(mode, perspective):
     """A world whose up is z, as in the forks that render cars: its tip is on top, as if z were y."""
@@ -270,7 +269,6 @@ def test_a_renderer_saved_whole_by_the_published_code_draws():
 
 @pytest.mark.parametrize("size", [(16, 32), [16, 32], np.array([16, 32]), torch.tensor([16, 32])])
 @pytest.mark.parametrize("mode", ["look", "look_at"])
-@pytest.mark.parametrize("perspective", [True, False])
 def test_wide_images_show_more_at_the_sides(size, mode, perspective):
     mesh, renderer = textured_sphere(), nr.Renderer(16, camera_mode=mode, perspective=perspective)
     square = renderer(*mesh)
