@@ -35,7 +35,6 @@ def slow_light(normal, point, eye, lamps, specular, shininess):
     return light
 
 
-@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("specular", [0.0, 0.7])
 def test_lights_and_highlights_equal_the_formula(smooth, specular):
     vertices, faces = bumpy_sphere()
@@ -77,7 +76,6 @@ def test_highlights_without_a_camera_and_with_one_of_your_own():
     assert_close(*(nmr.render_rgb(*SCREEN, x, **how) for x in (mine, camera)))
 
 
-@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("specular", [{}, dict(specular=0.6, shininess=3.5)], ids=["", "specular"])
 def test_every_parameter_has_its_true_derivative(smooth, specular):
     """Of a pyramid larger than the screen, with its top in sight and the light oblique to all its sides."""
@@ -143,7 +141,6 @@ def room_cameras(kind, count, g, right_handed):
     [("look", False), ("wide", False), ("look", True), ("wide", True), ("pinhole", False)],
 )
 @pytest.mark.parametrize("right_handed", [False, True])
-@pytest.mark.parametrize("packed", [False, True])
 def test_normals_point_towards_the_viewer_inside_rooms(kind, foreign, right_handed, packed):
     g = torch.Generator().manual_seed(0)
     camera, eye = room_cameras(kind, 40, g, right_handed)
@@ -161,7 +158,6 @@ def test_normals_point_towards_the_viewer_inside_rooms(kind, foreign, right_hand
         assert (facing[fragments.covered] > (-0.05 if smooth else 0)).all()
 
 
-@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize(
     "dtype, scale", [(torch.float32, 1e-17), (torch.float32, 1e11), (torch.float64, 1e-140)]
 )
