@@ -48,7 +48,10 @@ struct Run {
     for (char c : string_view(name)) stream = 31 * stream + static_cast<uint64_t>(c);
     return stream;
   }
-  T* out(const char* name, int64_t size) { return r.out(name, size); }
+  template <class Number = T>
+  Number* out(const char* name, int64_t size) {
+    return r.template out<Number>(name, size);
+  }
   T* out_if(bool wanted, const char* name, int64_t size) {
     T* values = out(name, wanted ? size : 0);
     return wanted ? values : nullptr;
@@ -87,12 +90,12 @@ struct Run {
   // The face index map; SoftRas's silhouette; the nearest one to three faces.
   void surfaces() {
     const RasterSettings<T> settings{raster, s.fill_back, s.near, s.far, s.perspective};
-    int32_t* index = r.template out<int32_t>("face_index", pixels);
+    int32_t* index = out<int32_t>("face_index", pixels);
     face_index = index;
     rasterize(Rasterize<T>{mesh, settings, index, threads});
     const int64_t layers = 1 + seed % 3;
-    rasterize_layers(RasterizeLayers<T>{
-        mesh, settings, layers, r.template out<int32_t>("layers", layers * pixels), threads});
+    rasterize_layers(RasterizeLayers<T>{mesh, settings, layers,
+                                        out<int32_t>("layers", layers * pixels), threads});
 
     const T sigma = seed % 7 < 3 ? T(1e-4) : seed % 7 < 5 ? T(1e-2) : T(0.3);
     const SoftSettings<T> soft{settings, sigma, seed % 5 == 0 ? T(100) : T(7) * sigma};
@@ -100,8 +103,8 @@ struct Run {
     soft_forward(SoftForward<T>{mesh, soft, transmittance, threads});
     soft_backward(SoftBackward<T>{mesh, soft, transmittance, in("grad_transmittance", pixels),
                                   out("grad_soft", 3 * rows), out("grad_sigma", s.batch), threads});
-    soft_layers(SoftLayers<T>{mesh, soft, layers,
-                              r.template out<int32_t>("soft_layers", layers * pixels), threads});
+    soft_layers(
+        SoftLayers<T>{mesh, soft, layers, out<int32_t>("soft_layers", layers * pixels), threads});
 
     for (int64_t n = 0; n < pixels && s.foreign_face_index; ++n) {
       const double u = (noise(stream_of("face_index"), n) + 1) / 2;
@@ -113,17 +116,16 @@ struct Run {
   }
 
   void clip() {
-    int64_t* counts = r.template out<int64_t>("clip_counts", 2 * s.batch);
+    int64_t* counts = out<int64_t>("clip_counts", 2 * s.batch);
     clip_count(ClipCount<T>{mesh, s.near, counts, threads});
-    int64_t* starts = r.template out<int64_t>("clip_starts", 2 * s.batch + 2);
+    int64_t* starts = out<int64_t>("clip_starts", 2 * s.batch + 2);
     starts[0] = starts[1] = 0;
     for (int64_t n = 0; n < 2 * s.batch; ++n)
       starts[n + 2] = starts[n] + counts[n] + (seed % 4 == 0);  // or room to spare
     const int64_t P = starts[2 * s.batch], M = starts[2 * s.batch + 1];
-    clip_faces(ClipFaces<T>{mesh, s.near, starts, r.template out<int64_t>("clip_faces", 3 * M),
-                            r.template out<int32_t>("clip_source", M),
-                            r.template out<int64_t>("clip_corners", 3 * M),
-                            r.template out<int64_t>("clip_ends", 4 * P), threads});
+    clip_faces(ClipFaces<T>{mesh, s.near, starts, out<int64_t>("clip_faces", 3 * M),
+                            out<int32_t>("clip_source", M), out<int64_t>("clip_corners", 3 * M),
+                            out<int64_t>("clip_ends", 4 * P), threads});
   }
 
   void silhouettes() {
@@ -492,15 +494,15 @@ struct Run {
     std::copy_n(grads.data() + 3 * count, 3 * count, out("grad_up", 3 * count));
   }
 
-  // The edges are made up: corners of consecutive faces of the first mesh. Packed vertices count as
-  // one mesh.
+  // The edges are made up: corners of consecutive faces of the first mesh but the last, so that
+  // groups of edges are not full. Packed vertices count as one mesh.
   void smoothness() {
-    const int64_t num_edges = s.batch > 0 ? mesh.face_count(0) : 0,
-                  batch = s.packed() ? 1 : s.batch;
+    const int64_t num_faces = s.batch > 0 ? mesh.face_count(0) : 0,
+                  num_edges = std::max<int64_t>(num_faces - 1, 0), batch = s.packed() ? 1 : s.batch;
     int64_t* edges = r.tables.resize("edges", 4 * num_edges).data();
     for (int64_t f = 0; f < num_edges; ++f) {
       std::copy_n(s.faces.data() + 3 * f, 3, edges + 4 * f);
-      edges[4 * f + 3] = s.faces[3 * ((f + 1) % num_edges) + 1];
+      edges[4 * f + 3] = s.faces[3 * (f + 1) + 1];
     }
     const Smoothness<T> args{s.vertices.data(),
                              edges,
@@ -543,8 +545,7 @@ struct Run {
                                  s.num_faces,     s.faces_per_image, mesh.starts};
     for (const bool touched : {false, true}) {
       const int64_t cells = s.grid_size * s.grid_size * s.grid_size;
-      unsigned char* filled =
-          r.template out<unsigned char>(touched ? "touched" : "voxels", s.batch * cells);
+      unsigned char* filled = out<unsigned char>(touched ? "touched" : "voxels", s.batch * cells);
       voxelize(Voxelize{batch, s.grid_size, touched, reinterpret_cast<bool*>(filled), threads});
     }
   }
@@ -686,8 +687,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   const Size raster = scene.raster(), image = scene.image;
   const int64_t H = raster.height, W = raster.width;
   const bool foreign = scene.foreign_face_index;
-  const std::vector<int32_t>&face_index = r.template get<int32_t>("face_index"),
-        &layers = r.template get<int32_t>("layers");
+  const std::vector<int32_t>& face_index = r.template get<int32_t>("face_index");
 
   for (size_t n = 0; n < face_index.size(); ++n) {
     const int64_t b = static_cast<int64_t>(n) / raster.pixels(), x = static_cast<int64_t>(n) % W,
@@ -719,27 +719,20 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
           face_index[b * raster.pixels() + (step * y + k / step) * W + step * x + k % step] >= 0;
     check(alpha[n] == T(covered) / T(step * step), "alpha is the covered share of a pixel");
   }
-  const size_t count = face_index.empty() ? 0 : layers.size() / face_index.size();
-  const std::vector<int32_t>& around = r.template get<int32_t>("soft_layers");
-  for (size_t n = 0; n < around.size(); ++n) {
-    const int64_t id = around[n],
-                  F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
-    check(id >= -1 && id < (scene.fill_back ? 2 * F : F),
-          "a soft layer names a face of its image, or -1");
-    if (n % count > 0)
-      check(id < 0 || (around[n - 1] >= 0 && around[n - 1] != id),
-            "soft layers are different faces, then -1");
-  }
-  for (size_t n = 0; n < layers.size(); ++n) {
-    const int64_t id = layers[n],
-                  F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
-    check(id >= -1 && id < (scene.fill_back ? 2 * F : F),
-          "a layer names a face of its image, or -1");
-    if (n % count > 0)
-      check(id < 0 || (layers[n - 1] >= 0 && layers[n - 1] != id),
-            "layers are different faces, then -1");
-    if (n % count == 0 && !foreign)
-      check(id == face_index[n / count], "the first layer is the face index map");
+  for (const char* name : {"layers", "soft_layers"}) {
+    const std::vector<int32_t>& layers = r.template get<int32_t>(name);
+    const size_t count = face_index.empty() ? 0 : layers.size() / face_index.size();
+    for (size_t n = 0; n < layers.size(); ++n) {
+      const int64_t id = layers[n],
+                    F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
+      check(id >= -1 && id < (scene.fill_back ? 2 * F : F),
+            "a layer names a face of its image, or -1");
+      if (n % count > 0)
+        check(id < 0 || (layers[n - 1] >= 0 && layers[n - 1] != id),
+              "layers are different faces, then -1");
+      else if (string_view(name) == "layers" && !foreign)
+        check(id == face_index[n / count], "the first layer is the face index map");
+    }
   }
 
   const std::vector<int64_t>&starts = r.template get<int64_t>("clip_starts"),

@@ -22,18 +22,16 @@ inline double noise(uint64_t seed, uint64_t index) {
   return static_cast<double>(static_cast<int64_t>(x >> 44)) / 524288.0 - 1.0;
 }
 
-template <class T>
-struct Scene {
+// What a scene holds besides numbers of its type.
+struct SceneShape {
   int64_t batch = 0, num_vertices = 0,
           num_faces = 0;  // as in MeshBatch: packed, the sums over all meshes
   bool faces_per_image = false;
-  std::vector<T> vertices;
   std::vector<int64_t> faces;
   std::vector<int64_t> starts;  // empty unless packed
 
   Size image{8, 8};
   bool anti_aliasing = true, fill_back = true;
-  T near = T(0.1), far = T(100), eps = T(1e-4);
   int64_t channels = 3, texture_size = 2, grid_size = 4;
   bool per_image_values = false;  // textures and attributes of each image, not shared
   bool perspective = true,
@@ -51,13 +49,20 @@ struct Scene {
   Size raster() const { return raster_of(image, anti_aliasing); }
   int64_t pixels() const { return batch * raster().pixels(); }
   int64_t rows() const { return packed() ? num_vertices : batch * num_vertices; }  // of vertices
-  MeshBatch<T> mesh() const {
-    const int64_t* first = packed() ? starts.data() : nullptr;
-    return {vertices.data(), faces.data(), batch, num_vertices, num_faces, faces_per_image, first};
-  }
   void add_start() {  // of the next packed mesh, or the end
     starts.push_back(num_vertices);
     starts.push_back(num_faces);
+  }
+};
+
+template <class T>
+struct Scene : SceneShape {
+  std::vector<T> vertices;
+  T near = T(0.1), far = T(100), eps = T(1e-4);
+
+  MeshBatch<T> mesh() const {
+    const int64_t* first = packed() ? starts.data() : nullptr;
+    return {vertices.data(), faces.data(), batch, num_vertices, num_faces, faces_per_image, first};
   }
 };
 

@@ -140,15 +140,8 @@ TEST(float_agrees_with_double) {
   for (const Scene<float>& scene : scenes<float>()) {
     const Results<float> single = run_stages(scene, 1);
     Scene<double> wide;
+    static_cast<SceneShape&>(wide) = scene;
     wide.vertices.assign(scene.vertices.begin(), scene.vertices.end());
-    wide.faces = scene.faces, wide.starts = scene.starts, wide.batch = scene.batch,
-    wide.num_vertices = scene.num_vertices;
-    wide.num_faces = scene.num_faces, wide.faces_per_image = scene.faces_per_image,
-    wide.image = scene.image, wide.seed = scene.seed;
-    wide.anti_aliasing = scene.anti_aliasing, wide.fill_back = scene.fill_back,
-    wide.channels = scene.channels;
-    wide.per_image_values = scene.per_image_values, wide.perspective = scene.perspective,
-    wide.distorted = scene.distorted;
     wide.near = scene.near, wide.far = scene.far, wide.eps = scene.eps;
     wide.given_face_index = single.get<int32_t>("face_index").data();
     const Results<double> twice = run_stages(wide, 1);
