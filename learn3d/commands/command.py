@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-import docstring_parser  # of tyro
+import docstring_parser
 import tyro
 from typing_extensions import Self, dataclass_transform  # in typing from Python 3.11 on
 
