@@ -31,8 +31,9 @@ CODE_STEPS, VERTEX_STEPS = 45, 45
 PULL = 0.1  # weight of the squared relative distance between the code and the predicted one
 SMOOTHNESS = 3e-4  # weight of the smoothness loss
 STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
-# Units of azimuth, elevation, distance and shift as variables: a step moves the outline about equally far for each.
-_SCALES = (60.0, 60.0, 1.0, 1.0)
+# Units of the parts of a view as variables: a step moves the outline about equally far for each.
+_SCALES = (60.0, 60.0, 1.0, 1.0, 60.0, 1.0)
+LEVEL = 4  # parts of a view that are free if the camera is level and has a normal lens
 #: Options of torch's function `adam`. Its class Adam would import torch._dynamo, which takes a second.
 _ADAM = {
     "beta1": 0.9,
@@ -55,20 +56,39 @@ class View(NamedTuple):
     elevation_deg: Tensor  # float32 [N]
     log_distance: Tensor  # float32 [N]
     shift: Tensor  # float32 [N, 2]: shift of the object to the right and up, in units of the object frame
+    roll_deg: Tensor  # float32 [N]: angle by which the camera is turned clockwise about its axis
+    # float32 [N]: log of the factor by which the field of view is wider, and the camera nearer
+    perspective: Tensor
 
     def axes(self) -> Tensor:
         """Right, up and forward of each camera in the object frame, float32 [N, 3, 3]."""
-        a, e = torch.deg2rad(self.azimuth_deg), torch.deg2rad(self.elevation_deg)
+        a, e, r = map(torch.deg2rad, (self.azimuth_deg, self.elevation_deg, self.roll_deg))
         zero = torch.zeros_like(a)
         right = torch.stack([a.cos(), zero, a.sin()], 1)
         up = torch.stack([-e.sin() * a.sin(), e.cos(), e.sin() * a.cos()], 1)
         forward = torch.stack([-e.cos() * a.sin(), -e.sin(), e.cos() * a.cos()], 1)
-        return torch.stack([right, up, forward], 1)
+        cos, sin = r.cos()[:, None], r.sin()[:, None]
+        return torch.stack([cos * right - sin * up, cos * up + sin * right, forward], 1)
 
     def cameras(self) -> nmr.LookAt:
         """The cameras, which look at the origin; `place` shifts shapes for them."""
-        angles = self.elevation_deg, self.azimuth_deg
-        return nmr.LookAt.from_angles(self.log_distance.exp(), *angles, half_fov_deg=HALF_FOV_DEG)
+        half_fov_deg = HALF_FOV_DEG * self.perspective.exp()
+        usual, own = (
+            torch.deg2rad(each).tan() for each in (torch.tensor(HALF_FOV_DEG), half_fov_deg)
+        )
+        right = self._replace(roll_deg=torch.zeros_like(self.roll_deg)).axes()[:, 0]
+        roll, elevation = (
+            torch.deg2rad(each)[:, None] for each in (self.roll_deg, self.elevation_deg)
+        )
+        # across the line of sight, the vertical axis is shorter by the cosine of the elevation
+        up = roll.cos() * torch.tensor([0.0, 1.0, 0.0]) + roll.sin() * elevation.cos() * right
+        return nmr.LookAt.from_angles(
+            self.log_distance.exp() * (usual / own),
+            self.elevation_deg,
+            self.azimuth_deg,
+            up=up,
+            half_fov_deg=half_fov_deg,
+        )
 
     def place(self, vertices: Meshes) -> Meshes:
         """Vertices [N, V, 3] or N tensors [V_n, 3], moved by `shift`."""
@@ -97,7 +117,7 @@ class View(NamedTuple):
 def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> View:
     """Cameras in N directions, angles [N], at which vertices [V, 3] are framed like pictures."""
     zero, tangent = torch.zeros(len(azimuth_deg)), math.tan(math.radians(HALF_FOV_DEG))
-    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(zero), 2))
+    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(zero), 2), zero, zero)
     points = vertices @ view.axes().transpose(1, 2)
     distance, shift = torch.full_like(zero, 1.0 / tangent), view.shift
     for _ in range(6):
@@ -153,15 +173,19 @@ def minimize(
     steps: int,
     rates: Sequence[float],
     *variables: Tensor,
+    free: int = LEVEL,
 ) -> View:
     """The view, from `view` on, that minimises a loss together with other variables, by Adam.
 
     rates: learning rates of the view and of each variable, which fall to a tenth in the end.
+    free: number of the view's parts, from the first on, that change.
     """
-    parts = [(part / scale).requires_grad_() for part, scale in zip(view, _SCALES, strict=True)]
+    scales = _SCALES[:free]
+    parts = [(part / scale).requires_grad_() for part, scale in zip(view, scales, strict=False)]
 
     def current() -> View:
-        found = View(*(scale * part for part, scale in zip(parts, _SCALES, strict=True)))
+        changed = (scale * part for part, scale in zip(parts, scales, strict=True))
+        found = View(*changed, *view[free:])
         return found._replace(elevation_deg=found.elevation_deg.clamp(-30, 85))
 
     values, rates = [*parts, *variables], [*[rates[0]] * len(parts), *rates[1:]]

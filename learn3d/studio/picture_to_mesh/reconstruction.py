@@ -38,7 +38,7 @@ from learn3d.settings import split_names
 from learn3d.studio.picture_to_mesh.coloring import color_mesh
 from learn3d.studio.picture_to_mesh.cutting import Box, Judge, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
+from learn3d.studio.picture_to_mesh.fit import Progress, View, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.refinement import refine
 from learn3d.studio.picture_to_mesh.several import (
@@ -451,14 +451,15 @@ def reconstruct_several(
     *,
     crop: bool = True,
     category: str | None = None,
+    known: View | None = None,
     progress: Progress = lambda *_: None,
 ) -> SeveralPictures:
-    """Reconstruct an object from 2 to 8 pictures uint8 [H, W, 3] with masks uint8 [H, W]; their cameras are unknown.
+    """Reconstruct an object from 2 to 8 pictures uint8 [H, W, 3] with masks uint8 [H, W].
 
     Of three pictures or more, those that show something else, or have a wrong outline, are left
-    out.
-    category, progress: see `reconstruct_guesses`. Raises ValueError for another number of
-    pictures, for an unknown category, or if the model has no templates.
+    out. known: the cameras of the framed pictures; None if unknown. category, progress: see
+    `reconstruct_guesses`. Raises ValueError for another number of pictures, for an unknown
+    category, or if the model has no templates.
     """
     if not 2 <= len(pictures) <= MOST_PICTURES:
         raise ValueError(
@@ -474,6 +475,7 @@ def reconstruct_several(
     stored = [model.prepare(*picture, crop=crop) for picture in pictures]
     framed = [enlarge(*picture) for picture in pictures]
     masks = torch.stack([reduce_mask(each[3]) for each in framed])
+    outlines = torch.from_numpy(np.stack([each[3] for each in framed]))
     predicted = []
     for number, image in enumerate(stored):
         predicted.append(predict(model.method, torch.from_numpy(image), masks[number]))
@@ -482,8 +484,15 @@ def reconstruct_several(
     while True:
         used = [number for number in range(len(pictures)) if number not in left_out]
         chosen = [predicted[number] for number in used]
+        options = {"category": category, "known": known and known.select(torch.tensor(used))}
         fitted = fit_several(
-            model.templates, model.categories, chosen, masks[used], progress, category=category
+            model.templates,
+            model.categories,
+            chosen,
+            masks[used],
+            outlines[used],
+            progress,
+            **options,
         )
         outliers = find_outliers(fitted.ious)
         if not outliers:

@@ -1,14 +1,14 @@
 """One shape from several pictures of an object whose cameras are unknown.
 
-The cameras are those from which a generated shape looks most like the pictures. Then the object
-is carved out of a grid: a cell is kept if all outlines contain it, and likely shapes contain it or
-an outline needs it.
+The cameras are those from which generated shapes look like the pictures, and whose outlines
+contradict each other least. Then the object is carved out of a grid: a cell is kept if all
+outlines contain it, and likely shapes contain it or an outline needs it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +18,12 @@ from scipy import ndimage
 from torch import Tensor
 
 import nmr
-from learn3d.data.dataset import MASK_SIZE
+from learn3d.networks.encoders import CENTRED_SIZE
 from learn3d.pictures import grid_surface
 from learn3d.studio.picture_to_mesh.fit import (
     AZIMUTHS,
     ELEVATIONS_DEG,
+    LEVEL,
     Prediction,
     Progress,
     View,
@@ -43,17 +44,29 @@ from learn3d.studio.picture_to_mesh.templates import (
 MOST_PICTURES = 8
 SEEN = 16  # candidates whose outlines are compared with all pictures from all sides
 STRETCHED = 6  # best of them, which are stretched
-CELLS, BOX = 64, 1.1  # cells along each side of the grid, and its side in the object frame
-LIKELY = 0.2  # probability above which a cell is kept if all outlines contain it
+AGREEMENT = 0.05  # differences of two candidates' scores that make one e times as likely
+MODES = 4  # azimuths that are tried for each picture
+LAYOUTS = 64  # likeliest layouts of all cameras whose outlines are compared
+COARSE = 32  # cells along each side of the grid for that, and pixels of its masks
+WIDENED = 0.4  # cells of that grid by which the outlines are widened
+CELLS, BOX = 80, 1.1  # cells along each side of the grid, and its side in the object frame
+ROOM = 0.04  # distance from the box of the bent template up to which the object reaches
+LIKELY = 0.4  # probability above which a cell is kept if all outlines contain it
 NEEDED = 0.9  # share of the largest probability on a line of sight from which a cell is kept, too
+REACH = 2.0  # cells around a needed one that are kept, so that thin legs are whole
+BLURS = (1.0, 5.0)  # cells by which probabilities are blurred, for likely and for needed cells
+FAR = 0.1  # weight of the second ones
+LOSS = 0.03  # share of the outlines that an object mirrored in x may leave uncovered
 SHARPNESS = 0.1  # differences of two shapes' scores that make one e times as likely
-CARVINGS = (1, 0)  # width in pixels by which the outlines are widened in each round
+# cells by which the outlines are widened while the cameras are fitted, in two tries
+SLACKS = ((1.0,), (2.0, 1.0))
+LAST_SLACKS = (0.3, 0.7)  # and afterwards; the most alike of all shapes is taken
 CAMERA_STEPS = 15  # steps of the cameras between two rounds
 # mean outline IoU from which the bent template is taken, which has straighter parts
 STRAIGHT = 0.85
 # cosine of a picture's code and the mean of the others below which it shows something else
 ALIKE = 0.5
-LEVEL = 0.03  # cost of a camera that stands a level of `ELEVATIONS_DEG` above or below the others
+APART = 0.03  # cost of a camera that stands a level of `ELEVATIONS_DEG` above or below the others
 WORSE = 0.15  # a picture is left out if its outline IoU is so much below the median of all
 
 
@@ -95,6 +108,7 @@ def fit_several(
     categories: Sequence[str],
     predicted: Sequence[Prediction],
     masks: Tensor,
+    outlines: Tensor,
     progress: Progress = lambda *_: None,
     *,
     category: str | None = None,
@@ -102,20 +116,11 @@ def fit_several(
 ) -> SeveralFit:
     """One shape and N cameras for the framed masks float32 [N, 64, 64] of N pictures of the same object.
 
-    category: see `find_candidates`. known: the N cameras if they are known.
+    outlines: the masks uint8 [N, S, S]. category: see `find_candidates`. known: the N cameras if
+    they are known.
     """
-
-    def held(views: View) -> View:
-        if known is None:
-            return views
-        copies = len(views.azimuth_deg) // len(masks)
-        return View(
-            *(
-                torch.cat([part] * copies) + 0 * free
-                for part, free in zip(known, views, strict=True)
-            )
-        )
-
+    free = LEVEL if known is None else 0
+    distances = _distances(outlines)
     progress("shape", 0.3)
     found = find_candidates(templates, categories, predicted, category)
     each = [each.shape.view for each in predicted]
@@ -129,13 +134,15 @@ def fit_several(
         for shape, faces in zip(found.shapes, found.faces, strict=True)
     ]
     scores, views = zip(*looks, strict=True)
+    if known is None:
+        scores = _agree(torch.stack(scores), views, found.prior, distances, masks)
     rows, values = zip(*map(_choose_views, scores), strict=True)
     seen = torch.stack(values) + found.prior
     best = seen.topk(min(STRETCHED, len(seen))).indices.tolist()
     progress("stretch", 0.5)
     chosen = [views[row].select(rows[row]) for row in best]
     found = found.select(best)
-    stretched, shapes, cost = stretch(_join(chosen), found.shapes, found.faces, masks, held)
+    stretched, shapes, cost = stretch(_join(chosen), found.shapes, found.faces, masks, free)
     alike = likeness(
         stretched, _repeat(shapes, len(masks)), _repeat(found.faces, len(masks)), masks
     )
@@ -147,12 +154,12 @@ def fit_several(
     rows = one * len(masks) + torch.arange(len(masks))
     view = stretched.select(rows)
     faces = found.faces[one]
-    view, bent = bend(view, shapes[one], faces, masks, held)
+    view, bent = bend(view, shapes[one], faces, masks, free)
     ious = view.ious(bent[None], faces, masks)
     is_template = float(ious.mean()) > STRAIGHT
     if not is_template:
         likely = (likely + _fill(bent, faces)) / 2
-        carved = _carve_out(view, masks, likely, held)
+        carved = _carve_out(view, masks, distances, likely, bent, free)
         if carved is not None:
             view, bent, faces = carved
             ious = view.ious(bent[None], faces, masks)
@@ -182,6 +189,47 @@ def _look_around(
     return _all_ious(views, vertices, faces, masks) + bonus, views
 
 
+def _agree(
+    scores: Tensor, views: Sequence[View], prior: Tensor, distances: Tensor, masks: Tensor
+) -> Tensor:
+    """Scores [K, M, N] without azimuths at which the outlines of the N pictures contradict each other.
+
+    The scores of K candidates give each picture its likeliest azimuths. Of the likeliest layouts
+    of all cameras, that one is taken whose outlines, together with the mirrored ones, carve away
+    least of each other.
+    """
+    levels = len(ELEVATIONS_DEG)
+    chances = (torch.stack([_choose_views(each)[1] for each in scores]) + prior) / AGREEMENT
+    mean = torch.einsum("k,kmn->mn", chances.softmax(0), scores)
+    best, level = mean.view(AZIMUTHS, levels, -1).max(1)
+    is_mode = (best >= best.roll(1, 0)) & (best >= best.roll(-1, 0))
+    values, modes = torch.where(is_mode, best, best - 1).topk(MODES, 0)
+    rows = (modes * levels + level.gather(0, modes)).T.flatten()
+    view = views[int(chances.argmax())].select(rows)
+    small = F.interpolate(masks[:, None], COARSE, mode="area")[:, 0]
+    sight = _Sight.of(
+        view,
+        distances.repeat_interleave(MODES, 0) * (COARSE / CELLS),
+        small.repeat_interleave(MODES, 0),
+        COARSE,
+    )
+    choices = torch.cartesian_prod(*[torch.arange(MODES)] * len(masks))
+    score = values.gather(0, choices).mean(1)
+    likely = score.topk(min(LAYOUTS, len(score))).indices.tolist()
+    first = MODES * torch.arange(len(masks))
+
+    def agreement(layout: int) -> float:
+        chosen = sight.select(first + choices[layout])
+        hull = chosen.inside.amin(0) + WIDENED
+        return float(score[layout]) + chosen.covered(torch.minimum(hull, hull.flip(0)) > 0)
+
+    layout = max(likely, key=agreement)
+    azimuth = modes.gather(0, choices[layout][None])[0]
+    apart = (torch.arange(AZIMUTHS)[:, None] - azimuth).abs()
+    near = torch.minimum(apart, AZIMUTHS - apart) <= 1
+    return torch.where(near.repeat_interleave(levels, 0), scores, scores - 1)
+
+
 def _choose_views(scores: Tensor) -> tuple[Tensor, Tensor]:
     """The best view of each of N pictures by scores [M, N], int64 [N], and the mean of their scores.
 
@@ -192,7 +240,7 @@ def _choose_views(scores: Tensor) -> tuple[Tensor, Tensor]:
     if len(scores) != AZIMUTHS * levels:  # the views are known
         return scores.argmax(0), scores.amax(0).mean()
     apart = (torch.arange(levels)[:, None] - torch.arange(levels)).abs()
-    costs = scores.view(AZIMUTHS, levels, 1, -1) - LEVEL * apart[:, :, None]
+    costs = scores.view(AZIMUTHS, levels, 1, -1) - APART * apart[:, :, None]
     best, rows = costs.flatten(0, 1).max(0)
     common = int(best.mean(1).argmax())
     return rows[common], best[common].mean()
@@ -226,37 +274,58 @@ def _repeat(shapes: Sequence[Tensor], count: int) -> list[Tensor]:
     return [shape for shape in shapes for _ in range(count)]
 
 
-def _grid_points(cells: int) -> Tensor:
-    """The centres [cells^3, 3] of the cells of the grid."""
-    along = ((torch.arange(cells) + 0.5) / cells - 0.5) * BOX
-    return torch.cartesian_prod(along, along, along)
-
-
-class _Seen(NamedTuple):
+class _Sight(NamedTuple):
     """The cells of the grid as N cameras see them."""
 
-    inside: Tensor  # float32 [N, C]: the mask at each cell
-    pixel: Tensor  # int64 [N, C]: the pixel that shows it; the last one is outside the picture
-    mask: Tensor  # float32 [N, 64 * 64]: 1 at the pixels of the mask
+    inside: Tensor  # float32 [N, s, s, s]: distance to the outline in cells, positive inside of it
+    pixel: (
+        Tensor  # int64 [N, s^3]: the pixel that shows a cell; the last one is outside the picture
+    )
+    wanted: Tensor  # float32 [N, S * S]: 1 at the pixels of the mask
 
     @classmethod
-    def of(cls, views: View, masks: Tensor, points: Tensor, wider: int) -> _Seen:
-        """The cells [C, 3] in N views of masks [N, 64, 64], which are widened by some pixels for `inside`."""
-        x, y, _ = (
-            views.cameras().transform(views.place(points.expand(len(masks), -1, -1))).unbind(2)
-        )
-        grid = torch.stack([x, -y], 2)[:, None]
-        widened = F.max_pool2d(masks[:, None], 2 * wider + 1, 1, wider)
-        inside = F.grid_sample(widened, grid, align_corners=False)[:, 0, 0]
-        column, row = (((value + 1) / 2 * MASK_SIZE).floor().long() for value in (x, -y))
-        shown = (column >= 0) & (column < MASK_SIZE) & (row >= 0) & (row < MASK_SIZE)
-        pixel = torch.where(shown, row * MASK_SIZE + column, MASK_SIZE**2)
+    def of(cls, views: View, distances: Tensor, masks: Tensor, cells: int = CELLS) -> _Sight:
+        """A grid in N views of masks [N, S, S]. distances: see `_distances`."""
+        along = ((torch.arange(cells) + 0.5) / cells - 0.5) * BOX
+        points = torch.cartesian_prod(along, along, along).expand(len(masks), -1, -1)
+        x, y, _ = views.cameras().transform(views.place(points)).unbind(2)
+        options = {"padding_mode": "border", "align_corners": False}
+        place = torch.stack([x, -y], 2)[:, None]
+        inside = F.grid_sample(distances[:, None], place, **options)[:, 0, 0]
+        size = masks.shape[-1]
+        column, row = (((value + 1) / 2 * size).floor().long() for value in (x, -y))
+        shown = (column >= 0) & (column < size) & (row >= 0) & (row < size)
+        inside = torch.where(shown, inside, inside.clamp(max=-cells)).view(-1, *[cells] * 3)
+        pixel = torch.where(shown, row * size + column, size**2)
         return cls(inside, pixel, (masks.flatten(1) > 0.5).float())
 
+    def select(self, rows: Tensor) -> _Sight:
+        """The views `rows`."""
+        return _Sight(*(part[rows] for part in self))
+
     def project(self, values: Tensor) -> Tensor:
-        """The largest of the values [C] on the line of sight of each pixel, [N, 64 * 64]."""
-        largest = torch.zeros(len(self.pixel), MASK_SIZE**2 + 1)
-        return largest.scatter_reduce(1, self.pixel, values.expand_as(self.pixel), "amax")[:, :-1]
+        """The largest of the values [s, s, s] on the line of sight of each pixel, [N, S * S]."""
+        largest = torch.zeros(len(self.pixel), self.wanted.shape[1] + 1)
+        values = values.flatten().expand_as(self.pixel)
+        return largest.scatter_reduce(1, self.pixel, values, "amax")[:, :-1]
+
+    def covered(self, cells: Tensor) -> float:
+        """The mean share of the masks that cells [s, s, s], bool, cover."""
+        both = (self.project(cells.float()) * self.wanted).sum(1)
+        return float((both / self.wanted.sum(1)).mean())
+
+
+def _distances(outlines: Tensor) -> Tensor:
+    """Distance [N, S, S] of pixels to the outline of masks uint8 [N, S, S], positive inside.
+
+    Its unit is a cell of the grid at the object's distance.
+    """
+    found = []
+    for inside in outlines.numpy() > 127:
+        within, beyond = map(ndimage.distance_transform_edt, (inside, ~inside))
+        found.append(np.where(inside, within - 0.5, 0.5 - beyond))
+    scale = CELLS / (BOX * CENTRED_SIZE * outlines.shape[-1])
+    return scale * torch.from_numpy(np.float32(found))
 
 
 def _fill(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -273,38 +342,71 @@ def _average(found: Candidates, weights: Tensor) -> Tensor:
 
 
 def _carve_out(
-    view: View, masks: Tensor, likely: Tensor, held
+    view: View, masks: Tensor, distances: Tensor, likely: Tensor, bent: Tensor, free: int
 ) -> tuple[View, Tensor, Tensor] | None:
-    """Carve a shape, and fit the cameras to it, in turn. None if no cell is left."""
-    for wider in CARVINGS:
-        kept = _largest_piece(_carve(view, masks, likely, wider))
-        vertices, faces, *_ = grid_surface(kept, box=BOX)
-        if not len(faces):
-            return None
-        if wider:
-            view = held(
-                minimize(_misfit(vertices, faces, masks, held), view, CAMERA_STEPS, (0.01,))
-            )
-    return view, smooth(vertices, faces, rounds=3), faces
+    """Carve shapes, and fit the cameras to them; the one most like the masks. None if no cell is left."""
+    best, found = -math.inf, None
+    for slacks in SLACKS if free else ((),):
+        fitted = view
+        for slack in slacks:
+            mesh = _carve(_Sight.of(fitted, distances, masks), likely, bent, slack)
+            if mesh is not None:
+                misfit = _misfit(*mesh, masks)
+                fitted = minimize(misfit, fitted, CAMERA_STEPS, (0.01,), free=free)
+        sight = _Sight.of(fitted, distances, masks)
+        for slack in LAST_SLACKS:
+            mesh = _carve(sight, likely, bent, slack)
+            if mesh is not None:
+                vertices, faces = smooth(*mesh, rounds=3), mesh[1]
+                shapes = ([each] * len(masks) for each in (vertices, faces))
+                alike = float(likeness(fitted, *shapes, masks).mean())
+                if alike > best:
+                    best, found = alike, (fitted, vertices, faces)
+    return found
 
 
-def _largest_piece(cells: Tensor) -> Tensor:
-    """The cells [s, s, s], 0 or 1, without those that hang in the air."""
-    pieces, _ = ndimage.label(cells.numpy(), np.ones((3, 3, 3)))
+def _misfit(vertices: Tensor, faces: Tensor, masks: Tensor) -> Callable[[View], Tensor]:
+    return lambda view: -view.ious(vertices[None], faces, masks).sum()
+
+
+def _carve(
+    sight: _Sight, likely: Tensor, bent: Tensor, slack: float
+) -> tuple[Tensor, Tensor] | None:
+    """Vertices and faces of a carved shape; None if it is empty.
+
+    Cells within all outlines, which are widened by `slack` cells, are kept if they are likely, or
+    near the likeliest one on the line of sight of a pixel. If the mirrored outlines leave almost
+    no pixel without a cell, they carve, too. likely: the probability [s, s, s] of each cell.
+    bent: the template, whose box contains the object.
+    """
+    along = ((torch.arange(CELLS) + 0.5) / CELLS - 0.5) * BOX
+    low, high = bent.amin(0)[:, None] - ROOM, bent.amax(0)[:, None] + ROOM
+    x, y, z = torch.minimum(along - low, high - along) * (CELLS / BOX)
+    room = torch.minimum(torch.minimum(x[:, None, None], y[:, None]), z)
+    hull = torch.minimum(sight.inside.amin(0) + slack, room)
+    mirrored = torch.minimum(hull, hull.flip(0))
+    is_symmetric = sight.covered(mirrored > -0.5) > sight.covered(hull > -0.5) - LOSS
+    if is_symmetric:
+        hull, likely = mirrored, (likely + likely.flip(0)) / 2
+    near, far = (torch.from_numpy(ndimage.gaussian_filter(likely.numpy(), each)) for each in BLURS)
+    values = (hull > -0.5) * (near + FAR * far + 1e-3)
+    largest = F.pad(sight.project(values) * sight.wanted, (0, 1)).gather(1, sight.pixel)
+    needed = ((values.flatten() >= NEEDED * largest) & (largest > 0)).any(0).view_as(hull)
+    if is_symmetric:
+        needed |= needed.flip(0)
+    away = ndimage.distance_transform_edt(~needed.numpy())
+    kept = np.maximum(3 * (near.numpy() - LIKELY), REACH - away).astype(np.float32)
+    kept = torch.from_numpy(ndimage.gaussian_filter(kept, 0.7))
+    field = _largest_piece(torch.minimum(hull, kept).clamp(-2, 2))
+    vertices, faces, *_ = grid_surface(field, level=0.0, box=BOX)
+    return (vertices, faces) if len(faces) else None
+
+
+def _largest_piece(field: Tensor) -> Tensor:
+    """The field [s, s, s] without pieces that hang in the air."""
+    pieces, _ = ndimage.label((field > 0).numpy(), np.ones((3, 3, 3)))
     sizes = np.bincount(pieces.ravel())[1:]  # 0 is empty space
-    return cells * torch.from_numpy(pieces == 1 + sizes.argmax()) if len(sizes) else cells
-
-
-def _misfit(vertices: Tensor, faces: Tensor, masks: Tensor, held):
-    return lambda view: -held(view).ious(vertices[None], faces, masks).sum()
-
-
-def _carve(view: View, masks: Tensor, likely: Tensor, wider: int) -> Tensor:
-    """The kept cells [s, s, s], 0 or 1, for probabilities [s, s, s]: likely ones, and the likeliest of each pixel."""
-    seen = _Seen.of(view, masks, _grid_points(CELLS), wider)
-    common = seen.inside.amin(0) > 0.5
-    values = common * (F.avg_pool3d(likely[None], 3, 1, 1).flatten() + 1e-3)
-    largest = F.pad(seen.project(values) * seen.mask, (0, 1)).gather(1, seen.pixel)
-    needed = (values >= NEEDED * largest) & (largest > 0)
-    kept = (likely.flatten() > LIKELY) | needed.any(0)
-    return (kept & common).float().view_as(likely)
+    if not len(sizes):
+        return field
+    others = torch.from_numpy((pieces > 0) & (pieces != 1 + sizes.argmax()))
+    return torch.where(others, -field, field)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,15 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
-from learn3d.studio.picture_to_mesh.fit import Fit, Prediction, Progress, View, belief, minimize
+from learn3d.studio.picture_to_mesh.fit import (
+    LEVEL,
+    Fit,
+    Prediction,
+    Progress,
+    View,
+    belief,
+    minimize,
+)
 from learn3d.studio.shapes import CATEGORIES, numbered_shape
 
 SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates
@@ -259,12 +267,12 @@ def stretch(
     shapes: list[Tensor],
     faces: list[Tensor],
     masks: Tensor,
-    held: Callable[[View], View] = lambda v: v,
+    free: int = LEVEL,
 ) -> tuple[View, list[Tensor], Tensor]:
     """Stretch N shapes along the three axes until they have the outlines of masks [64, 64] or [M, 64, 64].
 
-    views: N, or N M with those of the first shape first. held: puts known parts of the views in
-    their place. Returns the fitted views, the shapes, and how unequal the factors are, [N].
+    views: N, or N M with those of the first shape first. free: see `minimize`. Returns the fitted
+    views, the shapes, and how unequal the factors are, [N].
     """
     copies = len(views.azimuth_deg) // len(shapes)
     wanted = masks if masks.dim() == 2 else masks.repeat(len(shapes), 1, 1)
@@ -278,12 +286,11 @@ def stretch(
         return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
 
     def loss(views: View) -> Tensor:
-        ious = held(views).ious(
-            [shape for shape in stretched() for _ in range(copies)], faces, wanted
-        )
+        ious = views.ious([shape for shape in stretched() for _ in range(copies)], faces, wanted)
         return (costs() + 0.1 * logs.square().sum(1)).sum() - ious.sum() / copies
 
-    return held(minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs)), stretched(), costs()
+    views = minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs, free=free)
+    return views, stretched(), costs()
 
 
 def bend(
@@ -291,11 +298,11 @@ def bend(
     vertices: Tensor,
     faces: Tensor,
     masks: Tensor,
-    held: Callable[[View], View] = lambda v: v,
+    free: int = LEVEL,
 ) -> tuple[View, Tensor]:
     """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them.
 
-    masks: [64, 64] for one view, or [N, 64, 64] for N. held: see `stretch`.
+    masks: [64, 64] for one view, or [N, 64, 64] for N. free: see `minimize`.
     """
     low, high = vertices.amin(0), vertices.amax(0)
     place = (vertices - low) / (high - low).clamp(min=1e-3)
@@ -323,6 +330,6 @@ def bend(
             sum(moves().diff(dim=axis).square().sum() for axis in range(3))
             + 0.1 * moves().square().sum()
         )
-        return BENDING * rough - held(view).ious(bent()[None], faces, masks).mean()
+        return BENDING * rough - view.ious(bent()[None], faces, masks).mean()
 
-    return held(minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice)), bent()
+    return minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice, free=free), bent()

@@ -163,7 +163,8 @@ def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
 
 def test_a_picture_without_a_seen_vertex_still_has_colours() -> None:
     vertices, faces = arrow()
-    view = View(torch.zeros(1), torch.zeros(1), torch.tensor([3.0]), torch.zeros(1, 2))
+    level = torch.zeros(1)
+    view = View(level, level, torch.tensor([3.0]), torch.zeros(1, 2), level, level)
     surface = color_mesh((vertices, faces), view, [np.zeros((4, 64, 64), np.uint8)])
     assert surface.colors.isfinite().all()
 

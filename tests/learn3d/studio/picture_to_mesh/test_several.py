@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+import trimesh
 
 import nmr
 from learn3d.pictures import photograph
+from learn3d.studio.picture_to_mesh.fit import frame_view
 from learn3d.studio.picture_to_mesh.reconstruction import load_model, reconstruct_several
 from learn3d.studio.picture_to_mesh.templates import template
 
@@ -34,3 +36,28 @@ def test_three_pictures_become_one_mesh_without_a_wrong_one() -> None:
     )
     with pytest.raises(ValueError, match="2 to 8 pictures, got 1"):
         reconstruct_several(model, pictures[:1])
+
+
+def test_thin_legs_are_whole_if_cameras_are_known() -> None:
+    corners = [(x, z) for x in (-0.2, 0.2) for z in (-0.2, 0.2)]
+    boxes = [((0.5, 0.05, 0.5), (0, 0, 0)), ((0.5, 0.3, 0.05), (0, 0.35, 0.2))]
+    boxes += [((0.03, 0.5, 0.03), (x, -0.25, z)) for x, z in corners]
+    boxes += [((0.03, 0.4, 0.03), (x, 0.2, 0.2)) for x in (-0.2, 0.2)]
+    stool = trimesh.util.concatenate(
+        [trimesh.creation.box(size).apply_translation(place) for size, place in boxes]
+    )
+    vertices, faces = torch.tensor(stool.vertices).float(), torch.tensor(stool.faces)
+    views = frame_view(vertices, torch.tensor([20.0, 115.0, -165.0, -70.0]), torch.full((4,), 25.0))
+    pictures = []
+    for number in range(4):
+        view = views.select(torch.tensor([number]))
+        (rgb,), (alpha,) = photograph(
+            view.place(vertices[None])[0], faces, (0.2, 0.5, 0.3), view.cameras(), image_size=256
+        )
+        pictures.append((rgb, alpha))
+    found = reconstruct_several(load_model(None), pictures, category="chair", known=views)
+    assert found.used == [0, 1, 2, 3] and found.made.silhouette_iou > 0.85
+    points = found.made.surface.vertices
+    for x, z in corners:
+        for y in (-0.1, -0.2, -0.3, -0.4, -0.48):
+            assert (points - torch.tensor([x, y, z])).norm(dim=1).min() < 0.06
