@@ -25,7 +25,8 @@ from learn3d.data.conventions import (
 from learn3d.data.masks import mask_box
 from learn3d.data.poses import wrap_deg
 from learn3d.networks.encoders import CENTRED_SIZE
-from learn3d.pictures import Surface, draw_around, natural_look, photograph, save_png, tile
+from learn3d.pictures import Surface, draw_around, photograph, save_png, tile
+from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
 from learn3d.studio.picture_to_mesh.fit import HALF_FOV_DEG as VIEW_HALF_FOV_DEG
 from learn3d.studio.picture_to_mesh.fit import View
