@@ -23,8 +23,6 @@ RECTANGLES = [(7, 16), (15, 6), (1, 9), (9, 1)]
 @pytest.mark.parametrize(
     "seed, size", [*((seed, (15, 15)) for seed in range(4)), *((2, size) for size in RECTANGLES)]
 )
-@pytest.mark.parametrize("anti_aliasing", [False, True])
-@pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, size, anti_aliasing, fill_back):
     vertices, faces = random_soup(seed)
     upstream = normal(2, *size, seed=seed)
@@ -133,7 +131,6 @@ def spheres():
     [(lambda: random_soup(3), (10, 14), True), (spheres, (100, 140), False)],
     ids=["soup", "spheres"],
 )
-@pytest.mark.parametrize("anti_aliasing", [False, True])
 @pytest.mark.parametrize("own_background", [False, True])
 def test_colors_equal_the_slow_definition(scene, size, perspective, anti_aliasing, own_background):
     vertices, faces = scene()
@@ -188,7 +185,6 @@ def test_a_surface_has_no_end_within(subdivisions, doubled):
     assert not leaf.grad.any()
 
 
-@pytest.mark.parametrize("anti_aliasing", [False, True])
 def test_gradients_of_all_outputs(anti_aliasing):
     """ "none" is the true derivative alone, "local" adds its own to that of each output; the images are the same."""
     ball, faces = nmr.icosphere(2)

@@ -27,7 +27,6 @@ ON_FACES = [inflation_loss, volume_loss, area_loss]
 
 
 @pytest.mark.parametrize("name", vector_names("loss_smooth_*"))
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_smoothness_vectors(name, dtype):
     v = tensors_of(load_vector(name), "")
     edges = nmr.edge_table(v["faces"])
@@ -107,7 +106,6 @@ def plain_iou(prediction, target):
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 31, 4096, 4097, 10007])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_soft_iou_is_the_formula_and_its_derivative(count, dtype):
     images = [uniform(3, count, seed=seed).to(dtype) for seed in (count, 0)]
     share = 1e-6 if dtype == torch.float32 else 1e-13
@@ -157,7 +155,6 @@ PUBLISHED = {
 }
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("key", PUBLISHED)
 def test_published_losses(key, dtype):
     v = tensors_of(load_vector("loss_extra"), "")
@@ -215,7 +212,6 @@ def test_losses_have_true_derivatives(loss):
     gradcheck(lambda x: loss(x, table), leaf_of(uneven))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("sizes", [[0.0, 0, 0], [1.0, 0, 0]], ids=["point", "line"])
 @pytest.mark.parametrize("loss", [*ON_EDGES, *ON_FACES, smoothness_loss])
 def test_collapsed_meshes_have_finite_gradients(loss, sizes, dtype):

@@ -125,7 +125,6 @@ VERTICES, FACES = [v for v, _ in MESHES], [f for _, f in MESHES]
 EYES = torch.tensor([[0.0, 0.5, -2.5], [1.5, 0.0, -2.0], [-1.0, 1.0, 2.0]])
 
 
-@pytest.mark.parametrize("smooth", [False, True])
 def test_lights_per_image(smooth):
     shapes = (3,), (3, 2), (3, 2, 3), (3, 3), (3, 2, 3)
     parameters = [uniform(*x, seed=k, dtype=torch.float32) for k, x in enumerate(shapes)]

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 import torch
+from scenes import leaf_of, same_bits
 from torch.autograd import forward_ad
 
 import nmr
@@ -39,28 +40,24 @@ FUNCTIONS = {
 
 
 def gradient(function, vertices):
-    leaf = vertices.clone().requires_grad_()
+    leaf = leaf_of(vertices)
     return torch.autograd.grad(function(leaf), leaf)[0]
 
 
 @pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
 def test_torch_func(function):
     """grad, vjp, jacrev, vmap and vmap of grad: the same bits as backward(), mesh by mesh."""
+    one = MESHES[0]
+    values = torch.stack([function(mesh) for mesh in MESHES])
     wanted = torch.stack([gradient(function, mesh) for mesh in MESHES])
     assert wanted.abs().sum((1, 2)).min() > 0
-    assert torch.equal(torch.func.grad(function)(MESHES[0]), wanted[0])
-    assert torch.equal(torch.func.jacrev(function)(MESHES[0]), wanted[0])
-    value, pull = torch.func.vjp(function, MESHES[0])
-    assert torch.equal(pull(torch.ones(()))[0], wanted[0])
-    assert torch.equal(value, function(MESHES[0]))
-    assert torch.equal(
-        torch.func.vmap(function)(MESHES), torch.stack([function(mesh) for mesh in MESHES])
-    )
-    assert torch.equal(torch.func.vmap(torch.func.grad(function))(MESHES), wanted)
-    last = torch.func.vmap(torch.func.grad(function), in_dims=2, out_dims=2)(
-        MESHES.permute(1, 2, 0)
-    )
-    assert torch.equal(last.permute(2, 0, 1), wanted)
+    grad, vmap = torch.func.grad(function), torch.func.vmap
+    value, pull = torch.func.vjp(function, one)
+    last = vmap(grad, in_dims=2, out_dims=2)(MESHES.permute(1, 2, 0)).permute(2, 0, 1)
+    assert same_bits((value, vmap(function)(MESHES)), (values[0], values))
+    for each in (grad(one), torch.func.jacrev(function)(one), pull(torch.ones(()))[0]):
+        assert torch.equal(each, wanted[0])
+    assert same_bits((vmap(grad)(MESHES), last), (wanted, wanted))
 
 
 @pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
@@ -84,7 +81,7 @@ def test_forward_mode_is_an_error(function):
     """And not 0, in torch.func and in torch.autograd, with and without a gradient in reverse mode."""
     with pytest.raises(RuntimeError, match=r"no forward-mode derivative.*use reverse mode"):
         torch.func.jvp(function, (SPHERE,), (SPHERE,))
-    for leaf in (SPHERE, SPHERE.clone().requires_grad_()):
+    for leaf in (SPHERE, leaf_of(SPHERE)):
         with (
             forward_ad.dual_level(),
             pytest.raises(RuntimeError, match="no forward-mode derivative"),
