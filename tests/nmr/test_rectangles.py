@@ -44,7 +44,6 @@ def outside_of(image, size):
 
 @pytest.mark.parametrize("size", [WIDE, TALL])
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("anti_aliasing", [True, False])
 def test_the_middle_is_the_square_image(camera, size, anti_aliasing):
     vertices, faces, tint = mesh()
     names, scale = ("rgb", "alpha", "depth", "normals"), 2 if anti_aliasing else 1
@@ -74,7 +73,6 @@ def across(vertices):
 
 
 @pytest.mark.parametrize("size", [(23, 41), (12, 40), (64, 9)])
-@pytest.mark.parametrize("anti_aliasing", [True, False])
 def test_swapped_scenes_are_transposes(size, anti_aliasing):
     """In renderer space, so that nothing but the raster is at work; all outputs, with gradients, in odd sizes."""
     vertices, faces, tint = mesh()

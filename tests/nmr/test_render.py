@@ -139,7 +139,6 @@ def all_outputs(leaf, faces, wanted, **how):
     return nmr.render(leaf, faces, CAMERA, outputs=wanted, colors=colors, **how)
 
 
-@pytest.mark.parametrize("anti_aliasing", [False, True])
 @pytest.mark.parametrize("gradient", ["nmr", "local"])
 @pytest.mark.parametrize("output", ["rgb", "alpha", "depth", "normals"])
 def test_outputs_together_equal_outputs_alone(output, gradient, anti_aliasing):
@@ -227,7 +226,6 @@ def test_flat_normals_point_at_the_viewer_and_are_those_of_the_faces():
 LARGE = double([[-4.0, -3.0, 1.0], [5.0, -4.0, 3.0], [0.5, 6.0, 2.0]])
 
 
-@pytest.mark.parametrize("anti_aliasing", [False, True])
 def test_depth_and_normals_have_true_derivatives(anti_aliasing):
     tilted = torch.cat([LARGE, LARGE[:1] * double([1.5, 1.0, 1.2])]).requires_grad_()
     faces = torch.tensor([[0, 1, 2], [0, 1, 3]])

@@ -17,8 +17,6 @@ RECTANGLES = [(7, 16), (15, 6), (1, 9), (9, 1)]
 @pytest.mark.parametrize(
     "seed, size", [(seed, (15, 15)) for seed in range(6)] + [(5, size) for size in RECTANGLES]
 )
-@pytest.mark.parametrize("anti_aliasing", [False, True])
-@pytest.mark.parametrize("fill_back", [False, True])
 def test_equals_the_slow_definition(seed, size, anti_aliasing, fill_back):
     vertices, faces = random_soup(seed)
     upstream, raster = normal(2, *size, seed=seed), tuple(n * (1 + anti_aliasing) for n in size)

@@ -100,7 +100,6 @@ def textured_fragments(per_image):
 
 
 @pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
-@pytest.mark.parametrize("per_image", [False, True])
 @pytest.mark.parametrize("filter", ["bilinear", "mipmap"])
 def test_values_and_gradients_equal_torch_operations(wrap, per_image, filter):
     fragments, image, uv = textured_fragments(per_image)
@@ -198,7 +197,6 @@ def test_uv_that_are_not_numbers_spoil_nothing(filter, moving):
     assert bool(results[3][:, 2].any()) == moving  # edges move x and y in any case
 
 
-@pytest.mark.parametrize("per_image", [False, True])
 def test_face_colours_are_exact(per_image):
     mesh, camera = nmr.icosphere(1), nmr.LookAt.from_angles(3.0, 10.0, [0.0, 90.0])
     colors = uniform(2 if per_image else 1, 80, 4, dtype=torch.float32)
