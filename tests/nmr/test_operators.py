@@ -186,10 +186,10 @@ for _ in range(200):  # on busy cores some loops take one thread
     render()
 child = os.fork()
 if child == 0:
-    signal.alarm(300)  # ends a child that hangs
+    signal.alarm(60)  # ends a child that hangs
     before = threads()
     same = all(torch.equal(render(), wanted) for _ in range(200))
     os._exit(0 if same and torch.get_num_threads() == 2 and threads() == before else 1)
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
-    subprocess.run([sys.executable, "-I", "-c", program], check=True, timeout=400)
+    subprocess.run([sys.executable, "-I", "-c", program], check=True, timeout=200)
