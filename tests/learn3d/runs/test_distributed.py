@@ -149,7 +149,7 @@ def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp
 
 def test_a_batch_that_ranks_cannot_share_is_refused(monkeypatch) -> None:
     assert distributed.own_rows(5, 2).tolist() == [0, 1, 2, 3]
-    monkeypatch.setattr(distributed, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
     monkeypatch.setattr(distributed, "rank", lambda: 1)
     assert distributed.own_rows(16, 2).tolist() == [4, 5, 6, 7, 12, 13, 14, 15]
     with pytest.raises(ValueError, match="batch_size must be a multiple of 8 for 2 ranks"):
