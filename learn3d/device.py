@@ -14,7 +14,7 @@ from typing import Literal
 
 import torch
 
-from learn3d.runs.distributed import world_size
+from learn3d.distributed import world_size
 
 CPUINFO = "/proc/cpuinfo"  # Linux lists the CPU's instruction sets here
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from learn3d.runs.distributed import all_reduce_mean
+from learn3d.distributed import all_reduce_mean
 
 
 def pose_classification_loss(logits: Tensor, view_ids: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import time
 
+from learn3d import distributed
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import Batch, ViewDataset
 from learn3d.data.mirror_plane import find_mirror_plane
@@ -15,7 +16,6 @@ from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Losses, Method
 from learn3d.methods.pose_updates import update_poses, update_steps
 from learn3d.pictures import save_png
-from learn3d.runs import distributed
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Progress, load_data
 from learn3d.runs.log import RunLog, check_log, open_log

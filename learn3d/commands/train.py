@@ -11,9 +11,9 @@ import tyro
 
 from learn3d.commands.command import Command, OnDataset, Runs
 from learn3d.config import TrainConfig
+from learn3d.distributed import join_ranks, rank
 from learn3d.files.writing import check_target, write_json
 from learn3d.presets import DEFAULT_PRESET, PLACES, PRESETS, SHORT_NAMES, full_name, load_config
-from learn3d.runs.distributed import join_ranks, rank
 from learn3d.runs.measurement import MEASURES, class_means, evaluate_runs, format_table
 from learn3d.terminal import INTERRUPTED, align, say
 from learn3d.training import train

@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
+from learn3d.distributed import all_gather, whole_batch
 from learn3d.losses import silhouette_energy_distance
 from learn3d.methods.method import Losses
 from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.networks.discriminators import pose_discriminator
 from learn3d.networks.encoders import EncoderName
 from learn3d.networks.generators import GeneratorName, SymmetryOption
-from learn3d.runs.distributed import all_gather, whole_batch
 from learn3d.settings import Count, Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks in the mask bank

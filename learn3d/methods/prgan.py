@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
+from learn3d.distributed import all_reduce_mean, rank, world_size
 from learn3d.methods.method import Grids, Losses, Method, MethodSettings
 from learn3d.methods.optimization import adam, frozen
 from learn3d.networks.encoders import network_input
@@ -29,7 +30,6 @@ from learn3d.networks.voxel_gan import (
     VoxelGenerator,
     project,
 )
-from learn3d.runs.distributed import all_reduce_mean, rank, world_size
 from learn3d.settings import Items, LayerChannels, Positive, Share, Step, checked
 
 BETAS = (0.5, 0.999)  # Adam's decays for the two networks of the GAN

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch, DatasetInfo
 from learn3d.data.poses import Poses
+from learn3d.distributed import whole_batch
 from learn3d.losses import silhouette_pyramid_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.method import Losses
@@ -30,7 +31,6 @@ from learn3d.networks.encoders import ENCODERS, PreactResNet18
 from learn3d.networks.generators import GENERATORS
 from learn3d.networks.layers import reverse_gradient
 from learn3d.networks.resnet import ResNet18Encoder
-from learn3d.runs.distributed import whole_batch
 from learn3d.settings import Channels, Pixels, Positive, Weight, checked
 
 MASK_THRESHOLD = 0.1  # published code: a pixel belongs to the object if alpha is at least this

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import filelock
 
-from learn3d.runs.distributed import rank
+from learn3d.distributed import rank
 
 CONFIG, METRICS, WANDB_ID = "config.json", "metrics.jsonl", "wandb.txt"
 LAST, PREVIOUS, BEST = "last.safetensors", "previous.safetensors", "best.safetensors"

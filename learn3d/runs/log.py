@@ -18,9 +18,9 @@ import numpy as np
 from tqdm import tqdm
 
 from learn3d.config import TrainConfig, config_to_dict
+from learn3d.distributed import rank
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
-from learn3d.runs.distributed import rank
 from learn3d.runs.folder import METRICS, TENSORBOARD, WANDB_ID
 from learn3d.terminal import is_watched, note
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from learn3d import distributed
 from learn3d.config import TrainConfig, check_resume, config_to_dict
 from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.poses import PoseCandidates
@@ -16,7 +17,7 @@ from learn3d.files.reading import DamagedFile
 from learn3d.methods.mesh_method import is_compact
 from learn3d.methods.method import Method
 from learn3d.presets import load_config
-from learn3d.runs import checkpoint, distributed
+from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress, versions
 from learn3d.runs.folder import BEST, CONFIG, LAST, PREVIOUS

@@ -17,11 +17,11 @@ import tiny_networks
 import torch
 
 from learn3d import training
+from learn3d.distributed import join_ranks, rank
 from learn3d.methods import mesh_method, prgan
 from learn3d.networks.encoders import ENCODERS
 from learn3d.presets import config_from_dict
 from learn3d.runs import checkpoint
-from learn3d.runs.distributed import join_ranks, rank
 from learn3d.terminal import without_traceback
 
 

@@ -15,9 +15,10 @@ from children import environment
 from runs import check_same
 from steps import TINY, TINY_PRGAN, TINY_VPL
 
+from learn3d import distributed
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.presets import PRESETS
-from learn3d.runs import checkpoint, distributed
+from learn3d.runs import checkpoint
 
 RUNS = {  # for each: its preset, options, and the bound of relative differences of losses and weights
     "proposed": ("peng2020-kato", TINY, 1e-5),
