@@ -1,3 +1,1 @@
-"""learn3d: pose-invariant 3D reconstruction from single-view images (Peng et al. 2020), through
-the `nmr` renderer.
-"""
+"""Pose-invariant 3D reconstruction from single images (Peng et al. 2020) with the renderer `nmr`."""

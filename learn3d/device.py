@@ -135,7 +135,8 @@ class ThreadTuner:
         times = {count: f"{1000 * self._medians[count]:.0f} ms a step" for count in (1, self.all)}
         self._use(min(self._medians, key=self._medians.__getitem__))
         other = self.all if self.threads == 1 else 1
-        return f"threads: {self.threads} ({times[self.threads]}; with {other}: {times[other]}); --threads fixes it"
+        compared = f"{times[self.threads]}; with {other}: {times[other]}"
+        return f"threads: {self.threads} ({compared}); --threads fixes it"
 
     def _use(self, threads: int) -> None:
         self.threads = threads

@@ -26,10 +26,10 @@ BACK_LIGHT = 0.35  # strength of the light from the opposite side, relative to t
 def studio_lights(
     light: Sequence[float] = KEY_LIGHT, ambient: float = 0.5, smooth: bool = False
 ) -> nmr.Lights:
-    """A key light from the direction `light` (of any length but 0), a weaker one from behind, and ambient light.
+    """A key light, a weaker one from behind, and ambient light.
 
-    ambient: its share in 0 .. 1; a surface that faces the key light has the brightness 1. smooth:
-    interpolate normals.
+    light: direction of the key light, of any length but 0. ambient: its share in 0 .. 1; a surface
+    that faces the key light has the brightness 1. smooth: interpolate normals.
     """
     key = 1.0 - ambient
     direction = torch.as_tensor(light, dtype=torch.float64)
@@ -50,7 +50,7 @@ def photograph(
     lights: nmr.Lights | None = None,
     supersample: int = 2,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One mesh in B views on white. Both sides of its faces are lit in the same way. Not differentiable.
+    """One mesh in B views on white, without gradients. Both sides of its faces are lit alike.
 
     vertices float [V, 3] in the object frame, faces integer [F, 3], a camera of nmr with B poses.
     colors: a texture, or colours of the faces, float [F, 3] or [3] in [0, 1]. supersample:

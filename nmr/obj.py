@@ -82,8 +82,8 @@ def read_obj(file: BinaryIO, with_uv: bool = True) -> Obj:
                 raise ValueError("it is UTF-16; save it as UTF-8")
         end = _last_line_end(text) if more else len(text)
         text, rest = text[:end], text[end:]
-        # Each replacement keeps the length. A vertical tab stands for the line end behind a
-        # backslash.
+        # Every replacement is as long as what it replaces. Where a backslash continues a line, a
+        # vertical tab replaces the line end.
         if b"\r" in text:
             text = text.replace(b"\r\n", b" \n").replace(b"\r", b"\n")
         if b"\\" in text:

@@ -49,8 +49,7 @@ def take_pictures(
     """Pictures of a mesh in everyday colours with their masks, and the cameras of the framed pictures.
 
     hand_held: around the object, elevations of 5 to 40 degrees, distances of 1.6 to 3.5, tilts of
-    up to 5 degrees; otherwise `count` of Kato's 24 views, one of each
-    sector.
+    up to 5 degrees; otherwise `count` of Kato's 24 views, one of each sector.
     """
     zero, drawn = torch.zeros(count), lambda *bounds: torch.from_numpy(rng.uniform(*bounds, count))
     if hand_held:
@@ -88,7 +87,7 @@ def _with_lens(views: View, tangent: torch.Tensor) -> View:
 def measure(
     model: Model, mesh: Surface, rng: np.random.Generator, count: int, known: bool, hand_held: bool
 ) -> tuple[list[float], Surface]:
-    """The values of `COLUMNS` for a mesh in the object frame, and the surface made of `count` pictures."""
+    """The values of `COLUMNS` for a mesh in the object frame, and the surface that is made."""
     pictures, views = take_pictures(mesh, rng, count, hand_held)
     start = time.process_time()
     if count == 1:
@@ -122,12 +121,13 @@ def main(
     hand_held: bool = False,
     sheet: Path | None = None,
 ) -> None:
-    """Print a line for each number of pictures: means over `objects` meshes of one half of a folder or mesh pack.
+    """Print a line of means over meshes for each number of pictures.
 
-    The meshes have y up and the front towards +z. Columns: voxel IoU (kato18) as it is and after
-    the best quarter turn, outline IoU, shares of azimuths that are right within 30 degrees as they
-    are and after the best common turn, processor seconds. hand_held: see `take_pictures`. sheet:
-    PNG file with the true and the made meshes of the largest number of pictures.
+    models: a folder of meshes or a mesh pack, of which one half is used; y is up, the front
+    towards +z. Columns: voxel IoU (kato18) as it is and after the best quarter turn, outline IoU,
+    shares of azimuths that are right within 30 degrees as they are and after the best common turn,
+    processor seconds. hand_held: see `take_pictures`. sheet: PNG file with the true and the made
+    meshes of the largest number of pictures.
     """
     model, rows = load_model(None), []
     sources = list(mesh_sources(models).values())

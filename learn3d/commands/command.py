@@ -77,7 +77,7 @@ class Command:
 
 
 def _join_help_lines(kind: type, default: object) -> None:
-    """Take the line breaks of the source out of the help of a dataclass's options, where tyro keeps them.
+    """Take the source's line breaks, which tyro keeps, out of the help of a dataclass's options.
 
     default: an instance, or None.
     """

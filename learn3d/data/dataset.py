@@ -41,9 +41,8 @@ class DatasetInfo:
     num_views: Annotated[int, Field(ge=0, le=100_000)]  # K view classes
     inverted: bool  # colours are stored as 255 - colour
     num_classes: Annotated[int, Field(ge=1, le=10_000)] = 1  # number of categories
-    pose_features: Annotated[int, Field(ge=0, le=64)] = (
-        3  # length of `features` of a pose; 0 if poses are unknown
-    )
+    # length of `features` of a pose; 0 if poses are unknown
+    pose_features: Annotated[int, Field(ge=0, le=64)] = 3
     # result of `data.mirror_plane`; None if none was found or looked for
     mirror_plane_deg: float | None = None
     # side of the cube, centred at the origin, that holds all objects; None if unknown

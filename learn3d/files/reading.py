@@ -42,7 +42,7 @@ class OddFile(_FileError, UserWarning):
     """A file or folder that can be read, but is probably not as it was meant."""
 
 
-#: Where a reader says what it finds. It may raise, or return; then the reader goes on without the faulty file.
+#: Where a reader says what it finds. It raises, or the reader goes on without the faulty file.
 FaultHandler: TypeAlias = Callable[[_FileError], None]
 
 

@@ -167,8 +167,9 @@ class Method(abc.ABC):
         """The shapes of codes [B, C], on the CPU."""
 
     def view_probabilities(self, images: Tensor) -> Tensor | None:
-        """Probability of each cell of `mesh_method.AZIMUTH_BINS`, float32 [B, K], for stored images; None if they
-        were not learnt.
+        """Probabilities float32 [B, K] of the cells of `mesh_method.AZIMUTH_BINS` for stored images.
+
+        None if they were not learnt.
         """
         return None
 

@@ -101,9 +101,8 @@ class SphereGenerator(MeshGenerator):
     """
 
     sphere: Tensor  # float32 [642,3]
-    source: (
-        Tensor  # int64 [642,3]: index of each coordinate's output; the index after the last means 0
-    )
+    # int64 [642,3]: index of each coordinate's output; the index after the last means 0
+    source: Tensor
     sign: Tensor  # float32 [642,3]: -1 if the coordinate is the opposite of the output
 
     def __init__(self, symmetry: Symmetry | None = None) -> None:

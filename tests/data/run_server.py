@@ -2,7 +2,7 @@
 
 A run can be killed at the nth thing that it does in its folder (opening, renaming, linking or removing a file), or be
 sent a signal after some time. Python's audit events tell what it does, so that no code needs to be changed for it.
-Its best networks are those of step `BEST`, whatever they measure, as that depends on the processor's bits.
+Its best networks are those of step `BEST`: what they measure depends on the processor's bits.
 """
 
 from __future__ import annotations

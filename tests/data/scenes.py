@@ -49,7 +49,10 @@ def leaf_of(tensor):
 
 
 def value_and_gradients(function, *inputs, upstream=None):
-    """The detached output of a function, and its gradients; upstream: by default 1 of a number, else `normal`."""
+    """The detached output of a function, and its gradients.
+
+    upstream: the gradient of the output; default: 1 for a number, else `normal`.
+    """
     leaves = [leaf_of(x) for x in inputs]
     output = function(*leaves)
     if upstream is None:
@@ -63,7 +66,7 @@ def value_and_gradients(function, *inputs, upstream=None):
 
 
 def assert_near(actual, expected, share):
-    """No number differs by more than a share of the largest that is expected; tensors, or lists of them."""
+    """No number of the tensors, or lists of them, differs by more than a share of the largest."""
     if isinstance(expected, torch.Tensor):
         actual, expected = [actual], [expected]
     for a, b in zip(actual, expected, strict=True):
@@ -90,7 +93,7 @@ def for_threads(counts, run):
 
 
 def random_soup(seed, batch=2, num_faces=12, dtype=torch.float64, size=0.5):
-    """Random triangles in renderer space, some partly off the screen: vertices ``[B, V, 3]``, faces ``[F, 3]``."""
+    """Random triangles, some partly off the screen: vertices ``[B, V, 3]``, faces ``[F, 3]``."""
     g = torch.Generator().manual_seed(seed)
     centre = torch.rand(batch, num_faces, 1, 3, generator=g) * 2 - 1
     corners = centre + size * torch.randn(batch, num_faces, 3, 3, generator=g)

@@ -44,7 +44,7 @@ def gradient_tolerance(name: str) -> float:
 
 
 def tensors_of(vector: dict[str, np.ndarray], prefix: str) -> dict[str, torch.Tensor]:
-    """The numbers of a vector file whose names begin with a prefix, as tensors without it in their names."""
+    """The numbers of a vector file whose names begin with a prefix, as tensors by the rest."""
     return {
         key.removeprefix(prefix): torch.from_numpy(value)
         for key, value in vector.items()

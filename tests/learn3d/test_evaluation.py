@@ -273,7 +273,8 @@ def test_mean_is_over_classes_not_over_runs() -> None:
     assert mean["mmd_paper"] is None
 
 
-AXES = {  # the published IoU, and in row i the axis of the object frame that index i of the stored grid runs along
+# the published IoU, and in row i the axis of the object frame along which index i of the grid runs
+AXES = {
     KATO: ("iou_CVPR18", [[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
     KAR: ("iou_NIPS17", [[0, 0, -1], [0, 1, 0], [1, 0, 0]]),
     PASCAL3D: ("iou_Pascal3D", [[-1, 0, 0], [0, 0, -1], [0, -1, 0]]),

@@ -76,7 +76,7 @@ def test_without_a_camera_the_perspective_image_is_cut():
 
 @pytest.mark.parametrize("direction", [[0.2, -0.3, 1.0], [1.0, 0.1, 0.1], [-0.4, 0.9, -0.5]])
 def test_a_room_from_inside(direction):
-    """A cube of 12 faces around the eye: every pixel shows a wall, at the distance of the cube's sides."""
+    """A cube of 12 faces around the eye: every pixel shows a wall."""
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     faces = torch.tensor([[side[0], side[k], side[k + 1]] for side in sides for k in (1, 2)])

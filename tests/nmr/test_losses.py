@@ -30,7 +30,7 @@ ON_FACES = [inflation_loss, volume_loss, area_loss]
 def test_smoothness_vectors(name, dtype):
     v = tensors_of(load_vector(name), "")
     edges = nmr.edge_table(v["faces"])
-    # Collapsed edges: what remains is rounding (the vector is 2.1e-3 from the float64 value, ours 1.5e-3).
+    # Collapsed edges: what remains is rounding (from float64: the vector 2.1e-3, ours 1.5e-3).
     tolerance = 5e-3 if name.endswith("degenerate") else 1e-4
     check_published(lambda x: smoothness_loss(x, edges), v["vertices"], v, dtype, tolerance)
 

@@ -12,13 +12,13 @@ CELL = 64
 VIEWS = 8
 ROWS = 6
 LEGEND = (
-    "rows: up to 6 objects of each split; columns: up to 8 views, the mask of view 0 (black: the object), the voxels "
-    "seen from the front (the darker, the thicker)"
+    "rows: up to 6 objects of each split; columns: up to 8 views, the mask of view 0 "
+    "(black: the object), the voxels seen from the front (the darker, the thicker)"
 )
 
 
 def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.ndarray]:
-    """An object's row of the contact sheet: up to 8 views, the mask of view 0, the voxels, each uint8 [64, 64, 3].
+    """An object's row: up to 8 views, the mask of view 0 and the voxels, each uint8 [64, 64, 3].
 
     rgb uint8 [n, S, S, 3] over white, alpha uint8 [n, S, S], voxels bool [32, 32, 32] with axes
     (x, y, z), z = away.
@@ -34,9 +34,9 @@ def make_row(rgb: np.ndarray, alpha: np.ndarray, voxels: np.ndarray) -> list[np.
 
 
 def draw_sheet(splits: Mapping[str, Sequence[list[np.ndarray]]], views: int) -> np.ndarray:
-    """The contact sheet of a data set with `views` views of each object (see `LEGEND`): uint8 [H, W, 3].
+    """The contact sheet of a data set (see `LEGEND`): uint8 [H, W, 3].
 
-    splits: for each split up to `ROWS` rows by `make_row`.
+    views: number of views of each object. splits: for each split up to `ROWS` rows by `make_row`.
     """
     rows = [row for of_split in splits.values() for row in of_split]
     names = [

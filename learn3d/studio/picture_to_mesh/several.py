@@ -278,9 +278,8 @@ class _Sight(NamedTuple):
     """The cells of the grid as N cameras see them."""
 
     inside: Tensor  # float32 [N, s, s, s]: distance to the outline in cells, positive inside of it
-    pixel: (
-        Tensor  # int64 [N, s^3]: the pixel that shows a cell; the last one is outside the picture
-    )
+    # int64 [N, s^3]: the pixel that shows a cell; the last one is outside the picture
+    pixel: Tensor
     wanted: Tensor  # float32 [N, S * S]: 1 at the pixels of the mask
 
     @classmethod
@@ -344,7 +343,10 @@ def _average(found: Candidates, weights: Tensor) -> Tensor:
 def _carve_out(
     view: View, masks: Tensor, distances: Tensor, likely: Tensor, bent: Tensor, free: int
 ) -> tuple[View, Tensor, Tensor] | None:
-    """Carve shapes, and fit the cameras to them; the one most like the masks. None if no cell is left."""
+    """Carve shapes, and fit the cameras to them. Returns the one most like the masks.
+
+    None if no cell is left. free: see `minimize`.
+    """
     best, found = -math.inf, None
     for slacks in SLACKS if free else ((),):
         fitted = view

@@ -16,9 +16,8 @@ class Comparison:
 
     offset_deg: float
     accuracy: float  # Acc@30: share of errors of at most 30 degrees
-    half_turn_accuracy: (
-        float  # the same, if half a turn does not count: many tables look the same from behind
-    )
+    # the same, if half a turn does not count: many tables look the same from behind
+    half_turn_accuracy: float
     median_deg: float
     mean_deg: float
     flips: float  # share of errors of at least 150 degrees

@@ -162,8 +162,8 @@ def test_voxels_follow_vpls_rule() -> None:
 def test_view_classes_of_val_are_those_of_training(folder: Path) -> None:
     train, val = (pascal3d.load(folder, "aeroplane", split) for split in ("train", "val"))
     assert train.view_names == val.view_names
-    # The first two share the cells of training views; the third is in a cell of its own, 130 degrees from ANGLES[3],
-    # the last of training, and farther from the others.
+    # The first two share the cells of training views. The third is in a cell of its own, 130 degrees
+    # from ANGLES[3], the last of training, and farther from the others.
     assert val.view_ids.tolist() == train.view_ids[[0, 1, 5]].tolist()
     test = pascal3d.load(folder, "aeroplane", "test")
     np.testing.assert_array_equal(test.images, val.images)

@@ -11,8 +11,6 @@ from steps import INFO, make_method
 from torch import Tensor, nn
 from vectors import load_vector
 
-from learn3d import device as precision_module
-from learn3d.device import resolve_precision
 from learn3d.methods import create_method
 from learn3d.methods.method import Method
 from learn3d.networks.discriminators import (
@@ -40,7 +38,7 @@ from learn3d.networks.resnet import ResNet18Encoder
 from learn3d.networks.voxel_gan import InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
 from learn3d.presets import PRESETS
 
-#: A published network, and how many numbers it learns: all widths, sizes of kernels, biases and batch norms together.
+#: A published network, and how many numbers it learns: widths, kernels, biases and batch norms.
 #: Strides and padding follow from the shapes of the table below.
 PUBLISHED: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "encoder": (ENCODERS["conv"], 19_383_488),
@@ -272,25 +270,6 @@ def test_initial_weights_follow_the_seed_and_not_the_discriminator() -> None:
         ours, theirs = with_d[name].state_dict(), without[name].state_dict()
         assert all(torch.equal(ours[key], theirs[key]) for key in ours)
     assert not torch.equal(other["encoder"].layers[0].weight, without["encoder"].layers[0].weight)
-
-
-@pytest.mark.parametrize(
-    ("vendor", "flags", "wanted"),
-    [
-        ("AuthenticAMD", "fpu avx512_bf16", "bf16"),
-        ("GenuineIntel", "fpu avx512_bf16", "fp32"),
-        ("GenuineIntel", "avx512_bf16 amx_bf16", "bf16"),
-        ("AuthenticAMD", "avx2", "fp32"),
-    ],
-)
-def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, vendor, flags, wanted) -> None:
-    cpuinfo = tmp_path / "cpuinfo"
-    cpuinfo.write_text(f"vendor_id : {vendor}\nmodel name : x\nflags\t\t: {flags}\n")
-    monkeypatch.setattr(precision_module, "CPUINFO", str(cpuinfo))
-    assert resolve_precision("auto", "cpu") == wanted
-    assert resolve_precision("fp32", "cpu") == "fp32"
-    monkeypatch.setattr(precision_module, "CPUINFO", str(tmp_path / "missing"))
-    assert resolve_precision("auto", "cpu") == "fp32"
 
 
 def create(device: str, precision: str) -> Method:

@@ -49,7 +49,8 @@ def test_projection_and_gradient_are_those_of_grid_sample(views: ViewCircle) -> 
     assert torch.allclose(ours, theirs, atol=1e-5)
 
 
-BOXES = np.array(  # low and high corners; no two views of the three together are alike, and no mirror image is
+# low and high corners; no two views of the three together are alike, and no mirror image is
+BOXES = np.array(
     [
         [[-0.5, -0.4, -0.3], [0.1, -0.1, 0.4]],
         [[-0.5, -0.1, -0.3], [-0.2, 0.4, 0.0]],

@@ -42,8 +42,9 @@ def uninterrupted(
 ) -> tuple[TrainConfig, float, int]:
     """A run that nothing disturbed, the seconds it took and the number of things it did in its folder.
 
-    It has 10 steps with everything in them: 5 validations, 4 checkpoints, 3 pictures. Its best networks are those of
-    step `BEST`: a run that forgets them when it is resumed at step 9 takes those of step 10.
+    It has 10 steps with everything in them: 5 validations, 4 checkpoints, 3 pictures. Its best
+    networks are those of step `BEST`; a run that forgets them and is resumed at step 9 takes those
+    of step 10.
     """
     folder = tmp_path_factory.mktemp("killed")
     for path in tiny_folder.iterdir():  # not compressed: the tests read them a hundred times
@@ -95,6 +96,22 @@ def test_killed_at_any_place(server, uninterrupted, wanted: int) -> None:
         answer = server(config, resume=(config.output / "config.json").exists())
         assert answer["status"] == 0, config.output.with_suffix(".log").read_text()
         check_same(config.output, killed.output)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["last", "best"])
+def test_killed_in_the_middle_of_each_checkpoint(server, uninterrupted, name: str) -> None:
+    """Half of a file under its temporary name is removed when the run goes on."""
+    killed, _, things = uninterrupted
+    for place in range(things // 4, things):
+        config = dataclasses.replace(killed, output=killed.output.with_name(f"half-{name}-{place}"))
+        server(config, kill_at=place, half=True)
+        if (config.output / f".{name}.safetensors.partial").exists():
+            check_whole(config.output)
+            assert server(config, resume=True)["status"] == 0
+            check_same(config.output, killed.output)
+            return
+    raise AssertionError(f"no kill left half of {name}")
 
 
 def test_signals_at_any_time(server, uninterrupted) -> None:

@@ -62,7 +62,7 @@ def test_vectors(name):
         # How far a contracted multiply-add moves the published gradient says how far rounding may.
         latitude = 5 * (grads.get(f"{key}_fma", expected) - expected).norm()
         error = (leaves[key].grad - expected).norm()
-        # The camera rounds otherwise, too: its published formula in float64 moves gradients by up to 2e-4.
+        # The camera rounds otherwise, too: in float64 its formula moves gradients by up to 2e-4.
         assert error <= max(latitude, 1e-3 * expected.norm()), f"{key}: {error}, {latitude}"
 
 

@@ -1,4 +1,4 @@
-"""The number of threads of a training: one or all, by the time of its steps."""
+"""What fits the processor: the precision, and one thread or all by the time of the steps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from learn3d.device import SLOWER, TRIAL, WINDOW, ThreadTuner
+from learn3d import device
+from learn3d.device import SLOWER, TRIAL, WINDOW, ThreadTuner, resolve_precision
 from learn3d.runs import checkpoint
 from learn3d.training import train
 
@@ -96,3 +97,22 @@ def test_a_resumed_run_keeps_its_number(tiny_run, run_folder, monkeypatch, capsy
     monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
     train(tiny_run(run_folder, iterations=2 * TRIAL + 4, threads=3), resume=True)
     assert used[-1] == 3, "unless another one is asked for"
+
+
+@pytest.mark.parametrize(
+    ("vendor", "flags", "wanted"),
+    [
+        ("AuthenticAMD", "fpu avx512_bf16", "bf16"),
+        ("GenuineIntel", "fpu avx512_bf16", "fp32"),
+        ("GenuineIntel", "avx512_bf16 amx_bf16", "bf16"),
+        ("AuthenticAMD", "avx2", "fp32"),
+    ],
+)
+def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, vendor, flags, wanted) -> None:
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text(f"vendor_id : {vendor}\nmodel name : x\nflags\t\t: {flags}\n")
+    monkeypatch.setattr(device, "CPUINFO", str(cpuinfo))
+    assert resolve_precision("auto", "cpu") == wanted
+    assert resolve_precision("fp32", "cpu") == "fp32"
+    monkeypatch.setattr(device, "CPUINFO", str(tmp_path / "missing"))
+    assert resolve_precision("auto", "cpu") == "fp32"
