@@ -232,6 +232,9 @@ def _check_split(layout: Layout, folder: Path | str, category: str, split: str) 
             layout, folder, category, split, found.append, views_per_object=ALL_VIEWS
         )
         objects = dataset.num_objects
+        if dataset.poses is None:
+            advice = f"learn3d estimate-poses --layout {layout} finds them from the masks"
+            found.append(OddFile(Path(folder) / category, f"has no poses: {advice}"))
         if has_shards(folder, category, split):
             from learn3d.data import shards
 

@@ -102,10 +102,7 @@ def load(
     poses = None
     view_ids = np.zeros(len(pairs), np.int64)
     view_names = ("unknown",)
-    if chosen[0].distance is None:
-        advice = "learn3d estimate-poses --layout photos finds them from the masks"
-        on_fault(OddFile(table, f"has no poses: {advice}"))
-    else:
+    if chosen[0].distance is not None:
         _check_scales(table, pairs, on_fault)
         poses = _poses([photo for photo, _ in pairs])
         view_ids, view_names = view_classes(poses, _poses(training))
