@@ -21,6 +21,7 @@ pytest.importorskip("plotly")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+PATIENCE = 300_000  # milliseconds; a second or two on an idle machine
 Open = Callable[..., Any]
 
 
@@ -39,6 +40,7 @@ def visit(browser) -> Iterator[Open]:
 
     def open_page(path: Path, width: int = 1200, height: int = 900, **options: Any) -> Any:
         contexts.append(browser.new_context(viewport={"width": width, "height": height}, **options))
+        contexts[-1].set_default_timeout(PATIENCE)
         tab = contexts[-1].new_page()
         tab.on(
             "console",
@@ -79,6 +81,7 @@ def test_a_mesh_is_saved_as_reconstruct_writes_it(
     page, runs, tiny_folder, browser, tmp_path
 ) -> None:
     tab = browser.new_page()
+    tab.set_default_timeout(PATIENCE)
     tab.goto(page.as_uri())
     with tab.expect_download() as download:
         tab.locator("figcaption button").first.click()
