@@ -480,7 +480,7 @@ def reconstruct_several(
     for number, image in enumerate(stored):
         predicted.append(predict(model.method, torch.from_numpy(image), masks[number]))
         progress("camera", 0.3 * (number + 1) / len(stored))
-    left_out = dict.fromkeys(find_strangers(predicted), "it seems to show another object")
+    left_out = dict.fromkeys(find_strangers(predicted, framed), "it seems to show another object")
     while True:
         used = [number for number in range(len(pictures)) if number not in left_out]
         chosen = [predicted[number] for number in used]

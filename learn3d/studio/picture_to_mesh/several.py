@@ -50,7 +50,7 @@ LAYOUTS = 64  # likeliest layouts of all cameras whose outlines are compared
 COARSE = 32  # cells along each side of the grid for that, and pixels of its masks
 WIDENED = 0.4  # cells of that grid by which the outlines are widened
 CELLS, BOX = 80, 1.1  # cells along each side of the grid, and its side in the object frame
-ROOM = 0.04  # distance from the box of the bent template up to which the object reaches
+ROOM = 0.2  # distance from the box of the bent template up to which the object reaches
 LIKELY = 0.4  # probability above which a cell is kept if all outlines contain it
 NEEDED = 0.9  # share of the largest probability on a line of sight from which a cell is kept, too
 REACH = 2.0  # cells around a needed one that are kept, so that thin legs are whole
@@ -64,8 +64,10 @@ LAST_SLACKS = (0.3, 0.7)  # and afterwards; the most alike of all shapes is take
 CAMERA_STEPS = 15  # steps of the cameras between two rounds
 # mean outline IoU from which the bent template is taken, which has straighter parts
 STRAIGHT = 0.85
-# cosine of a picture's code and the mean of the others below which it shows something else
-ALIKE = 0.5
+COLORS = 5.0  # weight of the distance of two pictures' colours; that of their codes is 1
+SAMPLES = 500  # pixels of a picture whose colours are compared
+# a picture shows something else if its distance to the nearest one exceeds that of the others by this
+STRANGE = 0.5
 APART = 0.03  # cost of a camera that stands a level of `ELEVATIONS_DEG` above or below the others
 WORSE = 0.15  # a picture is left out if its outline IoU is so much below the median of all
 
@@ -81,18 +83,39 @@ class SeveralFit(NamedTuple):
     is_template: bool  # whether it is a bent template, not a carved shape
 
 
-def find_strangers(predicted: Sequence[Prediction]) -> list[int]:
-    """The pictures whose codes are unlike the others', the most unlike first. Two pictures cannot tell."""
-    left, strangers = list(range(len(predicted))), []
+def find_strangers(predicted: Sequence[Prediction], pictures: Sequence[np.ndarray]) -> list[int]:
+    """The pictures whose codes and colours are like no other's, the most unlike first. Two pictures cannot tell.
+
+    pictures: N of R, G, B and mask, uint8 [4, S, S].
+    """
     codes = torch.stack([F.normalize(each.code[0], dim=0) for each in predicted])
+    colors = [_color_samples(picture) for picture in pictures]
+    apart = torch.stack([torch.stack([_apart(a, b) for b in colors]) for a in colors])
+    apart = 1 - codes @ codes.T + COLORS * (apart + apart.T) / 2
+    left, strangers = list(range(len(codes))), []
     while len(left) > 2:
-        kept = codes[left]
-        others = F.normalize(kept.sum(0) - kept, dim=1)
-        cosines = (kept * others).sum(1)
-        if cosines.min() > ALIKE:
+        nearest = apart[left][:, left].fill_diagonal_(math.inf).amin(1)
+        most = int(nearest.argmax())
+        others = torch.cat([nearest[:most], nearest[most + 1 :]])
+        if nearest[most] < others.quantile(0.5) + STRANGE:
             break
-        strangers.append(left.pop(int(cosines.argmin())))
+        strangers.append(left.pop(most))
     return strangers
+
+
+def _color_samples(picture: np.ndarray) -> Tensor:
+    """Hues and half of the brightness [P, 4] of pixels within the outline of a picture uint8 [4, S, S]."""
+    inside = picture[3] > 127
+    inner = ndimage.binary_erosion(inside, iterations=2)
+    colors = torch.from_numpy(picture[:3, inner if inner.any() else inside].T / np.float32(255))
+    grey = colors.mean(1, keepdim=True)
+    samples = torch.cat([colors - grey, grey / 2], 1)
+    return samples[:: math.ceil(len(samples) / SAMPLES)]
+
+
+def _apart(colors: Tensor, others: Tensor) -> Tensor:
+    """The mean distance of colours [P, 4] to the nearest of other ones [Q, 4]."""
+    return torch.cdist(colors, others).amin(1).mean()
 
 
 def find_outliers(ious: Tensor) -> list[int]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 import torch
 import trimesh
 
 import nmr
 from learn3d.pictures import photograph
-from learn3d.studio.picture_to_mesh.fit import frame_view
+from learn3d.studio.picture_to_mesh.fit import Prediction, frame_view
 from learn3d.studio.picture_to_mesh.reconstruction import load_model, reconstruct_several
+from learn3d.studio.picture_to_mesh.several import find_strangers
 from learn3d.studio.picture_to_mesh.templates import template
 
 
@@ -61,3 +65,23 @@ def test_thin_legs_are_whole_if_cameras_are_known() -> None:
     for x, z in corners:
         for y in (-0.1, -0.2, -0.3, -0.4, -0.48):
             assert (points - torch.tensor([x, y, z])).norm(dim=1).min() < 0.06
+
+
+def test_a_picture_with_another_code_and_other_colours_is_a_stranger() -> None:
+    def look(cosine: float, color: tuple[int, int, int]) -> tuple[Prediction, np.ndarray]:
+        code = torch.tensor([[cosine, math.sqrt(1 - cosine**2)]])
+        picture = np.zeros((4, 32, 32), np.uint8)
+        picture[:, 8:24, 8:24] = np.array([*color, 255], np.uint8)[:, None, None]
+        return Prediction(code, None, None), picture
+
+    red, darker, blue = (180, 40, 40), (150, 35, 30), (40, 40, 180)
+    alike = [look(1.0, red), look(0.95, darker), look(0.9, red)]
+    for more, strangers in (
+        ([], []),
+        ([look(0.7, darker)], []),
+        ([look(0.7, blue)], [3]),
+        ([look(-0.5, red)], [3]),
+        ([look(0.7, blue), look(-0.5, red)], [3, 4]),
+    ):
+        assert find_strangers(*zip(*alike, *more, strict=True)) == strangers
+    assert find_strangers(*zip(look(1.0, red), look(-0.5, blue), strict=True)) == []
