@@ -138,6 +138,7 @@ struct EdgeSums {
   std::vector<int32_t> ids;  // face indices
   Buffer<T> entries;         // [faces, kEdgeEntry], corners in drawing order
   int64_t count;
+  bool finite;  // all gradients of the task's rows
 };
 
 template <class T>
@@ -225,9 +226,9 @@ LineRange band_of(const RowBlock& block, bool columns, const PixelRange& reached
   return {first, std::min((block.number + 1) * width, last) - first, columns};
 }
 
-// The sums of one block. If a gradient of the image is not finite, they are NaN.
+// The sums of one block.
 template <class T>
-void sum_bands(const EdgeImage<T>& image, const RowBlock& block, bool finite, EdgeSums<T>& sums) {
+void sum_bands(const EdgeImage<T>& image, const RowBlock& block, EdgeSums<T>& sums) {
   const Size raster = image.raster;
   const int64_t entries = 2 * image.num_faces + 1;
   const int64_t most = std::min(
@@ -240,6 +241,9 @@ void sum_bands(const EdgeImage<T>& image, const RowBlock& block, bool finite, Ed
               T(0));  // of the background: a point, which no line crosses
   scratch.numbers[0] = 0;
   sums.count = 1;
+  const int64_t scale = image.anti_aliasing ? 2 : 1, row = image.size.width * image.channels,
+                first = block.first() / scale, last = block.last() / scale;
+  sums.finite = NMR_AT_BEST_LEVEL(all_finite, image.grad + first * row, (last - first) * row);
   for (const bool columns : {false, true}) {
     const Reach& reach = image.reach;
     const LineRange band = band_of(block, columns, columns ? reach.columns : reach.rows);
@@ -253,7 +257,6 @@ void sum_bands(const EdgeImage<T>& image, const RowBlock& block, bool finite, Ed
       const int64_t runs = group.runs_end[group.lines.count - 1];
       if (runs == 0) continue;
       number_faces(image, group.runs, runs, scratch, sums);
-      if (!finite) continue;
       if (!image.pixels)
         NMR_AT_BEST_LEVEL(pull_group<kCoverage>, image, group, scratch.list, sums.entries.data());
       else
@@ -263,21 +266,28 @@ void sum_bands(const EdgeImage<T>& image, const RowBlock& block, bool finite, Ed
         });
     }
   }
-  if (!finite)
-    std::fill_n(sums.entries.data(), sums.count * kEdgeEntry, std::numeric_limits<T>::quiet_NaN());
+}
+
+// NaN for the corners of all faces that own a pixel.
+template <class T>
+void spoil_gradients(const EdgeImage<T>& image, T* grad_vertices) {
+  VisibleFaces visible;
+  visible.list(image.face_index, image.raster.pixels(), image.num_faces);
+  for (int64_t n = 1; n < visible.count; ++n) {  // skips the background
+    const int64_t* face = image.faces + 3 * face_of(visible.ids[n], image.num_faces);
+    for (int k = 0; k < 3; ++k)
+      std::fill_n(grad_vertices + 3 * face[k], 2, std::numeric_limits<T>::quiet_NaN());
+  }
 }
 
 // Gradients of all images; image_of(b) describes one.
 template <class T, class ImageOf>
 void sum_edges(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads,
                const ImageOf& image_of) {
-  std::vector<char> finite(mesh.batch);
+  std::vector<char> finite(mesh.batch, true);
   std::vector<Reach> reach(mesh.batch);
   parallel_for(mesh.batch, num_threads, [&](int64_t b) {
-    const EdgeImage<T> image = image_of(b);
-    const int64_t count = image.size.pixels() * image.channels;
-    finite[b] = NMR_AT_BEST_LEVEL(all_finite, image.grad, count);
-    reach[b] = reach_of(image.vertices, mesh.vertex_count(b), raster);
+    reach[b] = reach_of(mesh.image_vertices(b), mesh.vertex_count(b), raster);
     std::fill_n(grad_vertices + 3 * mesh.vertex_start(b), 3 * mesh.vertex_count(b), T(0));
   });
   sum_blocks<EdgeSums<T>>(
@@ -285,9 +295,10 @@ void sum_edges(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_
       [&](const RowBlock& block, EdgeSums<T>& sums) {
         EdgeImage<T> image = image_of(block.b);
         image.reach = reach[block.b];
-        sum_bands(image, block, finite[block.b], sums);
+        sum_bands(image, block, sums);
       },
       [&](int64_t b, const EdgeSums<T>& sums) {
+        finite[b] = finite[b] && sums.finite;
         const int64_t F = mesh.face_count(b);
         T* grad_image = grad_vertices + 3 * mesh.vertex_start(b);
         for (int64_t n = 1; n < sums.count; ++n) {  // skips the background
@@ -301,6 +312,8 @@ void sum_edges(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_
           }
         }
       });
+  for (int64_t b = 0; b < mesh.batch; ++b)
+    if (!finite[b]) spoil_gradients(image_of(b), grad_vertices + 3 * mesh.vertex_start(b));
 }
 
 template <class Args>

@@ -17,6 +17,8 @@ constexpr int64_t kVectors = 4;  // of runs, whose crossings are found before th
 
 // --- lines
 
+constexpr int64_t kRowsAhead = 4 * kLanes;  // processors foresee no columns of a large image
+
 // Row c of `to` gets column c of an array whose rows are `step` values apart; a negative step turns
 // it upside down. Vectors must not reach beyond `end`. Writes up to kLanes - 1 more values to each
 // row of `to`.
@@ -25,7 +27,10 @@ NMR_INLINE void transpose(const E* from, int64_t rows, int64_t step, int64_t col
                           E* to, int64_t stride) {
   for (int64_t j = 0; j < rows; j += kLanes) {
     const E* row[kLanes];
-    for (int64_t k = 0; k < kLanes; ++k) row[k] = from + std::min(j + k, rows - 1) * step;
+    for (int64_t k = 0; k < kLanes; ++k) {
+      row[k] = from + std::min(j + k, rows - 1) * step;
+      __builtin_prefetch(from + std::min(j + k + kRowsAhead, rows - 1) * step);
+    }
     const E* last = std::max(row[0], row[kLanes - 1]);
     for (int64_t i = 0; i < columns; i += 4) {
       const int64_t count = std::min<int64_t>(4, columns - i);
@@ -130,14 +135,14 @@ void find_group_runs(const EdgeImage<T>& image, LineGroup<T>& group) {
   group.face_stride = W;
   if (group.lines.columns) {
     const int64_t last = std::min(window.last, M);
-    for (int64_t n = 0; n < count; ++n)
-      std::fill_n(group.transposed + n * group.stride, group.stride, -1);
     transpose(image.face_index + (M - 1 - window.first) * W + group.lines.first,
               last - window.first, -W, count, image.face_index + M * W,
               group.transposed + window.first, group.stride);
-    for (int64_t n = 0; n < count; ++n)
-      std::fill(group.transposed + n * group.stride + last,
-                group.transposed + (n + 1) * group.stride, -1);
+    for (int64_t n = 0; n < count; ++n) {
+      int32_t* line = group.transposed + n * group.stride;
+      std::fill_n(line, window.first, -1);
+      std::fill(line + last, line + group.stride, -1);
+    }
     group.face_index = group.transposed;
     group.face_stride = group.stride;
   }
@@ -157,36 +162,36 @@ template <int64_t kChannels, class T>
 NMR_INLINE void list_pixels(EdgeLine<T>& line, const PixelList<T>& list) {
   const Lanes<T> zero = splat(T(0));
   int64_t count = 0;
-  uint32_t gains = 0;
+  LaneMask<T> gains = zero < zero;
   for (int64_t m = 0; m < line.length; m += kLanes) {
-    const Lanes<T> at = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(m)));
-    const uint32_t background =
-        lane_bits(load_face_indices(line.face_index, m, line.length) < splat(int32_t(0)));
+    const LaneMask<T> background =
+        widen_mask<T>(load_face_indices(line.face_index, m, line.length) < splat(int32_t(0)));
+    const Lanes32 pixels = lane_numbers() + splat(static_cast<int32_t>(m));
     if constexpr (kChannels == kCoverage) {
       const Lanes<T> grad = load_lanes<Lanes<T>>(line.grads + m);
-      gains |= lane_bits(grad > zero) & ~background;
-      const uint32_t pulls = lane_bits(grad < zero) & background;
+      gains = gains | without(grad > zero, background);
+      const uint32_t pulls = lane_bits((grad < zero) & background);
       if (!pulls) continue;
       compress_lanes(zero - grad, pulls, list.weight + count);
-      count += compress_lanes(at, pulls, list.position + count);
+      count += compress_lanes(to_values<T>(pixels), pulls, list.position + count);
     } else {
       const int64_t C = kChannels ? kChannels : line.channels;
-      LaneMask<T> pulls = zero < zero;
+      LaneMask<T> acts = zero < zero;
       for (int64_t c = 0; c < C; ++c) {
         const Lanes<T> grad = load_lanes<Lanes<T>>(line.grads + c * line.stride + m);
-        pulls = pulls | (grad < zero) | (grad > zero);
+        acts = acts | (grad < zero) | (grad > zero);
       }
-      const uint32_t bits = lane_bits(pulls);
-      if (!bits) continue;
-      gains |= bits & ~background;
-      compress_lanes(lane_numbers() + splat(static_cast<int32_t>(m)), bits, list.pixel + count);
-      count += compress_lanes(at, bits, list.position + count);
+      gains = gains | without(acts, background);
+      const uint32_t pulls = lane_bits(acts);
+      if (!pulls) continue;
+      compress_lanes(pixels, pulls, list.pixel + count);
+      count += compress_lanes(to_values<T>(pixels), pulls, list.position + count);
     }
   }
   list.position[-1] = -std::numeric_limits<T>::max();
   list.position[count] = std::numeric_limits<T>::max();
   line.pulling = count;
-  line.gains = gains != 0;
+  line.gains = lane_bits(gains) != 0;
 }
 
 // --- eight runs and one of their edges

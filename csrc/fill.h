@@ -94,9 +94,10 @@ NMR_INLINE DepthBound<T> bound_depth(const Lanes<T> (&x)[3], const Lanes<T> (&y)
   return bound;
 }
 
-// Stores the bounds of the depths of eight faces, and returns the largest q of each; infinite ones
-// for faces so thin that all three weights could round to 0, or close to the limits of T or of
-// depth. largest: the largest coordinate of each, at least 1.
+// Stores the bounds of the depths of eight faces, and returns the largest q of each. They are
+// infinite for faces close to the limits of T or of depth. Those of the corners hold for the
+// thinnest face, but all three of its weights could round to 0, and then it has no depth: it wins a
+// pixel by its exact depth alone. largest: the largest coordinate of each, at least 1.
 template <class T>
 NMR_INLINE Lanes<T> store_bounds(const RasterSettings<T>& settings, const Lanes<T> (&x)[3],
                                  const Lanes<T> (&y)[3], const Lanes<T> (&z)[3], LaneMask<T> usable,
@@ -115,9 +116,11 @@ NMR_INLINE Lanes<T> store_bounds(const RasterSettings<T>& settings, const Lanes<
   const Lanes<T> lo = min_of(min_of(z[0], z[1]), z[2]), hi = max_of(max_of(z[0], z[1]), z[2]);
   const Lanes<T> det = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]);
   const LaneMask<T> bounded =
-      usable & (splat(near) >= zero) & (absolute<T>(det) >= splat(resolution) * largest * largest) &
-      (largest * splat(longer) < splat(moderate)) & (lo * splat(1 - 16 * eps) > splat(near)) &
-      (hi * splat(1 + 16 * eps) < splat(far)) & (lo > splat(smallest)) & (hi < splat(1 / smallest));
+      usable & (splat(near) >= zero) & (largest * splat(longer) < splat(moderate)) &
+      (lo * splat(1 - 16 * eps) > splat(near)) & (hi * splat(1 + 16 * eps) < splat(far)) &
+      (lo > splat(smallest)) & (hi < splat(1 / smallest));
+  const LaneMask<T> has_depth =
+      bounded & (absolute<T>(det) >= splat(resolution) * largest * largest);
   // For faces without bounds, those of an ordinary triangle are computed and not used.
   const Lanes<T> ordinary_x[3] = {zero, one, zero}, ordinary_y[3] = {zero, zero, one};
   Lanes<T> bx[3], by[3], bz[3];
@@ -134,6 +137,7 @@ NMR_INLINE Lanes<T> store_bounds(const RasterSettings<T>& settings, const Lanes<
   store_lanes(block.slope_y, bound.slope_y);
   store_lanes(block.level, bound.level);
   store_lanes(block.margin, select(bounded, bound.margin, infinity));
+  store_lanes(block.win_margin, select(has_depth, bound.margin, infinity));
   store_lanes(block.nearest, nearest);
   return nearest;
 }
@@ -244,12 +248,12 @@ constexpr int32_t kBits[kLanes] = {1, 2, 4, 8, 16, 32, 64, 128};
 // depth, than the face stored so far. Of equally near faces the one with the smaller index wins, in
 // whichever order they are filled.
 template <class T>
-LaneMask<T> contest(const Image<T>& image, int32_t id, uint32_t contested_bits, int64_t i,
-                    int64_t j, const int32_t* face_index_at) {
+LaneMask<T> contest(const Image<T>& image, const FacePlane<T>& plane, int32_t id,
+                    uint32_t contested_bits, int64_t i, int64_t j, const int32_t* face_index_at) {
   const Lanes<T> column = to_values<T>(lane_numbers() + splat(static_cast<int32_t>(i)));
   const T row = static_cast<T>(j);
   const bool perspective = image.settings.perspective;
-  const Lanes<T> z = exact_depths(face_plane(image, id), column, row, perspective);
+  const Lanes<T> z = exact_depths(plane, column, row, perspective);
   const Lanes32 bit = load_lanes<Lanes32>(kBits),
                 among = splat(static_cast<int32_t>(contested_bits)) & bit;
   const LaneMask<T> contested = widen_mask<T>(among > splat(int32_t(0))) &
@@ -276,13 +280,13 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
   const int64_t j_first = std::max<int64_t>(block.row_first[n], band.row_first);
   const int64_t j_last = std::min<int64_t>(block.row_last[n], band.row_last);
   if (j_first > j_last) return;
-  const bool bounded = block.nearest[n] < std::numeric_limits<T>::infinity();
-  if (!bounded && !is_drawable(load_triangle(image.vertices, image.faces + 3 * f, false))) return;
+  const bool has_depth = block.win_margin[n] < std::numeric_limits<T>::infinity();
+  if (!has_depth && !is_drawable(load_triangle(image.vertices, image.faces + 3 * f, false))) return;
   const int32_t id = reversed ? f + static_cast<int32_t>(image.num_faces) : f;
   const int k0 = reversed ? 2 : 0, k2 = reversed ? 0 : 2;
   const T x0 = block.x[k0][n], x1 = block.x[1][n], x2 = block.x[k2][n];
   const T y0 = block.y[k0][n], y1 = block.y[1][n], y2 = block.y[k2][n];
-  const Lanes<T> margin = splat(block.margin[n]);
+  const Lanes<T> margin = splat(block.margin[n]), win_margin = splat(block.win_margin[n]);
   const Lanes32 ids = splat(id);
   const Lanes<T> x0s = splat(x0), x1s = splat(x1), x2s = splat(x2);
   const Lanes<T> dy0 = splat(y1 - y0), dy1 = splat(y2 - y1), dy2 = splat(y0 - y2);
@@ -313,7 +317,7 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
         const LaneMask<T> outside = (splat(row_terms[0][r]) < c0) | (splat(row_terms[1][r]) < c1) |
                                     (splat(row_terms[2][r]) < c2);
         const Lanes<T> q = q_column + splat(row_terms[3][r]), q_most = q + margin,
-                       q_least = q - margin;
+                       q_least = q - win_margin;
         const Lanes<T> pixel_most = load_lanes<Lanes<T>>(most),
                        pixel_least = load_lanes<Lanes<T>>(least);
         const LaneMask<T> unsettled = without(q_most >= pixel_least, outside | off_box),
@@ -327,11 +331,12 @@ NMR_INLINE void fill_face(const Image<T>& image, int32_t f, bool reversed, const
         store_lanes(face_index, choose(narrow_mask(wins), ids, load_lanes<Lanes32>(face_index)));
       }
       if (!any_contested) continue;
+      const FacePlane<T> plane = face_plane(image, id);
       for (int64_t r = 0; r < rows; ++r) {
         if (!contested[r]) continue;
         const int64_t at = start + r * stride;
         const LaneMask<T> wins =
-            contest<T>(image, id, contested[r], i, top + r, band.face_index + at);
+            contest<T>(image, plane, id, contested[r], i, top + r, band.face_index + at);
         const Lanes<T> q = q_column + splat(row_terms[3][r]);
         store_lanes(band.most + at, choose(wins, q + margin, load_lanes<Lanes<T>>(band.most + at)));
         store_lanes(band.least + at,
@@ -470,4 +475,28 @@ void fill_band(const Image<T>& image, const Band<T>& args, int64_t blocks, T* bl
                 (last - first) * sizeof(int32_t));
     std::fill_n(row + last, W - last, -1);
   }
+}
+
+// alpha [w]: the covered shares of the pixels of a row, from the rows of the face index map.
+template <class T>
+NMR_INLINE void cover_row(const int32_t* face_index, int64_t w, bool anti_aliasing, T* alpha) {
+  if (!anti_aliasing) {
+    for (int64_t x = 0; x < w; ++x) alpha[x] = face_index[x] >= 0 ? T(1) : T(0);
+    return;
+  }
+  const int32_t *upper = face_index, *lower = face_index + 2 * w;
+  for (int64_t x = 0; x < w; ++x) {
+    const int upper_covered = (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
+    const int lower_covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0);
+    alpha[x] = T(0.25) * static_cast<T>(upper_covered + lower_covered);
+  }
+}
+
+// The band's part of the silhouette.
+template <class T>
+void cover_band(const Band<T>& band, const int32_t* face_index, bool anti_aliasing, T* alpha) {
+  const int64_t scale = anti_aliasing ? 2 : 1, w = band.raster.width / scale;
+  const int64_t last = (band.raster.height - band.row_first) / scale;
+  for (int64_t y = (band.raster.height - 1 - band.row_last) / scale; y < last; ++y)
+    cover_row(face_index + y * scale * band.raster.width, w, anti_aliasing, alpha + y * w);
 }

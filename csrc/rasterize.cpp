@@ -33,7 +33,8 @@ struct FaceBlock {
   T x[3][kLanes], y[3][kLanes];                       // corners, in the face's own order
   T slope_x[kLanes], slope_y[kLanes], level[kLanes];  // coefficients of q
   T margin[kLanes];                                   // infinity: no bounds
-  T nearest[kLanes];                                  // largest q at any pixel
+  T win_margin[kLanes];  // the same, and infinity if it wins by its exact depth alone
+  T nearest[kLanes];     // largest q at any pixel
   // Pixels inside the box.
   int32_t column_first[kLanes], column_last[kLanes], row_first[kLanes], row_last[kLanes];
 };
@@ -124,6 +125,7 @@ template <class T>
 void rasterize(const Rasterize<T>& args) {
   const Size raster = args.settings.raster;
   const int64_t H = raster.height, W = raster.width, batch = args.mesh.batch;
+  const int64_t scale = args.anti_aliasing ? 2 : 1;  // rows that no two bands share
   // Many images: one thread per image. Few images: all threads share one image at a time.
   const bool share = batch < args.num_threads;
   parallel_for(batch, share ? 1 : args.num_threads, [&](int64_t b) {
@@ -149,10 +151,10 @@ void rasterize(const Rasterize<T>& args) {
         for (int64_t j = 0; j < H + kLanes; ++j) scratch.rows[j] = pixel_centre<T>(j, H);
         scratch.raster = raster;
       }
-      Band<T> band{n * H / bands,
-                   (n + 1) * H / bands - 1,
+      Band<T> band{n * (H / scale) / bands * scale,
+                   (n + 1) * (H / scale) / bands * scale - 1,
                    raster,
-                   W + kLanes,
+                   W + 3 * kLanes,
                    scratch.columns.data(),
                    scratch.rows.data(),
                    nullptr,
@@ -164,6 +166,9 @@ void rasterize(const Rasterize<T>& args) {
       band.face_index = reserve(scratch.face_index, rows * band.stride + kLanes);
       T* block_least = reserve(scratch.block_least, (rows / kLanes + 1) * blocks);
       NMR_AT_BEST_LEVEL(fill_band, image, band, blocks, block_least, args.face_index + b * H * W);
+      if (args.alpha)
+        NMR_AT_BEST_LEVEL(cover_band, band, args.face_index + b * H * W, args.anti_aliasing,
+                          args.alpha + b * H * W / (scale * scale));
     });
   });
 }

@@ -1,4 +1,4 @@
-// From the raster to the image: coverage of a face index map, and pixels.
+// From the pixels of the raster to those of the image.
 #include <algorithm>
 #include <cstdint>
 #include <vector>
@@ -10,22 +10,6 @@
 namespace nmr {
 
 namespace {
-
-constexpr int64_t kBandPixels = int64_t(1) << 16;  // of an image, that one task averages
-
-// alpha [h, w]: the covered share of each pixel of an image whose face index map has twice its
-// size.
-template <class T>
-void average_coverage(const int32_t* face_index, Size image, T* alpha) {
-  for (int64_t y = 0; y < image.height; ++y, alpha += image.width) {
-    const int32_t *upper = face_index + 4 * y * image.width, *lower = upper + 2 * image.width;
-    for (int64_t x = 0; x < image.width; ++x) {
-      const int upper_covered = (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
-      const int lower_covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0);
-      alpha[x] = T(0.25) * static_cast<T>(upper_covered + lower_covered);
-    }
-  }
-}
 
 // A row of the image, w pixels wide, from the raster rows `pixels` [2 or 1, W, C]. behind: the
 // background and the mean of four background pixels [2, C], or nullptr. kChannels: C, or 0 if it is
@@ -71,25 +55,6 @@ NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, i
 }
 
 }  // namespace
-
-// Bands of rows of all images in parallel.
-template <class T>
-void silhouette_forward(const SilhouetteForward<T>& args) {
-  const Size image = args.image, raster = raster_of(image, args.anti_aliasing);
-  const int64_t rows = std::max<int64_t>(kBandPixels / image.width, 1);
-  const auto average = [&](int64_t b, int64_t first, int64_t last) {
-    const Size band{last - first, image.width};
-    const int32_t* face_index =
-        args.face_index + b * raster.pixels() + first * (raster.pixels() / image.height);
-    T* alpha = args.alpha + b * image.pixels() + first * image.width;
-    if (!args.anti_aliasing) {
-      for (int64_t i = 0; i < band.pixels(); ++i) alpha[i] = face_index[i] >= 0 ? T(1) : T(0);
-      return;
-    }
-    average_coverage(face_index, band, alpha);
-  };
-  for_bands(args.batch, image.height, rows, args.num_threads, average);
-}
 
 // The mean of 2x2 pixels, or a copy; pixels without a face have the background's colour, if it is
 // given.
@@ -146,7 +111,6 @@ void resolve_backward(const Resolve<T>& args) {
     });
 }
 
-NMR_FLOAT_AND_DOUBLE(silhouette_forward, SilhouetteForward)
 NMR_FLOAT_AND_DOUBLE(resolve_forward, Resolve)
 NMR_FLOAT_AND_DOUBLE(resolve_backward, Resolve)
 

@@ -148,13 +148,15 @@ struct RasterSettings {
   bool perspective = true;  // see Fragments
 };
 
-// Which face is nearest at each pixel (rasterize.cpp).
+// Which face is nearest at each pixel, and the silhouette (rasterize.cpp).
 template <class T>
 struct Rasterize {
   MeshBatch<T> mesh;
   RasterSettings<T> settings;
   int32_t* face_index;  // out [B, H, W]; -1 background, f front, F + f reversed copy of f
   int num_threads;
+  T* alpha = nullptr;          // out [B, h, w], or nullptr: the covered share of each pixel
+  bool anti_aliasing = false;  // of alpha: the mean of 2x2 pixels
 };
 
 // The K nearest faces at each pixel, nearest first (layers.cpp).
@@ -167,18 +169,8 @@ struct RasterizeLayers {
   int num_threads;
 };
 
-// Coverage of a face index map, with NMR's gradient (silhouette.cpp) or that of Kato and Harada
-// 2019 (local_gradient.cpp).
-template <class T>
-struct SilhouetteForward {
-  const int32_t* face_index;  // [B, H, W], of raster_of(image, anti_aliasing)
-  int64_t batch;
-  Size image;          // h x w
-  bool anti_aliasing;  // 2x2 mean
-  T* alpha;            // out [B, h, w]
-  int num_threads;
-};
-
+// NMR's gradient of a silhouette (edge_gradient.cpp), or that of Kato and Harada 2019
+// (local_gradient.cpp).
 template <class T>
 struct SilhouetteBackward {
   MeshBatch<T> mesh;
@@ -541,6 +533,7 @@ struct SoftIou {
   int64_t batch, count;
   double* areas;       // forward out, backward in [B, 2]: I and U
   T* iou;              // forward out [B]
+  T* target_range;     // forward out [2]: the least and the largest of all targets, 0 and 1
   const T* grad_iou;   // backward in [B]
   T* grad_prediction;  // backward out [B, N], or nullptr
   T* grad_target;      // backward out [B, N], or nullptr
@@ -565,8 +558,6 @@ template <class T>
 void rasterize(const Rasterize<T>& args);
 template <class T>
 void rasterize_layers(const RasterizeLayers<T>& args);
-template <class T>
-void silhouette_forward(const SilhouetteForward<T>& args);
 template <class T>
 void silhouette_backward(const SilhouetteBackward<T>& args);
 template <class T>

@@ -21,16 +21,12 @@ Smoothness<T> read_smoothness(Call& call) {
   return args;
 }
 
-// A target in [0, 1] or a little outside, as resampling makes it; not a mask of 0 and 255.
+// The target must lie in [0, 1] or a little outside, as resampling makes it; not in 0 .. 255.
 template <class T>
-void require_mask(const T* target, int64_t count) {
-  T low = 0, high = 1;
-  for (int64_t n = 0; n < count; ++n) {
-    low = target[n] < low ? target[n] : low;
-    high = target[n] > high ? target[n] : high;
-  }
-  if (low >= T(-0.5) && high <= T(1.5)) return;
-  const auto [least, most] = std::minmax_element(target, target + count);
+void require_mask(const SoftIou<T>& args) {
+  if (args.target_range[0] >= T(-0.5) && args.target_range[1] <= T(1.5)) return;
+  const auto [least, most] =
+      std::minmax_element(args.target, args.target + args.batch * args.count);
   char text[120];
   std::snprintf(
       text, sizeof text,
@@ -66,9 +62,11 @@ void mean_of_iou(Call& call) {
     args.grad_iou = iou.data();
     return soft_iou_backward(args);
   }
+  T range[2];
   args.iou = iou.data();
-  require_mask(args.target, args.batch * args.count);
+  args.target_range = range;
   soft_iou_forward(args);
+  require_mask(args);
   double sum = 0;
   for (T value : iou) sum += value;
   *loss = static_cast<T>(1 - sum / static_cast<double>(args.batch));

@@ -71,16 +71,13 @@ RasterizeLayers<T> read_layers(Call& call) {
   return args;
 }
 
-// The silhouette draws the face index map first.
 template <class T>
 void draw_silhouette(Call& call) {
-  const Rasterize<T> drawn = read_rasterize<T>(call);
-  SilhouetteForward<T> args{drawn.face_index,           drawn.mesh.batch, {},
-                            call.flag("anti_aliasing"), nullptr,          drawn.num_threads};
-  args.image = image_size(call, args.anti_aliasing);
+  Rasterize<T> args = read_rasterize<T>(call);
+  args.anti_aliasing = call.flag("anti_aliasing");
+  image_size(call, args.anti_aliasing);
   call.read("alpha [B, h, w]", args.alpha);
-  rasterize(drawn);
-  silhouette_forward(args);
+  rasterize(args);
 }
 
 template <class T>

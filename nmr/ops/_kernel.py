@@ -98,17 +98,18 @@ def _operator(
 ) -> Callable:
     """Registers a kernel, its fake (``allocate``) and its vmap rule: one call per item."""
     several = get_origin(returned) is tuple
-    names, first = list(hints), next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
+    first = next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
+    names = (*hints, *results)
 
     def run(*args):
-        device = args[first].device
-        if device.type != "cpu":
+        like = args[first]
+        if not like.is_cpu:
             outputs = run(*(x.cpu() if isinstance(x, Tensor) else x for x in args))
-            return tuple(x.to(device) for x in outputs) if several else outputs.to(device)
+            return tuple(x.to(like.device) for x in outputs) if several else outputs.to(like.device)
         outputs = allocate(*args)
-        given = dict(zip(names, args, strict=True))
+        values = (*args, *outputs) if several else (*args, outputs)
+        given = dict(zip(names, values, strict=True))
         wanted = given.pop("wanted", None)
-        given.update(zip(results, outputs if several else (outputs,), strict=True))
         if wanted is not None:
             given.update(
                 (result, None) for result, want in zip(results, wanted, strict=True) if not want
@@ -153,11 +154,12 @@ def _operator(
 
 def _gradient_is_wanted(args) -> bool:
     """In reverse mode, or in forward mode, which is an error."""
+    reverse, forward = torch.is_grad_enabled(), forward_ad._current_level >= 0
+    if not reverse and not forward:
+        return False
     tensors = [x for x in args if isinstance(x, Tensor)]
-    if torch.is_grad_enabled() and any([x.requires_grad for x in tensors]):
-        return True
-    return forward_ad._current_level >= 0 and any(
-        [forward_ad.unpack_dual(x).tangent is not None for x in tensors]
+    return (reverse and any([x.requires_grad for x in tensors])) or (
+        forward and any([forward_ad.unpack_dual(x).tangent is not None for x in tensors])
     )
 
 

@@ -92,7 +92,8 @@ struct Run {
     const RasterSettings<T> settings{raster, s.fill_back, s.near, s.far, s.perspective};
     int32_t* index = out<int32_t>("face_index", pixels);
     face_index = index;
-    rasterize(Rasterize<T>{mesh, settings, index, threads});
+    rasterize(
+        Rasterize<T>{mesh, settings, index, threads, out("alpha", image_pixels), s.anti_aliasing});
     const int64_t layers = 1 + seed % 3;
     rasterize_layers(RasterizeLayers<T>{mesh, settings, layers,
                                         out<int32_t>("layers", layers * pixels), threads});
@@ -129,8 +130,6 @@ struct Run {
   }
 
   void silhouettes() {
-    silhouette_forward(SilhouetteForward<T>{face_index, s.batch, s.image, s.anti_aliasing,
-                                            out("alpha", image_pixels), threads});
     SilhouetteBackward<T> args{mesh,
                                s.image,
                                s.anti_aliasing,
@@ -528,6 +527,7 @@ struct Run {
                           raster.pixels(),
                           areas,
                           out("iou", s.batch),
+                          out("target_range", 2),
                           in("grad_iou", s.batch),
                           out("grad_prediction", pixels),
                           out("grad_target", pixels),
@@ -710,7 +710,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
           "a face covers no centre outside its bounding box");
   }
   const std::vector<T>& alpha = r.get("alpha");
-  for (int64_t n = 0; n < scene.batch * image.pixels(); ++n) {
+  for (int64_t n = 0; n < scene.batch * image.pixels() && !foreign; ++n) {
     const int64_t step = scene.anti_aliasing ? 2 : 1, b = n / image.pixels(),
                   y = n / image.width % image.height, x = n % image.width;
     int covered = 0;
