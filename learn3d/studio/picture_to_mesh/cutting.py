@@ -41,7 +41,7 @@ _AWAY = 0.04  # gap between an object and its box, as a share of the object's si
 _SMALL_HOLE = 0.002  # smaller holes are filled, as a share of the object
 _TOUCHED = 0.03  # share of a side of the picture, from which the object touches it
 _PREFERRED = 0.05  # by which GrabCut from the whole region must be judged better
-_FILLED = 0.75  # share of its box, below which an object in a given box is not the whole one
+_EXTENT = 2  # weight of the share of its box that an object spans, against that of its own pixels
 _PROBABLE = -0.6  # mark of an object that is probably the right one
 _RECTANGLE = 0.9  # share of its box that an upright rectangle fills
 _UNLIKELY = 0.3  # by which the mark of such a rectangle is worse
@@ -76,7 +76,8 @@ def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None
     if box is not None:
         return Outline(cut_out(colors, box), "by GrabCut in the box")
     if is_plain(colors):
-        mask, how = threshold_mask(colors), "as all that differs from the plain background"
+        mask = _without_frame(colors, threshold_mask(colors), judge)
+        how = "as all that differs from the plain background"
     elif importlib.util.find_spec("rembg") is not None:
         mask = _ask_rembg(colors)
         how = "by rembg, which loads its weights from the internet at its first use"
@@ -159,9 +160,9 @@ def cut_out(colors: np.ndarray, box: Box | None = None, judge: Judge | None = No
 
     colors: uint8 [H, W, 3]. Pixels outside the box are background (default box: all but a narrow
     border). GrabCut starts with the pixels that are unlike the background at their height
-    (`_separate`). If the result is much smaller than that of a start with the whole box, that one
-    is taken. Without a box the largest parts are tried, each in a box of its own, and the `judge`
-    decides. Raises ValueError without OpenCV, or if the box exceeds or fills the picture.
+    (`_separate`), and in a given box once more with all pixels (`_cut_in`). Without a box the
+    largest parts are tried, each in a box of its own, and the `judge` decides. Raises ValueError
+    without OpenCV, or if the box exceeds or fills the picture.
     """
     height, width = colors.shape[:2]
     scale = min(1.0, SIDE / max(height, width))
@@ -185,26 +186,41 @@ def cut_out(colors: np.ndarray, box: Box | None = None, judge: Judge | None = No
         raise ValueError(
             "the box covers the whole picture; leave some background around the object"
         )
-    whole = _only_object(_grab_cut(small, region, region, _ROUNDS))
-    if box is None:
-        inside = _choose(small, region, whole, judge)
-    else:
-        inside = _only_object(_separate(small, region))
-        if _extent(inside) < _FILLED * _extent(whole):
-            inside = whole
+    inside = _choose(small, region, judge) if box is None else _cut_in(small, region)
     mask = Image.fromarray(255 * inside.astype(np.uint8)).resize(
         (width, height), Image.Resampling.BILINEAR
     )
     return 255 * (np.asarray(mask) > 127).astype(np.uint8)
 
 
-def _separate(colors: np.ndarray, region: np.ndarray) -> np.ndarray:
-    """Objects in a region, both bool [H, W]: GrabCut from the pixels that are unlike the background."""
-    unlike = _difference(colors, ~region)
-    least = max(1.5 * np.percentile(unlike[~region], 90), _LEAST)
-    limit = max(min(threshold_otsu(unlike[region].clip(max=_MOST)), _CLEAR), least)
-    inside = _grab_cut(colors, region & (unlike > limit), region, _ROUNDS_FROM_GUESS)
-    return inside | (ndimage.binary_fill_holes(inside) & (unlike > least))
+def _separate(colors: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Objects in a region, all bool [H, W]: GrabCut from the pixels that are unlike the background.
+
+    The second mask is that of all pixels that may be unlike the background.
+    """
+    difference = _difference(colors, ~region)
+    least = max(1.5 * np.percentile(difference[~region], 90), _LEAST)
+    limit = max(min(threshold_otsu(difference[region].clip(max=_MOST)), _CLEAR), least)
+    inside = _grab_cut(colors, region & (difference > limit), region, _ROUNDS_FROM_GUESS)
+    unlike = difference > least
+    return inside | (ndimage.binary_fill_holes(inside) & unlike), unlike
+
+
+def _cut_in(colors: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """The object that spans a region, both bool [H, W]: the better of two results of GrabCut.
+
+    One starts with the pixels that are unlike the background, the other with all pixels, in CIELAB
+    with twice the chroma. The better one spans the region and has few pixels like the background.
+    """
+    started, unlike = _separate(colors, region)
+    chromatic = (128 + (rgb2lab(colors) - [50, 0, 0]) * [1, 2, 2]).clip(0, 255).astype(np.uint8)
+
+    def mark(inside: np.ndarray) -> float:
+        share = unlike[inside].mean() if inside.any() else 0
+        return _EXTENT * _extent(inside) / np.count_nonzero(region) + share
+
+    results = started, _grab_cut(chromatic, region, region, _ROUNDS)
+    return max(map(_only_object, results), key=mark)
 
 
 def _parts(inside: np.ndarray) -> list[np.ndarray]:
@@ -296,18 +312,17 @@ def _without_frames(patches: np.ndarray, inside: np.ndarray) -> Iterator[np.ndar
             yield _only_object(rest)
 
 
-def _choose(
-    colors: np.ndarray, region: np.ndarray, whole: np.ndarray, judge: Judge | None
-) -> np.ndarray:
-    """The most probable object, bool [H, W], in a region: `whole`, or a part that is unlike the background.
+def _choose(colors: np.ndarray, region: np.ndarray, judge: Judge | None) -> np.ndarray:
+    """The most probable object, bool [H, W], in a region: all of it, or a part that is unlike the background.
 
     If none is probable, it is looked for once more beside these parts.
     """
+    whole = _only_object(_grab_cut(colors, region, region, _ROUNDS))
     patches = felzenszwalb(colors, scale=100, min_size=50) + 1
     masks, marks = [whole], [_mark(colors, whole, judge) - _PREFERRED]
     for _ in range(2):
-        for part in _parts(_separate(colors, region)):
-            mask = _only_object(_separate(colors, _around(part)))
+        for part in _parts(_separate(colors, region)[0]):
+            mask = _only_object(_separate(colors, _around(part))[0])
             for candidate in (mask, *_without_frames(patches, mask)):
                 masks.append(candidate)
                 marks.append(_mark(colors, candidate, judge))
@@ -317,13 +332,25 @@ def _choose(
     return masks[int(np.argmax(marks))]
 
 
+def _without_frame(colors: np.ndarray, mask: np.ndarray, judge: Judge | None) -> np.ndarray:
+    """A mask uint8 [H, W], or its most probable part if the largest is an upright rectangle: a picture on the wall."""
+    parts = _parts(mask > 127)
+    if len(parts) < 2 or not _is_rectangle(parts[0]):
+        return mask
+    return 255 * max(parts, key=lambda part: _mark(colors, part, judge)).astype(np.uint8)
+
+
+def _is_rectangle(inside: np.ndarray) -> bool:
+    """Whether a mask, bool [H, W], fills its box."""
+    return np.count_nonzero(inside) > _RECTANGLE * _extent(inside)
+
+
 def _mark(colors: np.ndarray, inside: np.ndarray, judge: Judge | None) -> float:
     """How probably a mask, bool [H, W], is the object's: near the centre and known to the judge, or else large."""
     if not inside.any():
         return -math.inf
     mark = judge(colors, 255 * inside.astype(np.uint8)) if judge else float(inside.mean())
-    is_rectangle = np.count_nonzero(inside) > _RECTANGLE * _extent(inside)
-    return mark - _OFF_CENTRE * _offset(inside) - _UNLIKELY * is_rectangle
+    return mark - _OFF_CENTRE * _offset(inside) - _UNLIKELY * _is_rectangle(inside)
 
 
 def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.ndarray:

@@ -57,6 +57,35 @@ def test_a_box_must_leave_some_background(scene, box) -> None:
         cut_out(scene[0], box)
 
 
+@pytest.mark.parametrize("part", ["half", "more"])
+def test_a_box_takes_the_better_result(scene, part, monkeypatch) -> None:
+    pytest.importorskip("cv2", reason="needs the extra photos")
+    colors, inside = scene
+    box = (96, 66, 188, 188)
+    separate = cutting._separate
+
+    def fail(seen: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Half of the object, or the object and half of the background in the box."""
+        found, unlike = separate(seen, region)
+        left = np.arange(seen.shape[1]) < 190 * seen.shape[1] / 400
+        return (found & left if part == "half" else found | (region & left)), unlike
+
+    monkeypatch.setattr(cutting, "_separate", fail)
+    assert overlap(cut_out(colors, box), inside) > 0.93
+
+
+def test_a_picture_on_a_plain_wall_is_left_out() -> None:
+    y, x = np.mgrid[:300, :400]
+    disc = np.hypot(x - 230, y - 180) < 50
+    colors = np.full((300, 400, 3), 230, np.uint8)
+    colors[30:120, 40:170] = (60, 110, 70)
+    colors[disc] = (140, 40, 45)
+    assert is_plain(colors) and overlap(find_outline(colors).mask, disc) > 0.98
+    colors[disc] = 230
+    alone = find_outline(colors).mask > 127
+    assert alone[30:120, 40:170].all() and alone.sum() == 90 * 130, "a rectangle may be the object"
+
+
 def test_plain_backgrounds_need_no_opencv(scene, monkeypatch) -> None:
     colors, inside = scene
     plain = np.where(inside[..., None], colors, np.uint8(230))
