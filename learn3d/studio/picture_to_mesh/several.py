@@ -8,7 +8,7 @@ outlines contain it, and likely shapes contain it or an outline needs it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,6 @@ from scipy import ndimage
 from torch import Tensor
 
 import nmr
-from learn3d.data.poses import wrap_deg
 from learn3d.networks.encoders import CENTRED_SIZE
 from learn3d.pictures import grid_surface
 from learn3d.studio.picture_to_mesh.fit import (
@@ -50,7 +49,7 @@ MODES = 4  # azimuths that are tried for each picture
 LAYOUTS = 64  # likeliest layouts of all cameras whose outlines are compared
 COARSE = 32  # cells along each side of the grid for that, and pixels of its masks
 WIDENED = 0.4  # cells of that grid by which the outlines are widened
-CELLS, BOX = 88, 1.2  # cells along each side of the grid, and its side in the object frame
+CELLS, BOX = 80, 1.1  # cells along each side of the grid, and its side in the object frame
 ROOM = 0.2  # distance from the box of the bent template up to which the object reaches
 LIKELY = 0.4  # probability above which a cell is kept if all outlines contain it
 NEEDED = 0.9  # share of the largest probability on a line of sight from which a cell is kept, too
@@ -59,19 +58,10 @@ BLURS = (1.0, 5.0)  # cells by which probabilities are blurred, for likely and f
 FAR = 0.1  # weight of the second ones
 LOSS = 0.03  # share of the outlines that an object mirrored in x may leave uncovered
 SHARPNESS = 0.1  # differences of two shapes' scores that make one e times as likely
-SLACKS = (0.3, 0.7)  # cells by which the outlines are widened; the shape most like them is taken
-FITTED = 4  # best layouts, whose cameras are fitted
-COARSE_FIT = (
-    COARSE,
-    16,
-    0.03,
-)  # cells along each side of the grid, steps and learning rate for that
-FINE_FIT = (64, 20, 0.01)  # and for the cameras of the layout that agrees best
-SOFTNESS = 0.35  # cells of the grid over which the edge of a hull is blurred, for gradients
-CROWDED = 0.25  # cost of a layout whose cameras all stand at the same side
-EQUALLY_HIGH = 0.03  # cost of elevations with a standard deviation of ten degrees
-# cost of cameras ten degrees above or below those of a person before furniture
-USUALLY_HIGH, USUAL_DEG = 0.02, 25.0
+# cells by which the outlines are widened while the cameras are fitted, in two tries
+SLACKS = ((1.0,), (2.0, 1.0))
+LAST_SLACKS = (0.3, 0.7)  # and afterwards; the most alike of all shapes is taken
+CAMERA_STEPS = 15  # steps of the cameras between two rounds
 # mean outline IoU from which the bent template is taken, which has straighter parts
 STRAIGHT = 0.85
 COLORS = 5.0  # weight of the distance of two pictures' colours; that of their codes is 1
@@ -161,96 +151,60 @@ def fit_several(
     found = found.select(
         (alike.mean(0) + found.prior).topk(min(SEEN, len(found.prior))).indices.tolist()
     )
+    beliefs = [each.azimuths for each in predicted]
+    looks = [
+        _look_around(shape, faces, masks, beliefs, known)
+        for shape, faces in zip(found.shapes, found.faces, strict=True)
+    ]
+    scores, views = zip(*looks, strict=True)
     if known is None:
-        beliefs = [each.azimuths for each in predicted]
-        looks = [
-            _look_around(shape, faces, masks, beliefs)
-            for shape, faces in zip(found.shapes, found.faces, strict=True)
-        ]
-        scores, views = zip(*looks, strict=True)
-        known = _find_cameras(torch.stack(scores), views, found.prior, distances, masks)
-    seen = found.prior + torch.stack(
-        [
-            known.ious(shape[None], faces, masks).mean()
-            for shape, faces in zip(found.shapes, found.faces, strict=True)
-        ]
-    )
+        scores = _agree(torch.stack(scores), views, found.prior, distances, masks)
+    rows, values = zip(*map(_choose_views, scores), strict=True)
+    seen = torch.stack(values) + found.prior
     best = seen.topk(min(STRETCHED, len(seen))).indices.tolist()
     progress("stretch", 0.5)
+    chosen = [views[row].select(rows[row]) for row in best]
     found = found.select(best)
-    fitted = _fit_template(found, known, masks, free)
-    view, bent = fitted.view, fitted.bent
-    faces, kind = found.faces[fitted.best], found.kinds[fitted.best]
+    stretched, shapes, cost = stretch(_join(chosen), found.shapes, found.faces, masks, free)
+    alike = likeness(
+        stretched, _repeat(shapes, len(masks)), _repeat(found.faces, len(masks)), masks
+    )
+    total = (alike + _believe(stretched, beliefs)).view(len(best), -1).mean(1) + found.prior - cost
+    one = int(total.argmax())
+    found = found._replace(shapes=shapes)
     progress("surface", 0.7)
+    likely = _average(found, ((total - total[one]) / SHARPNESS).softmax(0))
+    rows = one * len(masks) + torch.arange(len(masks))
+    view = stretched.select(rows)
+    faces = found.faces[one]
+    view, bent = bend(view, shapes[one], faces, masks, free)
     ious = view.ious(bent[None], faces, masks)
     is_template = float(ious.mean()) > STRAIGHT
     if not is_template:
-        if free:  # a shape is carved by the cameras whose outlines agree
-            fitted = _fit_template(found, known, masks, 0)
-            view, bent, faces = fitted.view, fitted.bent, found.faces[fitted.best]
-        move = _Centring.of(bent)
-        view, bent = move.view(view), move(bent)
-        found = found._replace(shapes=[move(shape) for shape in fitted.shapes])
-        likely = _average(found, (fitted.scores / SHARPNESS).softmax(0))
         likely = (likely + _fill(bent, faces)) / 2
-        carved = _carve_out(view, masks, distances, likely, bent)
+        carved = _carve_out(view, masks, distances, likely, bent, free)
         if carved is not None:
-            bent, faces = carved
+            view, bent, faces = carved
+            ious = view.ious(bent[None], faces, masks)
         is_template = carved is None
-        ious = view.ious(bent[None], faces, masks)
-    move = _Centring.of(bent)
-    view, bent = move.view(view), move(bent)
-    return SeveralFit(bent, faces, view, ious, kind, is_template)
-
-
-class _FittedTemplate(NamedTuple):
-    """K candidates, stretched to the outlines of N pictures, and the best of them, bent."""
-
-    shapes: list[Tensor]  # K tensors float32 [V_k, 3], stretched
-    scores: Tensor  # float32 [K]
-    best: int  # row of the best one
-    view: View  # N views
-    bent: Tensor  # float32 [V, 3], the best one
-
-
-def _fit_template(found: Candidates, view: View, masks: Tensor, free: int) -> _FittedTemplate:
-    """Stretch candidates to masks [N, 64, 64], and bend the best. free: see `minimize`."""
-    shapes, faces, count = found.shapes, found.faces, len(masks)
-    views = view.select(torch.arange(count).repeat(len(shapes)))
-    views, shapes, cost = stretch(views, shapes, faces, masks, free)
-    alike = likeness(views, _repeat(shapes, count), _repeat(faces, count), masks)
-    scores = alike.view(-1, count).mean(1) + found.prior - cost
-    best = int(scores.argmax())
-    view = views.select(best * count + torch.arange(count))
-    return _FittedTemplate(
-        shapes, scores, best, *bend(view, shapes[best], faces[best], masks, free)
-    )
-
-
-class _Centring(NamedTuple):
-    """The move of a shape's box to the origin, and the scale at which its longest side becomes 1."""
-
-    centre: Tensor
-    scale: float
-
-    @classmethod
-    def of(cls, vertices: Tensor) -> _Centring:
-        low, high = vertices.amin(0), vertices.amax(0)
-        return cls((low + high) / 2, 1 / float((high - low).max()))
-
-    def __call__(self, vertices: Tensor) -> Tensor:
-        return self.scale * (vertices - self.centre)
-
-    def view(self, view: View) -> View:
-        """The cameras from which the moved shape looks as before."""
-        shift = self.scale * (view.shift + view.axes()[:, :2] @ self.centre)
-        return view._replace(log_distance=view.log_distance + math.log(self.scale), shift=shift)
+    centre = (bent.amin(0) + bent.amax(0)) / 2
+    size = 1 / float((bent.amax(0) - bent.amin(0)).max())  # the longest side becomes 1
+    moved = view.shift + (view.axes()[:, :2] @ centre)
+    view = view._replace(log_distance=view.log_distance + math.log(size), shift=size * moved)
+    return SeveralFit(size * (bent - centre), faces, view, ious, found.kinds[one], is_template)
 
 
 def _look_around(
-    vertices: Tensor, faces: Tensor, masks: Tensor, beliefs: Sequence[Tensor | None]
+    vertices: Tensor,
+    faces: Tensor,
+    masks: Tensor,
+    beliefs: Sequence[Tensor | None],
+    known: View | None,
 ) -> tuple[Tensor, View]:
     """Scores [M, N] of a shape in M views as explanations of N masks, and the views."""
+    if known is not None:
+        scores = _all_ious(known, vertices, faces, masks)
+        return torch.where(torch.eye(len(masks), dtype=torch.bool), scores, -1.0), known
     azimuths = -180 + (torch.arange(AZIMUTHS) + 0.5) * (360 / AZIMUTHS)
     grid = torch.cartesian_prod(azimuths, torch.tensor(ELEVATIONS_DEG))
     views = frame_view(vertices, grid[:, 0], grid[:, 1])
@@ -258,87 +212,61 @@ def _look_around(
     return _all_ious(views, vertices, faces, masks) + bonus, views
 
 
-def _find_cameras(
+def _agree(
     scores: Tensor, views: Sequence[View], prior: Tensor, distances: Tensor, masks: Tensor
-) -> View:
-    """The cameras of N pictures from which their outlines contradict each other least.
+) -> Tensor:
+    """Scores [K, M, N] without azimuths at which the outlines of the N pictures contradict each other.
 
-    The scores [K, M, N] of K candidates give each picture its likeliest azimuths. The best of the
-    likeliest layouts of all cameras are fitted, until their outlines, together with the mirrored
-    ones, carve away as little as possible of each other.
+    The scores of K candidates give each picture its likeliest azimuths. Of the likeliest layouts
+    of all cameras, that one is taken whose outlines, together with the mirrored ones, carve away
+    least of each other.
     """
-    levels, count = len(ELEVATIONS_DEG), len(masks)
-    chances = (torch.stack([_explained(each) for each in scores]) + prior) / AGREEMENT
+    levels = len(ELEVATIONS_DEG)
+    chances = (torch.stack([_choose_views(each)[1] for each in scores]) + prior) / AGREEMENT
     mean = torch.einsum("k,kmn->mn", chances.softmax(0), scores)
     best, level = mean.view(AZIMUTHS, levels, -1).max(1)
     is_mode = (best >= best.roll(1, 0)) & (best >= best.roll(-1, 0))
     values, modes = torch.where(is_mode, best, best - 1).topk(MODES, 0)
     rows = (modes * levels + level.gather(0, modes)).T.flatten()
     view = views[int(chances.argmax())].select(rows)
-    choices = torch.cartesian_prod(*[torch.arange(MODES)] * count)
+    small = F.interpolate(masks[:, None], COARSE, mode="area")[:, 0]
+    sight = _Sight.of(
+        view,
+        distances.repeat_interleave(MODES, 0) * (COARSE / CELLS),
+        small.repeat_interleave(MODES, 0),
+        COARSE,
+    )
+    choices = torch.cartesian_prod(*[torch.arange(MODES)] * len(masks))
     score = values.gather(0, choices).mean(1)
-    likely = score.topk(min(LAYOUTS, len(score))).indices
-    layouts = MODES * torch.arange(count) + choices[likely]
-    score = score[likely]
-    small = F.interpolate(masks[:, None], COARSE, mode="area")[:, 0].repeat_interleave(MODES, 0)
-    scale = COARSE / CELLS
-    sight = _Sight.of(view, scale * distances.repeat_interleave(MODES, 0), small, COARSE)
-    chosen = [sight.select(layout) for layout in layouts]
-    covered = torch.stack([each.covered((each.hull() > 0).float()) for each in chosen])
-    promise = score + covered - CROWDED * _crowding(view.azimuth_deg[layouts])
-    best, found = -math.inf, view
-    for row in promise.topk(min(FITTED, len(score))).indices.tolist():
-        fitted = _fit_cameras(view.select(layouts[row]), distances, masks, *COARSE_FIT)
-        contradiction = _disagree(fitted, distances, masks, COARSE)
-        crowding = _crowding(fitted.azimuth_deg[None])[0]
-        agreement = float(score[row] - 2 * contradiction - CROWDED * crowding)
-        if agreement > best:
-            best, found = agreement, fitted
-    return _fit_cameras(found, distances, masks, *FINE_FIT)
+    likely = score.topk(min(LAYOUTS, len(score))).indices.tolist()
+    first = MODES * torch.arange(len(masks))
+
+    def agreement(layout: int) -> float:
+        chosen = sight.select(first + choices[layout])
+        hull = chosen.inside.amin(0) + WIDENED
+        return float(score[layout]) + chosen.covered(torch.minimum(hull, hull.flip(0)) > 0)
+
+    layout = max(likely, key=agreement)
+    azimuth = modes.gather(0, choices[layout][None])[0]
+    apart = (torch.arange(AZIMUTHS)[:, None] - azimuth).abs()
+    near = torch.minimum(apart, AZIMUTHS - apart) <= 1
+    return torch.where(near.repeat_interleave(levels, 0), scores, scores - 1)
 
 
-def _crowding(azimuths_deg: Tensor) -> Tensor:
-    """How much nearer the N cameras of each of L layouts [L, N] are than if they stood all around, [L]."""
-    sector = 360 / azimuths_deg.shape[1]
-    apart = wrap_deg(azimuths_deg[:, :, None] - azimuths_deg[:, None]).abs()
-    nearest = (apart + 360 * torch.eye(azimuths_deg.shape[1])).amin(2)
-    return (0.75 - nearest / sector).clamp(min=0).mean(1)
-
-
-def _fit_cameras(
-    view: View, distances: Tensor, masks: Tensor, cells: int, steps: int, rate: float
-) -> View:
-    """The cameras near `view` whose outlines agree best. They are held about equally high."""
-
-    def loss(view: View) -> Tensor:
-        height = view.elevation_deg / 10
-        unusual = (height - USUAL_DEG / 10).square().mean()
-        return (
-            _disagree(view, distances, masks, cells)
-            + EQUALLY_HIGH * height.var(correction=0)
-            + USUALLY_HIGH * unusual
-        )
-
-    return minimize(loss, view, steps, (rate,))
-
-
-def _disagree(view: View, distances: Tensor, masks: Tensor, cells: int) -> Tensor:
-    """The share of the masks that the cells within all outlines, and all mirrored ones, leave uncovered."""
-    small = F.interpolate(masks[:, None], cells, mode="area")[:, 0]
-    sight = _Sight.of(view, distances * (cells / CELLS), small, cells)
-    return 1 - sight.covered((sight.hull() / SOFTNESS).sigmoid())
-
-
-def _explained(scores: Tensor) -> Tensor:
-    """The mean of the best scores of N pictures, from scores [M, N] in views from all sides.
+def _choose_views(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """The best view of each of N pictures by scores [M, N], int64 [N], and the mean of their scores.
 
     Who walks around an object holds the camera about equally high, so elevations that differ cost
     something.
     """
     levels = len(ELEVATIONS_DEG)
+    if len(scores) != AZIMUTHS * levels:  # the views are known
+        return scores.argmax(0), scores.amax(0).mean()
     apart = (torch.arange(levels)[:, None] - torch.arange(levels)).abs()
     costs = scores.view(AZIMUTHS, levels, 1, -1) - APART * apart[:, :, None]
-    return costs.amax((0, 1)).mean(1).max()
+    best, rows = costs.flatten(0, 1).max(0)
+    common = int(best.mean(1).argmax())
+    return rows[common], best[common].mean()
 
 
 def _guess(found: Candidates, view: View, mask: Tensor) -> Tensor:
@@ -353,6 +281,16 @@ def _all_ious(views: View, vertices: Tensor, faces: Tensor, masks: Tensor) -> Te
     drawn, wanted = views.silhouettes(vertices[None], faces).flatten(1), masks.flatten(1)
     both = drawn @ wanted.T
     return both / (drawn.sum(1, keepdim=True) + wanted.sum(1) - both).clamp(min=1e-6)
+
+
+def _believe(views: View, beliefs: Sequence[Tensor | None]) -> Tensor:
+    """The bonus [K N] of each view, where view k N + n belongs to picture n."""
+    azimuths = views.azimuth_deg.view(-1, len(beliefs)).unbind(1)
+    return torch.stack([belief(*each) for each in zip(azimuths, beliefs, strict=True)], 1).flatten()
+
+
+def _join(views: Sequence[View]) -> View:
+    return View(*(torch.cat(parts) for parts in zip(*views, strict=True)))
 
 
 def _repeat(shapes: Sequence[Tensor], count: int) -> list[Tensor]:
@@ -393,15 +331,10 @@ class _Sight(NamedTuple):
         values = values.flatten().expand_as(self.pixel)
         return largest.scatter_reduce(1, self.pixel, values, "amax")[:, :-1]
 
-    def covered(self, cells: Tensor) -> Tensor:
-        """The mean share of the masks that cells [s, s, s], which count 0 .. 1, cover."""
-        both = (self.project(cells) * self.wanted).sum(1)
-        return (both / self.wanted.sum(1)).mean()
-
-    def hull(self) -> Tensor:
-        """Distance [s, s, s] to the common hull of the widened outlines and the mirrored ones, positive inside."""
-        hull = self.inside.amin(0) + WIDENED
-        return torch.minimum(hull, hull.flip(0))
+    def covered(self, cells: Tensor) -> float:
+        """The mean share of the masks that cells [s, s, s], bool, cover."""
+        both = (self.project(cells.float()) * self.wanted).sum(1)
+        return float((both / self.wanted.sum(1)).mean())
 
 
 def _distances(outlines: Tensor) -> Tensor:
@@ -431,20 +364,34 @@ def _average(found: Candidates, weights: Tensor) -> Tensor:
 
 
 def _carve_out(
-    view: View, masks: Tensor, distances: Tensor, likely: Tensor, bent: Tensor
-) -> tuple[Tensor, Tensor] | None:
-    """Vertices and faces of the carved shape that is most like the masks; None if no cell is left."""
-    sight = _Sight.of(view, distances, masks)
+    view: View, masks: Tensor, distances: Tensor, likely: Tensor, bent: Tensor, free: int
+) -> tuple[View, Tensor, Tensor] | None:
+    """Carve shapes, and fit the cameras to them. Returns the one most like the masks.
+
+    None if no cell is left. free: see `minimize`.
+    """
     best, found = -math.inf, None
-    for slack in SLACKS:
-        mesh = _carve(sight, likely, bent, slack)
-        if mesh is not None:
-            vertices, faces = smooth(*mesh, rounds=3), mesh[1]
-            shapes = ([each] * len(masks) for each in (vertices, faces))
-            alike = float(likeness(view, *shapes, masks).mean())
-            if alike > best:
-                best, found = alike, (vertices, faces)
+    for slacks in SLACKS if free else ((),):
+        fitted = view
+        for slack in slacks:
+            mesh = _carve(_Sight.of(fitted, distances, masks), likely, bent, slack)
+            if mesh is not None:
+                misfit = _misfit(*mesh, masks)
+                fitted = minimize(misfit, fitted, CAMERA_STEPS, (0.01,), free=free)
+        sight = _Sight.of(fitted, distances, masks)
+        for slack in LAST_SLACKS:
+            mesh = _carve(sight, likely, bent, slack)
+            if mesh is not None:
+                vertices, faces = smooth(*mesh, rounds=3), mesh[1]
+                shapes = ([each] * len(masks) for each in (vertices, faces))
+                alike = float(likeness(fitted, *shapes, masks).mean())
+                if alike > best:
+                    best, found = alike, (fitted, vertices, faces)
     return found
+
+
+def _misfit(vertices: Tensor, faces: Tensor, masks: Tensor) -> Callable[[View], Tensor]:
+    return lambda view: -view.ious(vertices[None], faces, masks).sum()
 
 
 def _carve(
@@ -463,8 +410,7 @@ def _carve(
     room = torch.minimum(torch.minimum(x[:, None, None], y[:, None]), z)
     hull = torch.minimum(sight.inside.amin(0) + slack, room)
     mirrored = torch.minimum(hull, hull.flip(0))
-    symmetric, plain = (sight.covered((each > -0.5).float()) for each in (mirrored, hull))
-    is_symmetric = bool(symmetric > plain - LOSS)
+    is_symmetric = sight.covered(mirrored > -0.5) > sight.covered(hull > -0.5) - LOSS
     if is_symmetric:
         hull, likely = mirrored, (likely + likely.flip(0)) / 2
     near, far = (torch.from_numpy(ndimage.gaussian_filter(likely.numpy(), each)) for each in BLURS)
