@@ -154,7 +154,7 @@ void rasterize(const Rasterize<T>& args) {
       Band<T> band{n * (H / scale) / bands * scale,
                    (n + 1) * (H / scale) / bands * scale - 1,
                    raster,
-                   W + 3 * kLanes,
+                   W + 3 * kLanes,  // with one kLanes, rows of 1024 floats share cache lines
                    scratch.columns.data(),
                    scratch.rows.data(),
                    nullptr,

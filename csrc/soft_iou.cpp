@@ -13,7 +13,7 @@ namespace {
 constexpr int64_t kValueChunk = 4096;              // a multiple of 16
 constexpr int64_t kTaskValues = 16 * kValueChunk;  // of a pair of images, that one task reads
 
-// Partial sums of a chunk, and the range of the target and of 0 .. 1.
+// The sums over a chunk, lane by lane, and its smallest and largest target (at most 0, at least 1).
 template <class T>
 struct ChunkSums {
   T product[2 * kLanes], sum[2 * kLanes];  // of p t, and of p + t

@@ -148,7 +148,7 @@ struct RasterSettings {
   bool perspective = true;  // see Fragments
 };
 
-// Which face is nearest at each pixel, and the silhouette (rasterize.cpp).
+// The nearest face at each pixel, and the share of each pixel that is covered (rasterize.cpp).
 template <class T>
 struct Rasterize {
   MeshBatch<T> mesh;

@@ -209,8 +209,9 @@ def _separate(colors: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.nd
 def _cut_in(colors: np.ndarray, region: np.ndarray) -> np.ndarray:
     """The object that spans a region, both bool [H, W]: the better of two results of GrabCut.
 
-    One starts with the pixels that are unlike the background, the other with all pixels, in CIELAB
-    with twice the chroma. The better one spans the region and has few pixels like the background.
+    The first GrabCut starts from the pixels that are unlike the background. The second starts from
+    the whole region, and its colours are CIELAB with twice the chroma. The better result spans more
+    of the region and has fewer pixels that are like the background.
     """
     started, unlike = _separate(colors, region)
     chromatic = (128 + (rgb2lab(colors) - [50, 0, 0]) * [1, 2, 2]).clip(0, 255).astype(np.uint8)
