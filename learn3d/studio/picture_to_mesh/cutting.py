@@ -76,8 +76,11 @@ def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None
     if box is not None:
         return Outline(cut_out(colors, box), "by GrabCut in the box")
     if is_plain(colors):
-        mask = _without_frame(colors, threshold_mask(colors), judge)
+        whole = threshold_mask(colors)
+        mask = _without_frame(colors, whole, judge)
         how = "as all that differs from the plain background"
+        if mask is not whole:
+            how = f"{how} but for an upright rectangle, probably a picture on the wall"
     elif importlib.util.find_spec("rembg") is not None:
         mask = _ask_rembg(colors)
         how = "by rembg, which loads its weights from the internet at its first use"
@@ -334,11 +337,12 @@ def _choose(colors: np.ndarray, region: np.ndarray, judge: Judge | None) -> np.n
 
 
 def _without_frame(colors: np.ndarray, mask: np.ndarray, judge: Judge | None) -> np.ndarray:
-    """A mask uint8 [H, W], or its most probable part if the largest is an upright rectangle: a picture on the wall."""
+    """The mask uint8 [H, W], or another part of it if the largest is an upright rectangle and less probable."""
     parts = _parts(mask > 127)
     if len(parts) < 2 or not _is_rectangle(parts[0]):
         return mask
-    return 255 * max(parts, key=lambda part: _mark(colors, part, judge)).astype(np.uint8)
+    best = max(parts, key=lambda part: _mark(colors, part, judge))
+    return mask if best is parts[0] else 255 * best.astype(np.uint8)
 
 
 def _is_rectangle(inside: np.ndarray) -> bool:

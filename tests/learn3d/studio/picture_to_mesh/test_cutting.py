@@ -80,7 +80,9 @@ def test_a_picture_on_a_plain_wall_is_left_out() -> None:
     colors = np.full((300, 400, 3), 230, np.uint8)
     colors[30:120, 40:170] = (60, 110, 70)
     colors[disc] = (140, 40, 45)
-    assert is_plain(colors) and overlap(find_outline(colors).mask, disc) > 0.98
+    found = find_outline(colors)
+    assert is_plain(colors) and overlap(found.mask, disc) > 0.98
+    assert "picture on the wall" in found.how
     colors[disc] = 230
     alone = find_outline(colors).mask > 127
     assert alone[30:120, 40:170].all() and alone.sum() == 90 * 130, "a rectangle may be the object"
