@@ -16,6 +16,7 @@ from typing import Optional, ParamSpec, TypeVar, get_args, get_origin, get_type_
 
 import torch
 from torch import Tensor
+from torch._C._functorch import unwrap_if_dead
 from torch.autograd import forward_ad
 
 try:
@@ -99,7 +100,8 @@ def _operator(
     """Registers a kernel, its fake (``allocate``) and its vmap rule: one call per item."""
     several = get_origin(returned) is tuple
     first = next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
-    names = (*hints, *results)
+    has_wanted = "wanted" in hints  # the last argument: the results that the kernel is to compute
+    names = (*(hint for hint in hints if hint != "wanted"), *results)
 
     def run(*args):
         like = args[first]
@@ -107,13 +109,11 @@ def _operator(
             outputs = run(*(x.cpu() if isinstance(x, Tensor) else x for x in args))
             return tuple(x.to(like.device) for x in outputs) if several else outputs.to(like.device)
         outputs = allocate(*args)
-        values = (*args, *outputs) if several else (*args, outputs)
-        given = dict(zip(names, values, strict=True))
-        wanted = given.pop("wanted", None)
-        if wanted is not None:
-            given.update(
-                (result, None) for result, want in zip(results, wanted, strict=True) if not want
-            )
+        found = outputs if several else (outputs,)
+        if has_wanted:
+            *args, wanted = args
+            found = [x if want else None for x, want in zip(found, wanted, strict=True)]
+        given = dict(zip(names, (*args, *found), strict=True))
         getattr(_C, name)(**given, num_threads=torch.get_num_threads())
         return outputs
 
@@ -157,10 +157,13 @@ def _gradient_is_wanted(args) -> bool:
     reverse, forward = torch.is_grad_enabled(), forward_ad._current_level >= 0
     if not reverse and not forward:
         return False
-    tensors = [x for x in args if isinstance(x, Tensor)]
-    return (reverse and any([x.requires_grad for x in tensors])) or (
-        forward and any([forward_ad.unpack_dual(x).tangent is not None for x in tensors])
-    )
+    for x in args:
+        if isinstance(x, Tensor) and (
+            (reverse and x.requires_grad)
+            or (forward and forward_ad.unpack_dual(x).tangent is not None)
+        ):
+            return True
+    return False
 
 
 def _add_gradient(
@@ -174,18 +177,18 @@ def _add_gradient(
     """Registers the operator of the gradients, and with it the gradient of ``forward``."""
     names, count = list(hints), len(hints)
     tensors = [k for k, name in enumerate(names) if hints[name] in (Tensor, _MAYBE)]
-    numbers = [k for k in range(count) if k not in tensors]
     of = [names.index(name) for name in gradients]
     kept = [k for k, name in enumerate(results) if name in (*keep, *constant)]
     without = [k for k, name in enumerate(results) if name in constant]
     upstream = [k for k in range(len(results)) if k not in without]
 
     def allocate(*args):
-        wanted = args[-1]
         like = next(x for x in args if isinstance(x, Tensor))
-        inputs = [args[k] if want else None for k, want in zip(of, wanted, strict=True)]
-        grads = tuple(like.new_empty(0) if x is None else x.new_empty(x.shape) for x in inputs)
-        return grads if len(of) > 1 else grads[0]
+        grads = [
+            args[k].new_empty(args[k].shape) if want else like.new_empty(0)
+            for k, want in zip(of, args[-1], strict=True)
+        ]
+        return tuple(grads) if len(of) > 1 else grads[0]
 
     # A gradient is None if a result is not used.
     added = {results[k]: Tensor for k in kept}
@@ -203,16 +206,16 @@ def _add_gradient(
         if without:
             ctx.mark_non_differentiable(*(outputs[k] for k in without))
         ctx.save_for_backward(*(inputs[k] for k in tensors), *(outputs[k] for k in kept))
-        ctx.numbers = [inputs[k] for k in numbers]
+        ctx.arguments = [None if k in tensors else value for k, value in enumerate(inputs)]
 
     def pull(ctx, *grads):
         grads, wanted = [grads[k] for k in upstream], [ctx.needs_input_grad[k] for k in of]
         found: list[Tensor | None] = [None] * count
-        if any(wanted) and any(grad is not None for grad in grads):
-            arguments, saved = [None] * count, ctx.saved_tensors
-            for k, value in zip(
-                (*tensors, *numbers), (*saved[: len(tensors)], *ctx.numbers), strict=True
-            ):
+        if any(wanted) and any([grad is not None for grad in grads]):
+            # a pullback of torch.func.vjp runs after the transform whose wrappers it has saved
+            saved = [x if x is None else unwrap_if_dead(x) for x in ctx.saved_tensors]
+            arguments = list(ctx.arguments)
+            for k, value in zip(tensors, saved, strict=False):
                 arguments[k] = value
             grads = backward(*arguments, *saved[len(tensors) :], *grads, wanted)
             for k, want, grad in zip(of, wanted, (grads,) if len(of) == 1 else grads, strict=True):
@@ -271,11 +274,13 @@ def _register_autograd(operator: Callable, backward: Callable, set_up: Callable)
 
     def function(**parts):
         parts = {part: staticmethod(code) for part, code in parts.items()}
-        return type(name, (torch.autograd.Function,), parts).apply
+        return type(name, (torch.autograd.Function,), parts)
 
     # torch binds the arguments of a Function with setup_context by its signature, which takes
-    # longer than the kernel of a small mesh. Only torch.func needs that form.
-    operator.direct = function(forward=forward_with_context, backward=backward, jvp=jvp)
+    # longer than the kernel of a small mesh. Only torch.func needs that form, and the apply of
+    # Function, which prepares for it.
+    direct = function(forward=forward_with_context, backward=backward, jvp=jvp)
+    operator.direct = super(torch.autograd.Function, direct).apply
     operator.transformed = function(
         forward=forward, setup_context=set_up, backward=backward, jvp=jvp, vmap=operator.vmap
-    )
+    ).apply
