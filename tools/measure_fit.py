@@ -51,9 +51,13 @@ def main(models: Path, category: str, run: Path | None = None, images: int = 48)
             colors, lights = natural_look(vertices.numpy(), mesh.faces, rng)
             look = {"image_size": 256, "lights": lights}
             (rgb,), (alpha,) = photograph(vertices, mesh.faces, colors, pose.cameras(), **look)
-            mask = reduce_mask(enlarge(rgb, alpha)[3])
+            framed = enlarge(rgb, alpha)
+            mask = reduce_mask(framed[3])
             predicted = predict(model.method, torch.from_numpy(model.prepare(rgb, alpha)), mask)
-            template, kind = next(fit_template(model.templates, model.categories, predicted, mask))
+            pictures = framed, mask
+            template, kind = next(
+                fit_template(model.templates, model.categories, predicted, *pictures)
+            )
             boxed = template._replace(
                 vertices=torch.from_numpy(fit_to_box(template.vertices.numpy()))
             )

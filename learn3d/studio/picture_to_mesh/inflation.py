@@ -1,21 +1,25 @@
 """Inflates the outline of a picture to a smooth shape with the picture on it, for objects of unknown kinds."""
 
+import math
+
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy import ndimage
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from learn3d.pictures import Surface, Texture, grid_surface
-from learn3d.studio.picture_to_mesh.fit import View, frame_view
+from learn3d.studio.picture_to_mesh.fit import HALF_FOV_DEG, View
 from learn3d.studio.picture_to_mesh.smoothing import smooth
 
 CELLS = 72  # cells along each side of the grid in which the surface lies
 DEPTH = 0.8  # thickness of the shape of a disc, over the disc's diameter
 _EDGE = 2  # pixels inside the outline that may have the background's colours
 _ROUNDS = 4  # of smoothing
-_SOLID = 0.2  # share of inner cells, up to which all cells that the object touches belong to it
+_THIN = 3  # pixels from the middle of a part to its sides, up to which it is thin
+_HALF = 2  # pixels of half a cell
 
 
 @torch.no_grad()
@@ -26,17 +30,20 @@ def inflate(picture: np.ndarray) -> tuple[Surface, View]:
     Laplace(u) = -4 within, the surface is where z^2 = DEPTH^2 u, so that a disc becomes an
     ellipsoid. Both sides show the picture.
     """
-    mask = torch.from_numpy(picture[3])[None, None].float()
-    inside = torch.nn.functional.interpolate(mask, (CELLS, CELLS), mode="area")[0, 0].numpy() > 127
-    # lines, dots: smoothing would remove them
-    if ndimage.binary_erosion(inside).sum() <= _SOLID * inside.sum():
-        inside = torch.nn.functional.adaptive_max_pool2d(mask, CELLS)[0, 0].numpy() > 127
+    mask = picture[3] > 127
+    wide = ndimage.binary_erosion(mask, iterations=_THIN)
+    thin = mask & ~ndimage.binary_dilation(wide, iterations=_THIN + 1)
+    # a thin part gets every cell that it touches, another part the cells that it half fills
+    drawn = thin | ndimage.binary_erosion(mask, iterations=_HALF)
+    inside = F.adaptive_max_pool2d(torch.from_numpy(drawn)[None].float(), CELLS)[0].numpy() > 0
     square = DEPTH**2 * _solve(inside) - 4 * ndimage.distance_transform_edt(~inside)
     z = np.arange(CELLS) - (CELLS - 1) / 2
     field = square[::-1].T[:, :, None] - z**2
     surface = grid_surface(torch.from_numpy(0.5 + 0.5 * field / (np.abs(field) + 2)))
     vertices, faces = smooth(surface.vertices, surface.faces, rounds=_ROUNDS), surface.faces
-    view = frame_view(vertices, torch.zeros(1), torch.zeros(1))
+    zero = torch.zeros(1)  # the grid is the picture, whatever thin parts smoothing has removed
+    distance = zero + 0.5 / math.tan(math.radians(HALF_FOV_DEG))
+    view = View(zero, zero, distance.log(), torch.zeros(1, 2), zero, zero)
     x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
     image = _spread(picture)
     size = image.shape[0]

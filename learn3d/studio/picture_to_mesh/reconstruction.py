@@ -1,5 +1,6 @@
 """Reconstruction: from images with masks to mesh files and pictures of them."""
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
@@ -8,6 +9,7 @@ import numpy as np
 import torch
 import trimesh
 from PIL import Image
+from scipy import ndimage
 from torch import Tensor, nn
 
 from learn3d.config import TrainConfig
@@ -60,6 +62,10 @@ _SEARCHED_SIDE = 1024
 _COLORED = 256  # side in pixels of the picture that gives the colours
 # longest edge of a coloured template, since hidden parts have the colours of its vertices
 _LONGEST_EDGE = 0.1
+_INK = 16  # brightness up to which a pixel is black
+_BLACK = 0.7  # share of a drawing's pixels that are black
+_GAP = 0.015  # half of the widest gap in a line, as a share of the drawing
+_LINES = 0.75  # share of a drawing up to which it consists of lines
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
@@ -397,6 +403,7 @@ def reconstruct_guesses(
     """
     if category is not None:
         check_category(model, category)
+    colors, mask = fill_drawing(colors, mask)
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image = torch.from_numpy(stored)
     if not refined or not isinstance(method, MeshMethod):
@@ -427,7 +434,7 @@ def reconstruct_guesses(
         return
     options = {"category": category, "guesses": guesses}
     for fitted, kind in fit_template(
-        templates, model.categories, predicted, mask, progress, **options
+        templates, model.categories, predicted, framed, mask, progress, **options
     ):
         mesh = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE)
         progress("colours", 0.9)
@@ -480,7 +487,10 @@ def reconstruct_several(
     for number, image in enumerate(stored):
         predicted.append(predict(model.method, torch.from_numpy(image), masks[number]))
         progress("camera", 0.3 * (number + 1) / len(stored))
-    left_out = dict.fromkeys(find_strangers(predicted, framed), "it seems to show another object")
+    left_out = dict.fromkeys(
+        find_strangers(predicted, framed),
+        "it seems to show another object, or its outline is wrong",
+    )
     while True:
         used = [number for number in range(len(pictures)) if number not in left_out]
         chosen = [predicted[number] for number in used]
@@ -543,6 +553,28 @@ def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
 def enlarge(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """A picture uint8 [H, W, 3] and its mask as uint8 [4, 256, 256] on white, with the object centred and large."""
     return frame(colors, mask, _COLORED, object_size=CENTRED_SIZE, inverted=False)
+
+
+def fill_drawing(colors: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Add the white areas between the black lines of a drawing to its mask.
+
+    colors, mask: uint8 [H, W, 3] and [H, W]. Lines may have small gaps. Pictures other than
+    drawings of lines stay as they are. Returns colours on white, and the mask.
+    """
+    inside = mask > 127
+    if not inside.any() or np.quantile(colors[inside].mean(1), _BLACK) > _INK:
+        return colors, mask
+    left, top, right, bottom = mask_box(mask)
+    gap = math.ceil(_GAP * max(right - left, bottom - top))
+    padded = np.pad(inside, gap + 1)
+    near = ndimage.distance_transform_edt(~padded) <= gap
+    closed = padded | (ndimage.distance_transform_edt(near) > gap)
+    solid = ndimage.binary_fill_holes(closed)[gap + 1 : -gap - 1, gap + 1 : -gap - 1]
+    if inside.sum() > _LINES * solid.sum():
+        return colors, mask
+    alpha = mask[..., None] / 255
+    on_white = (alpha * colors + 255 * (1 - alpha)).round().astype(np.uint8)
+    return on_white, np.where(solid, np.uint8(255), mask)
 
 
 def reduce_mask(mask: np.ndarray) -> Tensor:

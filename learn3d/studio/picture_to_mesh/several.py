@@ -67,7 +67,7 @@ STRAIGHT = 0.85
 COLORS = 5.0  # weight of the distance of two pictures' colours; that of their codes is 1
 SAMPLES = 500  # pixels of a picture whose colours are compared
 # a picture shows something else if its distance to the nearest one exceeds that of the others by this
-STRANGE = 0.5
+STRANGE = 0.6
 APART = 0.03  # cost of a camera that stands a level of `ELEVATIONS_DEG` above or below the others
 WORSE = 0.15  # a picture is left out if its outline IoU is so much below the median of all
 

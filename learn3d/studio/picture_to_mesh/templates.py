@@ -14,12 +14,18 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import binary_erosion, distance_transform_edt
+from scipy.ndimage import (
+    binary_erosion,
+    distance_transform_edt,
+    gaussian_filter,
+    maximum_filter,
+    sobel,
+)
 from torch import Tensor
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.studio.picture_to_mesh.fit import (
     LEVEL,
@@ -42,6 +48,10 @@ VOXELS = 0.5  # weight of the IoU with the predicted shape; that of the outline 
 NEARNESS = 0.5  # weight of the codes' cosine
 EDGES = 0.15  # weight of the distance of two outlines in pixels
 FARTHEST = 6.0  # largest distance of outlines that counts
+LINES = 0.15  # weight of the distance of two pictures' lines in pixels of 64
+LINE_SIZE = 128  # side in pixels of the pictures whose lines are compared
+LINE_CONTRAST = 0.03  # change of a colour from pixel to pixel that makes a line
+LINE_BEND = 0.5  # sum of the normal's changes from pixel to pixel that makes one
 STRETCHING = 1.0  # weight of unequal factors along the axes
 STRETCH_STEPS = 30
 LATTICE = 4  # points of the lattice along each axis
@@ -179,18 +189,20 @@ def fit_template(
     templates: Templates,
     categories: Sequence[str],
     predicted: Prediction,
+    picture: np.ndarray,
     mask: Tensor,
     progress: Progress = lambda *_: None,
     *,
     category: str | None = None,
     guesses: int = 1,
 ) -> Iterator[tuple[Fit, str]]:
-    """Fit templates to a framed mask float32 [64, 64]: up to `guesses` different ones, the best first, with categories.
+    """Fit templates to a framed picture: up to `guesses` different ones, the best first, with categories.
 
+    picture: R, G, B and mask, uint8 [4, 256, 256]. mask: the same mask, float32 [64, 64].
     Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel
     IoU with the predicted shape, and the cosine of the two codes. The best are stretched along
-    the axes. Of these the best is bent, and those whose voxel IoU with a better one is below
-    `DIFFERENT`. category: see `find_candidates`.
+    the axes, and the lines inside of their outlines count, too. Of these the best is bent, and
+    those whose voxel IoU with a better one is below `DIFFERENT`. category: see `find_candidates`.
     """
     progress("shape", 0.3)
     found = find_candidates(templates, categories, [predicted], category)
@@ -203,6 +215,7 @@ def fit_template(
     scores = likeness(views, shapes, found.faces, mask) + belief(
         views.azimuth_deg, predicted.azimuths
     )
+    scores -= LINES * compare_lines(views, shapes, found.faces, picture)
     order = (scores + found.prior - cost).argsort(descending=True).tolist()
     progress("surface", 0.8)
     for row in _choose_different(
@@ -259,7 +272,45 @@ def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
     inside = np.pad(silhouette.numpy() > 0.35, 1)
     inside[0, 0] = True  # in the margin: there is always an edge
     edge = inside & ~binary_erosion(inside)
-    return edge, np.minimum(distance_transform_edt(~edge), FARTHEST)
+    return edge, _near(edge)
+
+
+def compare_lines(
+    views: View, shapes: list[Tensor], faces: list[Tensor], picture: np.ndarray
+) -> Tensor:
+    """The mean distance of the lines of N shapes and of a picture uint8 [4, 256, 256], [N], in pixels of 64.
+
+    They show arms, slats, drawers and corners within an outline. A shape's lines are its
+    silhouette and its creases, a picture's are thin lines along which its colours change.
+    """
+    lines = _lines_of(picture)
+    near_lines = _near(lines)
+    normals = nmr.render_normals(
+        views.place(shapes), faces, views.cameras(), image_size=LINE_SIZE
+    ).numpy()
+    down, across = (np.abs(np.diff(normals, axis=axis, append=0)).sum(3) for axis in (1, 2))
+    apart = [
+        _mean(near_lines[crease]) + _mean(_near(crease)[lines])
+        for crease in np.maximum(down, across) > LINE_BEND
+    ]
+    return torch.tensor(apart) * (MASK_SIZE / LINE_SIZE)
+
+
+def _lines_of(picture: np.ndarray) -> np.ndarray:
+    """The pixels on the lines of a picture uint8 [4, S, S], bool [LINE_SIZE, LINE_SIZE]."""
+    colors = gaussian_filter(picture[:3] / np.float32(255), (0, 1.5, 1.5))
+    change = np.sqrt(sum(sobel(colors, axis) ** 2 for axis in (1, 2)).sum(0)) / 8
+    change = change.reshape(LINE_SIZE, len(change) // LINE_SIZE, LINE_SIZE, -1).max((1, 3))
+    return (change > LINE_CONTRAST) & (change >= 0.8 * maximum_filter(change, 3))
+
+
+def _near(lines: np.ndarray) -> np.ndarray:
+    """The distance of each pixel to lines, at most `FARTHEST`."""
+    return np.minimum(distance_transform_edt(~lines), FARTHEST)
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else FARTHEST
 
 
 def stretch(

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from PIL import Image, ImageDraw
 
 from learn3d import commands
 from learn3d.commands import train as train_command
@@ -272,6 +273,17 @@ def test_the_fit_of_pictures_is_measured(tmp_path, capsys) -> None:
     lines = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
     assert [line[:2] for line in lines] == [["2", "unknown"], ["2", "known"]]
     assert all(len(line) == 8 and float(line[4]) > 0.5 for line in lines)
+    assert (tmp_path / "sheet.png").is_file()
+
+
+def test_likenesses_are_measured(tmp_path, capsys) -> None:
+    circle = Image.new("RGBA", (80, 80))
+    ImageDraw.Draw(circle).ellipse((10, 10, 70, 70), (200, 40, 40, 255))
+    circle.save(tmp_path / "disc.png")
+    main = runpy.run_path(str(TOOLS / "measure_likeness.py"))["main"]
+    main(tmp_path, sheet=tmp_path / "sheet.png")
+    one, mean = capsys.readouterr().out.splitlines()
+    assert float(one.split()[1]) > 0.8 and mean.startswith("1 pictures: outline 0.")
     assert (tmp_path / "sheet.png").is_file()
 
 

@@ -12,6 +12,7 @@ from learn3d.pictures import draw_around
 from learn3d.studio.picture_to_mesh.inflation import CELLS, DEPTH, inflate
 from learn3d.studio.picture_to_mesh.reconstruction import (
     enlarge,
+    fill_drawing,
     load_model,
     reconstruct_picture,
     reduce_mask,
@@ -58,6 +59,34 @@ def test_a_disc_becomes_an_ellipsoid_with_the_picture_on_both_sides() -> None:
     assert surface.texture.image.shape == (256, 256, 3) and surface.colors.min() > 0.1, (
         "no white of the background"
     )
+
+
+def test_thin_parts_are_whole_and_move_nothing() -> None:
+    car = (np.abs(X) < 70) & (Y > 20) & (Y < 60)
+    alone, _ = inflate(framed(car))
+    surface, view = inflate(framed(car | ((np.abs(X - 40) < 2) & (Y < 30) & (Y > -60))))
+    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
+    assert mesh.body_count == 1 and float(surface.vertices[:, 1].max()) > 0.3, "an antenna"
+    wide, high = (np.ptp(each.vertices[:, :2].numpy(), axis=0) for each in (alone, surface))
+    assert high[0] == pytest.approx(wide[0], rel=0.05)
+    place = view.cameras().transform(surface.vertices[None])[0, :, :2]
+    seen = 2 * surface.vertices[:, :2]
+    flat = surface.vertices[:, 2].abs() < 0.01
+    torch.testing.assert_close(place[flat], seen[flat], atol=0.01, rtol=0.01)
+
+
+def test_drawings_of_black_lines_are_filled() -> None:
+    ring = np.abs(np.hypot(X, Y) - 60) < 2
+    gap = ring & ~((np.abs(Y) < 1) & (X > 0))
+    ink = np.zeros((SIZE, SIZE, 3), np.uint8)
+    for lines in (ring, gap):
+        mask = 255 * lines.astype(np.uint8)
+        colors, filled = fill_drawing(ink, mask)
+        assert (filled > 0).sum() == pytest.approx(np.pi * 62**2, rel=0.02)
+        assert colors[100, 100].tolist() == [255, 255, 255] and colors[lines].max() == 0
+        assert fill_drawing(ink + 90, mask)[1] is mask, "a ring that is not of ink"
+    half = 255 * (ring & (X < 0)).astype(np.uint8)
+    assert fill_drawing(ink, half)[1] is half, "an open line"
 
 
 def test_pictures_of_unknown_kinds_are_inflated(tmp_path) -> None:

@@ -17,6 +17,7 @@ from learn3d.data.layouts import load_dataset
 from learn3d.pictures import Surface, photograph
 from learn3d.studio.make_data.render import DatasetConfig, make_shards
 from learn3d.studio.picture_to_mesh.coloring import paint
+from learn3d.studio.picture_to_mesh.fit import frame_view
 from learn3d.studio.picture_to_mesh.reconstruction import (
     Model,
     load_model,
@@ -25,7 +26,7 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     reconstruct_picture,
 )
 from learn3d.studio.picture_to_mesh.smoothing import divide, sharpen, smooth
-from learn3d.studio.picture_to_mesh.templates import learn_templates, template
+from learn3d.studio.picture_to_mesh.templates import compare_lines, learn_templates, template
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,26 @@ def bodies(surface: Surface) -> int:
     # it merges equal vertices
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy())
     return mesh.body_count if mesh.volume > 0 else 0  # below 0: it is inside out
+
+
+def test_lines_inside_the_same_outline_tell_a_shape() -> None:
+    panel = trimesh.creation.box((0.8, 0.8, 0.1))
+    plain, crossed = (panel.copy(), panel.copy())
+    bar = trimesh.creation.box((0.7, 0.1, 0.1)).apply_translation((0, 0, 0.1))
+    crossed = trimesh.util.concatenate([crossed, bar])
+    shapes = [torch.tensor(each.vertices).float() for each in (plain, crossed)]
+    faces = [torch.tensor(each.faces) for each in (plain, crossed)]
+    view = frame_view(shapes[1], torch.tensor([180.0, 180.0]), torch.tensor([20.0, 20.0]))
+    for number in range(2):
+        (rgb,), (alpha,) = photograph(
+            view.place(shapes)[number],
+            faces[number],
+            (0.2, 0.5, 0.3),
+            view.select(torch.tensor([number])).cameras(),
+            image_size=256,
+        )
+        seen = np.concatenate([np.moveaxis(rgb, -1, 0), alpha[None]])
+        assert int(compare_lines(view, shapes, faces, seen).argmin()) == number
 
 
 def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model) -> None:
