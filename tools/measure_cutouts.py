@@ -19,7 +19,6 @@ from learn3d.data.masks import keep_object, mask_box
 from learn3d.pictures import photograph, save_png, tile
 from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.picture_to_mesh.cutting import Box, find_outline
-from learn3d.studio.picture_to_mesh.reconstruction import load_model
 from learn3d.studio.shapes import make_shape
 
 CATEGORIES = ("airplane", "car", "chair", "lamp", "sofa", "table")
@@ -215,14 +214,10 @@ def main(images: int = 40, seed: int = 2, sheet: Path | None = None) -> None:
     sheet: a PNG of the pictures with the outlines that were found without a hand and with a box.
     """
     torch.set_num_threads(1)
-    model = load_model(None)
     kinds, values, shown = [], [], []
     for number, scene in enumerate(scenes(images, seed)):
         box = scene.box(np.random.default_rng([seed, number, 1]))
-        found = [
-            keep_object(find_outline(scene.colors, each, model.judge).mask)[0]
-            for each in (None, box)
-        ]
+        found = [keep_object(find_outline(scene.colors, each).mask)[0] for each in (None, box)]
         values.append([iou(mask, scene.mask) for mask in found])
         kinds.append(scene.kind)
         shown += [_draw(scene.colors, mask) for mask in found]

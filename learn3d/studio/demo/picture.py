@@ -14,7 +14,7 @@ from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.pictures import photograph
 from learn3d.studio.make_data.looks import PALETTES, natural_look
-from learn3d.studio.picture_to_mesh.cutting import Box, Judge, Outline, correct, find_outline
+from learn3d.studio.picture_to_mesh.cutting import Box, Outline, correct, find_outline
 from learn3d.studio.picture_to_mesh.reconstruction import (
     Model,
     Reconstruction,
@@ -62,7 +62,7 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
     return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3].copy(), strokes, box)
 
 
-def find_object(picture: Picture, judge: Judge | None = None) -> tuple[Outline, str | None]:
+def find_object(picture: Picture) -> tuple[Outline, str | None]:
     """The object's outline, and what was left out, see `keep_object`.
 
     The mask is the given one, or is found in the box or picture. If it was corrected, nothing is
@@ -73,7 +73,7 @@ def find_object(picture: Picture, judge: Judge | None = None) -> tuple[Outline, 
     if picture.box is None and picture.mask.min() < 255:
         outline = Outline(picture.mask, "by the picture's transparency")
     else:
-        outline = find_outline(picture.colors, picture.box, judge)
+        outline = find_outline(picture.colors, picture.box)
     mask, left_out = keep_object(outline.mask)
     return outline._replace(mask=mask), left_out
 
@@ -106,9 +106,9 @@ def make_meshes(
     object's, None if unknown.
     """
     try:
-        judge, masks = next(iter(models.values())).judge, []
+        masks = []
         for number, picture in enumerate(pictures):
-            outline, left_out = find_object(picture, judge)
+            outline, left_out = find_object(picture)
             of = {"of": number} if len(pictures) > 1 else {}
             which = f" in picture {number + 1}" if of else ""
             found = {

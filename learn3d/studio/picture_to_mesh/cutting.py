@@ -1,25 +1,19 @@
-"""Outlines of objects in photographs: by the colour of a plain background, by rembg, or by GrabCut (OpenCV)."""
+"""Outlines of objects in photographs: by a plain background, by rembg, or by a network and GrabCut (OpenCV)."""
 
 import functools
 import importlib.util
-import itertools
-import math
-from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 from scipy import ndimage
-from scipy.spatial import cKDTree
-from skimage.color import rgb2lab
-from skimage.filters import threshold_otsu
-from skimage.segmentation import felzenszwalb
 
-from learn3d.data.masks import keep_object, mask_box
+from learn3d.data.masks import keep_object
+from learn3d.studio.picture_to_mesh.outline_network import find_object
 
 SIDE = 384  # longer side in pixels of the picture for GrabCut
-INSET = 0.03  # width of the background border without a box, as a share of the picture's sides
 PLAIN = 0.9  # least share of the border with one colour in pictures with a plain background
+EVEN = 0.06  # largest difference from this colour, in 0 .. 1; walls and floors differ by more
 TOLERANCE = 0.12  # largest difference from the background's colour, in 0 .. 1
 JPEG_NOISE = 6  # levels by which compression changes the background near an object
 # A hole of the mask shows the background if more than this share of it has the background's colour.
@@ -27,35 +21,18 @@ PLAIN_HOLE = 0.5
 # Its least and largest size, as a share of the object; larger holes are often white table tops.
 HOLES = 0.001, 0.4
 KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
-_ROUNDS, _ROUNDS_FROM_GUESS, _ROUNDS_IN_STROKES = 5, 3, 2
+_ROUNDS = 3  # of GrabCut
 _AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
-
-# bands of rows; a pixel is compared with the background of its own band and its neighbours
-_BANDS = 12
-_SAMPLES = 600  # pixels of the background in a band
-_SHADES = 0.88, 0.76, 0.65, 0.55, 0.46  # brightness of the background in shadows of different depth
-_SHADED_FROM = 0.4  # height in the picture, from the top, below which there are shadows
-_SHADE_COST = 1.5  # differences are in units of CIELAB, here that of a shadow
-_LEAST, _CLEAR, _MOST = 4, 25, 60  # of an object; that is certainly one; beyond which all are alike
-_AWAY = 0.04  # gap between an object and its box, as a share of the object's sides
+_CERTAIN = 0.995  # probability from which GrabCut does not decide
 _SMALL_HOLE = 0.002  # smaller holes are filled, as a share of the object
 _TOUCHED = 0.03  # share of a side of the picture, from which the object touches it
-_PREFERRED = 0.05  # by which GrabCut from the whole region must be judged better
-_EXTENT = 2  # weight of the share of its box that an object spans, against that of its own pixels
-_PROBABLE = -0.6  # mark of an object that is probably the right one
 _RECTANGLE = 0.9  # share of its box that an upright rectangle fills
-_UNLIKELY = 0.3  # by which the mark of such a rectangle is worse
-_FRAME = 0.05  # least area of a picture on the wall, over that of the mask
-_FRAME_FILL = 0.7  # and over that of its own box
-_FRAME_WIDTH = 5  # pixels
-_OFF_CENTRE = 0.6  # weight of the distance from the centre against the judgement
 _PARTS = 3  # parts that may be the object
 _PART = 0.1  # their least area, over that of the largest
 _RAGGED = 600  # squared length of an outline over its area, in pixels; a thin-legged chair has 200
+_SURE = 0.6  # least soft IoU of a mask and its probabilities
 
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
-#: How well a mask uint8 [H, W] of a picture uint8 [H, W, 3] shows something known; larger is better.
-Judge = Callable[[np.ndarray, np.ndarray], float]
 
 
 class Outline(NamedTuple):
@@ -66,7 +43,7 @@ class Outline(NamedTuple):
     doubt: str | None = None  # a reason to ask for a box, None if there is none
 
 
-def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None = None) -> Outline:
+def find_outline(colors: np.ndarray, box: Box | None = None) -> Outline:
     """Find the object in a photograph uint8 [H, W, 3], and other things beside it.
 
     With a box: see `cut_out`. If there is no box and the background is plain, the object is
@@ -74,10 +51,11 @@ def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None
     and if not, see `cut_out`. Raises ValueError as `cut_out` does, or if rembg fails.
     """
     if box is not None:
-        return Outline(cut_out(colors, box), "by GrabCut in the box")
+        return Outline(cut_out(colors, box)[0], "by a network and GrabCut in the box")
+    doubt = None
     if is_plain(colors):
         whole = threshold_mask(colors)
-        mask = _without_frame(colors, whole, judge)
+        mask = _without_frame(colors, whole)
         how = "as all that differs from the plain background"
         if mask is not whole:
             how = f"{how} but for an upright rectangle, probably a picture on the wall"
@@ -85,9 +63,10 @@ def find_outline(colors: np.ndarray, box: Box | None = None, judge: Judge | None
         mask = _ask_rembg(colors)
         how = "by rembg, which loads its weights from the internet at its first use"
     else:
-        mask = cut_out(colors, judge=judge)
-        how = "by its difference from the background at the border"
-    return Outline(mask, how, find_doubt(keep_object(mask)[0]))
+        mask, sureness = cut_out(colors)
+        how = "by a network and GrabCut"
+        doubt = "the network is not sure of its outline" if sureness < _SURE else None
+    return Outline(mask, how, find_doubt(keep_object(mask)[0]) or doubt)
 
 
 def find_doubt(mask: np.ndarray) -> str | None:
@@ -127,7 +106,7 @@ def _ask_rembg(colors: np.ndarray) -> np.ndarray:
 def is_plain(colors: np.ndarray) -> bool:
     """Whether the border of a picture uint8 [H, W, 3] has one colour, except for a tenth of its pixels."""
     _, of_border = _differences(colors)
-    return bool((of_border < 255 * TOLERANCE).mean() > PLAIN)
+    return bool((of_border < 255 * EVEN).mean() > PLAIN)
 
 
 def _differences(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,73 +137,43 @@ def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarr
     return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
 
 
-def cut_out(colors: np.ndarray, box: Box | None = None, judge: Judge | None = None) -> np.ndarray:
-    """The mask uint8 [H, W], 0 or 255, of the object within a box of a photograph.
+def cut_out(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, float]:
+    """The mask uint8 [H, W], 0 or 255, of the main object of a photograph or of a box, and its sureness.
 
-    colors: uint8 [H, W, 3]. Pixels outside the box are background (default box: all but a narrow
-    border). GrabCut starts with the pixels that are unlike the background at their height
-    (`_separate`), and in a given box once more with all pixels (`_cut_in`). Without a box the
-    largest parts are tried, each in a box of its own, and the `judge` decides. Raises ValueError
-    without OpenCV, or if the box exceeds or fills the picture.
+    colors: uint8 [H, W, 3]. Pixels outside the box are background. A network finds the object
+    (`find_object`), and GrabCut decides where it is not certain. The sureness, in 0 .. 1, is the
+    soft IoU of the mask and the network's probabilities. Raises ValueError without OpenCV, or if
+    the box exceeds or fills the picture.
     """
     height, width = colors.shape[:2]
-    scale = min(1.0, SIDE / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = np.asarray(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
-    x, y, w, h = box or (
-        INSET * width,
-        INSET * height,
-        (1 - 2 * INSET) * width,
-        (1 - 2 * INSET) * height,
-    )
+    x, y, w, h = box or (0, 0, width, height)
     if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
         raise ValueError(
             f"the box {box} (x, y, width, height) must lie within the {width}x{height} pixels"
         )
-    region = np.zeros(small.shape[:2], bool)
-    region[round(y * scale) : round((y + h) * scale), round(x * scale) : round((x + w) * scale)] = (
-        True
-    )
-    if region.all():
+    if box is not None and w == width and h == height:
         raise ValueError(
             "the box covers the whole picture; leave some background around the object"
         )
-    inside = _choose(small, region, judge) if box is None else _cut_in(small, region)
-    mask = Image.fromarray(255 * inside.astype(np.uint8)).resize(
-        (width, height), Image.Resampling.BILINEAR
+    view, logits = find_object(colors, None if box is None else (x, y, x + w, y + h))
+    left, top, right, bottom = view
+    part = Image.fromarray(colors).crop(view)
+    part.thumbnail((SIDE, SIDE), Image.Resampling.BOX)
+    finer = Image.fromarray(logits).resize(part.size, Image.Resampling.BILINEAR)
+    chance = 1 / (1 + np.exp(-np.asarray(finer)))
+    unsure = np.abs(chance - 0.5) < _CERTAIN - 0.5
+    inside = _only_object(_grab_cut(np.asarray(part), chance > 0.5, unsure, _ROUNDS))
+    sureness = np.minimum(chance, inside).sum() / np.maximum(chance, inside).sum()
+    larger = Image.fromarray(255 * inside.astype(np.uint8)).resize(
+        (right - left, bottom - top), Image.Resampling.BILINEAR
     )
-    return 255 * (np.asarray(mask) > 127).astype(np.uint8)
-
-
-def _separate(colors: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Objects in a region, all bool [H, W]: GrabCut from the pixels that are unlike the background.
-
-    The second mask is that of all pixels that may be unlike the background.
-    """
-    difference = _difference(colors, ~region)
-    least = max(1.5 * np.percentile(difference[~region], 90), _LEAST)
-    limit = max(min(threshold_otsu(difference[region].clip(max=_MOST)), _CLEAR), least)
-    inside = _grab_cut(colors, region & (difference > limit), region, _ROUNDS_FROM_GUESS)
-    unlike = difference > least
-    return inside | (ndimage.binary_fill_holes(inside) & unlike), unlike
-
-
-def _cut_in(colors: np.ndarray, region: np.ndarray) -> np.ndarray:
-    """The object that spans a region, both bool [H, W]: the better of two results of GrabCut.
-
-    The first GrabCut starts from the pixels that are unlike the background. The second starts from
-    the whole region, and its colours are CIELAB with twice the chroma. The better result spans more
-    of the region and has fewer pixels that are like the background.
-    """
-    started, unlike = _separate(colors, region)
-    chromatic = (128 + (rgb2lab(colors) - [50, 0, 0]) * [1, 2, 2]).clip(0, 255).astype(np.uint8)
-
-    def mark(inside: np.ndarray) -> float:
-        share = unlike[inside].mean() if inside.any() else 0
-        return _EXTENT * _extent(inside) / np.count_nonzero(region) + share
-
-    results = started, _grab_cut(chromatic, region, region, _ROUNDS)
-    return max(map(_only_object, results), key=mark)
+    mask = np.zeros((height, width), np.uint8)
+    mask[top:bottom, left:right] = 255 * (np.asarray(larger) > 127)
+    if box is not None:
+        within = np.zeros_like(mask)
+        within[y : y + h, x : x + w] = 255
+        mask &= within
+    return mask, float(sureness)
 
 
 def _parts(inside: np.ndarray) -> list[np.ndarray]:
@@ -236,46 +185,6 @@ def _parts(inside: np.ndarray) -> list[np.ndarray]:
     return [regions == number for number in largest if areas[number] > _PART * areas.max()]
 
 
-def _offset(inside: np.ndarray) -> float:
-    """Distance of the centre of a mask, bool [H, W], from that of the picture, in sides of the picture."""
-    return float(
-        np.hypot(
-            *(np.nonzero(inside)[k].mean() / side - 0.5 for k, side in enumerate(inside.shape))
-        )
-    )
-
-
-def _difference(colors: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Difference of each pixel, float [H, W], from the colours of the background, bool [H, W], at its height.
-
-    So wall, skirting board and floor are each compared with themselves. Below, the background may
-    also be darker: a shadow on the floor.
-    """
-    height, width = background.shape
-    blurred = ndimage.gaussian_filter(colors.astype(np.float32) / 255, (0.8, 0.8, 0))
-    lab, rng = rgb2lab(blurred), np.random.default_rng(0)
-    edges = np.linspace(0, height, _BANDS + 1).round().astype(int)
-    rows, difference = height // _BANDS + 1, np.empty((height, width))
-    for low, high in itertools.pairwise(edges):
-        near = slice(max(0, low - rows), high + rows)
-        samples = blurred[near][background[near]]
-        samples = samples[rng.permutation(len(samples))[:_SAMPLES]]
-        pixels = lab[low:high].reshape(-1, 3)
-        found = _distance(pixels, samples)
-        if high > _SHADED_FROM * height:
-            shaded = np.concatenate([shade * samples for shade in _SHADES])
-            found = np.minimum(found, _distance(pixels, shaded) + _SHADE_COST)
-        difference[low:high] = found.reshape(high - low, width)
-    return difference
-
-
-def _distance(pixels: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Mean distance [N] of pixels [N, 3], in CIELAB, to the three nearest samples [M, 3], in RGB."""
-    tree, nearest = cKDTree(rgb2lab(samples[None])[0]), np.arange(1, min(3, len(samples)) + 1)
-    distance, _ = tree.query(pixels, k=nearest, distance_upper_bound=_MOST)
-    return distance.clip(max=_MOST).mean(1)
-
-
 def _only_object(inside: np.ndarray) -> np.ndarray:
     """A mask, bool [H, W], without specks and without small holes."""
     filled = ndimage.binary_fill_holes(inside)
@@ -285,77 +194,20 @@ def _only_object(inside: np.ndarray) -> np.ndarray:
     return keep_object(255 * (inside | small[holes]).astype(np.uint8))[0] > 127
 
 
-def _around(inside: np.ndarray) -> np.ndarray:
-    """The box of a mask, bool [H, W], and a little more, but never the border of the picture."""
-    region = np.zeros_like(inside)
-    height, width = inside.shape
-    left, top, right, bottom = (
-        mask_box(255 * inside.astype(np.uint8)) if inside.any() else (0, 0, width, height)
-    )
-    x, y = (round(_AWAY * side) + 2 for side in (right - left, bottom - top))
-    region[
-        max(2, top - y) : min(height - 2, bottom + y), max(2, left - x) : min(width - 2, right + x)
-    ] = True
-    return region
-
-
-def _extent(inside: np.ndarray) -> int:
-    """Area of the box of a mask, bool [H, W], in pixels."""
-    return np.count_nonzero(inside.any(axis=0)) * np.count_nonzero(inside.any(axis=1))
-
-
-def _without_frames(patches: np.ndarray, inside: np.ndarray) -> Iterator[np.ndarray]:
-    """A mask, bool [H, W], without each upright rectangle among the numbered patches of one colour [H, W].
-
-    It may be a picture or a window that the object touches or covers in part.
-    """
-    for number, box in enumerate(ndimage.find_objects(patches), 1):
-        part = (patches[box] == number) & inside[box]
-        if np.count_nonzero(part) > max(_FRAME * np.count_nonzero(inside), _FRAME_FILL * part.size):
-            rest = inside & ~ndimage.binary_dilation(patches == number, iterations=_FRAME_WIDTH)
-            yield _only_object(rest)
-
-
-def _choose(colors: np.ndarray, region: np.ndarray, judge: Judge | None) -> np.ndarray:
-    """The most probable object, bool [H, W], in a region: all of it, or a part that is unlike the background.
-
-    If none is probable, it is looked for once more beside these parts.
-    """
-    whole = _only_object(_grab_cut(colors, region, region, _ROUNDS))
-    patches = felzenszwalb(colors, scale=100, min_size=50) + 1
-    masks, marks = [whole], [_mark(colors, whole, judge) - _PREFERRED]
-    for _ in range(2):
-        for part in _parts(_separate(colors, region)[0]):
-            mask = _only_object(_separate(colors, _around(part))[0])
-            for candidate in (mask, *_without_frames(patches, mask)):
-                masks.append(candidate)
-                marks.append(_mark(colors, candidate, judge))
-            region = region & ~_around(part)
-        if max(marks) > _PROBABLE or not region.any():
-            break
-    return masks[int(np.argmax(marks))]
-
-
-def _without_frame(colors: np.ndarray, mask: np.ndarray, judge: Judge | None) -> np.ndarray:
+def _without_frame(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The mask uint8 [H, W], or another part of it if the largest is an upright rectangle and less probable."""
     parts = _parts(mask > 127)
     if len(parts) < 2 or not _is_rectangle(parts[0]):
         return mask
-    best = max(parts, key=lambda part: _mark(colors, part, judge))
+    (left, top, right, bottom), _ = find_object(colors)
+    best = max(parts, key=lambda part: np.count_nonzero(part[top:bottom, left:right]))
     return mask if best is parts[0] else 255 * best.astype(np.uint8)
 
 
 def _is_rectangle(inside: np.ndarray) -> bool:
     """Whether a mask, bool [H, W], fills its box."""
-    return np.count_nonzero(inside) > _RECTANGLE * _extent(inside)
-
-
-def _mark(colors: np.ndarray, inside: np.ndarray, judge: Judge | None) -> float:
-    """How probably a mask, bool [H, W], is the object's: near the centre and known to the judge, or else large."""
-    if not inside.any():
-        return -math.inf
-    mark = judge(colors, 255 * inside.astype(np.uint8)) if judge else float(inside.mean())
-    return mark - _OFF_CENTRE * _offset(inside) - _UNLIKELY * _is_rectangle(inside)
+    extent = np.count_nonzero(inside.any(axis=0)) * np.count_nonzero(inside.any(axis=1))
+    return np.count_nonzero(inside) > _RECTANGLE * extent
 
 
 def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.ndarray:
@@ -371,7 +223,7 @@ def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.nda
         part = tuple(
             slice(max(0, line[0] - _AROUND), line[-1] + 1 + _AROUND) for line in (rows, columns)
         )
-        inside[part] = _grab_cut(colors[part], inside[part], unsure[part], _ROUNDS_IN_STROKES)
+        inside[part] = _grab_cut(colors[part], inside[part], unsure[part], _ROUNDS)
     return 255 * inside.astype(np.uint8)
 
 

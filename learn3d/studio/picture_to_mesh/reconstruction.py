@@ -38,7 +38,7 @@ from learn3d.pictures import (
 from learn3d.runs import checkpoint
 from learn3d.settings import split_names
 from learn3d.studio.picture_to_mesh.coloring import color_mesh
-from learn3d.studio.picture_to_mesh.cutting import Box, Judge, find_outline
+from learn3d.studio.picture_to_mesh.cutting import Box, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.studio.picture_to_mesh.fit import Progress, View, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
@@ -89,14 +89,6 @@ class Model(NamedTuple):
         return prepare_image(
             colors, mask, crop=crop, object_size=self.object_size, size=size, layout=layout
         )
-
-    @torch.no_grad()
-    def judge(self, colors: np.ndarray, mask: np.ndarray) -> float:
-        """How much the object of a mask uint8 [H, W] resembles a known kind; 0 if the model has no known codes."""
-        if self.known_codes is None:
-            return 0.0
-        (code,) = self.method.encode(torch.from_numpy(self.prepare(colors, mask))[None])
-        return -self.known_codes.distance(code)
 
 
 def load_model(run: Path | None, which: str = "last") -> Model:
@@ -149,7 +141,7 @@ def reconstruct_files(
     paths, faults = [], []
     for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
         try:
-            photo = _read(image, mask, box, model.judge)
+            photo = _read(image, mask, box)
         except (ValueError, OSError) as error:
             faults.append(error)
             continue
@@ -194,7 +186,7 @@ def reconstruct_object_files(
     photos, names = [], []
     for image, mask in zip(images, masks or [None] * len(images), strict=True):
         try:
-            photos.append(_read(image, mask, judge=model.judge))
+            photos.append(_read(image, mask))
             names.append(image)
         except (ValueError, OSError) as error:
             note(f"left out: {error}")
@@ -290,7 +282,7 @@ def reconstruct(
 
 
 def _read(
-    path: Path, mask_path: Path | None = None, box: Box | None = None, judge: Judge | None = None
+    path: Path, mask_path: Path | None = None, box: Box | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path`, or found in the image."""
     colors, mask = read_photo(path, mask_path, optional=True)
@@ -301,7 +293,7 @@ def _read(
             photo = Image.fromarray(colors)
             photo.thumbnail((_SEARCHED_SIDE, _SEARCHED_SIDE))
             colors = np.asarray(photo)
-        mask, how, doubt = find_outline(colors, box, judge)
+        mask, how, doubt = find_outline(colors, box)
         if box is None:
             wrong = "if the outline in the strip of views is wrong, give --box or --masks"
             note(f"note: {path} has no transparency, so the object was searched, {how}; {wrong}")
