@@ -11,6 +11,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from scipy import ndimage
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
@@ -82,7 +83,8 @@ def test_the_object_is_given_or_found_or_corrected(photo) -> None:
     corrected[90] = 0
     assert np.flatnonzero(corrected.any(axis=1)).tolist() == list(range(10, 40))
     boxed, _ = pictures.find_object(pictures.Picture(photo, unknown, None, (40, 10, 80, 80)))
-    assert (boxed.mask != ring).mean() < 0.02
+    whole = ndimage.binary_fill_holes(boxed.mask > 127)  # the pale disc may be background
+    assert (whole != (ring > 127)).mean() < 0.02
 
 
 def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> None:
