@@ -1,6 +1,7 @@
 """Trains the network that finds objects in photographs, and stores it in the package.
 
-python tools/train_outlines.py --output output/outlines
+learn3d fetch-debian-models --output models
+python tools/train_outlines.py --models models
 
 Objects are generated, drawn by nmr, and composed before drawn rooms and parts of photographs. The
 photographs, textures, and cut-outs of other things come from Debian's packages, which apt-get
@@ -54,6 +55,7 @@ THINGS = (
     "openclipart-png",
 )  # cut-outs of other things, with transparency
 MOST_THINGS = 1500  # from each of these packages
+LARGEST_THING = 2000  # longest side in pixels of their pictures; larger ones are left out
 SEED = 1_000_000  # tools/measure_cutouts.py has smaller seeds
 SMALLEST, LARGEST = 128, 640  # sides of photographs and textures in pixels; larger ones are reduced
 BRIGHT = 100  # least mean of their values, 0 .. 255; darker ones are made brighter, by 4 at most
@@ -102,10 +104,15 @@ def read_things(folder: Path) -> list[np.ndarray]:
         files = sorted(read_package(get_package(package, folder), (".png",)).items())
         found = 0
         for number in np.random.default_rng(SEED).permutation(len(files)):
-            picture = Image.open(io.BytesIO(files[number][1]))
-            if found == MOST_THINGS or max(picture.size) > 2000:
+            if found == MOST_THINGS:
+                break
+            try:
+                picture = Image.open(io.BytesIO(files[number][1]))
+                if max(picture.size) > LARGEST_THING:
+                    continue
+                picture = picture.convert("RGBA")
+            except (OSError, Image.DecompressionBombError):
                 continue
-            picture = picture.convert("RGBA")
             picture.thumbnail((OBJECT, OBJECT), Image.Resampling.BOX)
             pixels = np.asarray(picture)
             if 0.06 < (pixels[..., 3] > 127).mean() < 0.97:
