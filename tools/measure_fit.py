@@ -54,10 +54,8 @@ def main(models: Path, category: str, run: Path | None = None, images: int = 48)
             framed = enlarge(rgb, alpha)
             mask = reduce_mask(framed[3])
             predicted = predict(model.method, torch.from_numpy(model.prepare(rgb, alpha)), mask)
-            pictures = framed, mask
-            template, kind = next(
-                fit_template(model.templates, model.categories, predicted, *pictures)
-            )
+            guesses = fit_template(model.templates, model.categories, predicted, framed, mask)
+            template, kind = next(guesses)
             boxed = template._replace(
                 vertices=torch.from_numpy(fit_to_box(template.vertices.numpy()))
             )

@@ -28,7 +28,7 @@ def main(
 ) -> None:
     """Print outline IoU, processor seconds and kind for each PNG file with transparency, and the means.
 
-    The largest share of inflated pictures is a warning. sheet: PNG file with each picture beside
+    A picture is inflated if it resembles no kind that the model knows. sheet: PNG file with each picture beside
     its mesh, for the eye; blind: without the picture, so that somebody says what a mesh shows
     before seeing what it should show.
     """

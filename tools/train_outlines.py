@@ -98,7 +98,7 @@ def read_backgrounds(packages: tuple[str, ...], folder: Path) -> list[np.ndarray
 
 
 def read_things(folder: Path) -> list[np.ndarray]:
-    """Cut-outs RGBA uint8 [h, w, 4] of other things: pictures of the packages that are partly transparent."""
+    """Cut-outs RGBA uint8 [h, w, 4] of other things: the partly transparent pictures of the packages."""
     things = []
     for package in THINGS:
         files = sorted(read_package(get_package(package, folder), (".png",)).items())
@@ -236,8 +236,7 @@ class Composer:
                 np.round((box[k::2] - view[k]) * scale[k]).astype(int).clip(0, side) for k in (0, 1)
             )
             place[top:bottom, left:right] = 255
-        views = np.dstack([scene, place, np.uint8(255 * alpha)])
-        return views
+        return np.dstack([scene, place, np.uint8(255 * alpha)])
 
     def _sprite(self, rng: np.random.Generator) -> np.ndarray:
         """A random object, in other colours and perhaps with a pattern, RGBA float [h, w, 4]."""

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 from scipy import ndimage
+from scipy.special import expit
 
 from learn3d.data.masks import keep_object
 from learn3d.studio.picture_to_mesh.outline_network import find_object
@@ -160,9 +161,9 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, flo
     part = Image.fromarray(colors).crop(view)
     part.thumbnail((SIDE, SIDE), Image.Resampling.BOX)
     finer = Image.fromarray(logits).resize(part.size, Image.Resampling.BILINEAR)
-    chance = 1 / (1 + np.exp(-np.asarray(finer)))
+    chance = expit(np.asarray(finer))
     unsure = np.abs(chance - 0.5) < _CERTAIN - 0.5
-    inside = _only_object(_grab_cut(np.asarray(part), chance > 0.5, unsure, _ROUNDS))
+    inside = _only_object(_grab_cut(np.asarray(part), chance > 0.5, unsure))
     sureness = np.minimum(chance, inside).sum() / np.maximum(chance, inside).sum()
     larger = Image.fromarray(255 * inside.astype(np.uint8)).resize(
         (right - left, bottom - top), Image.Resampling.BILINEAR
@@ -223,13 +224,11 @@ def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.nda
         part = tuple(
             slice(max(0, line[0] - _AROUND), line[-1] + 1 + _AROUND) for line in (rows, columns)
         )
-        inside[part] = _grab_cut(colors[part], inside[part], unsure[part], _ROUNDS)
+        inside[part] = _grab_cut(colors[part], inside[part], unsure[part])
     return 255 * inside.astype(np.uint8)
 
 
-def _grab_cut(
-    colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray, rounds: int
-) -> np.ndarray:
+def _grab_cut(colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray) -> np.ndarray:
     """GrabCut (Rother et al. 2004): decide again which of the pixels `unsure` are inside of an object, bool [H, W]."""
     try:
         import cv2
@@ -248,7 +247,7 @@ def _grab_cut(
         labels,
         None,
         *models,
-        rounds,
+        _ROUNDS,
         cv2.GC_INIT_WITH_MASK,
     )
     return labels % 2 == 1

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 from scipy import ndimage
+from scipy.special import expit
 from torch import Tensor, nn
 
 from learn3d.networks.layers import norm_relu
@@ -22,7 +23,6 @@ WEIGHTS = Path(__file__).with_name("outlines.safetensors")  # made by tools/trai
 
 Place = tuple[float, float, float, float]  # left, top, right, bottom in pixels
 View = tuple[int, int, int, int]  # the same, of a part of a picture
-_LOOKS = 1  # looks at a picture without a box before the last one
 
 
 class OutlineNetwork(nn.Module):
@@ -69,7 +69,7 @@ def load_outline_network() -> OutlineNetwork:
 
 
 def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[View, np.ndarray]:
-    """The part of a picture uint8 [H, W, 3] around its main object, and the network's logits [S, S] in it.
+    """The main object of a picture uint8 [H, W, 3]: a view around it, and the network's logits [S, S] of the view.
 
     With a box, it is the object that fills the box. Otherwise the network looks at the whole
     picture first, and then at the surroundings of the object that it saw.
@@ -78,14 +78,13 @@ def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[View, np.
     if box is not None:
         view = place_view(box, width, height)
         return view, _look(colors, view, box)
-    view = 0, 0, width, height
-    for _ in range(_LOOKS):
-        view = place_view(_place(_look(colors, view), view), width, height)
+    whole = 0, 0, width, height
+    view = place_view(_place(_look(colors, whole), whole), width, height)
     return view, _look(colors, view)
 
 
 def place_view(place: Place, width: float, height: float) -> View:
-    """The part of a picture that the network sees of an object: more by `MARGIN`, within the picture."""
+    """The part of a picture for the network: the object's place, wider by `MARGIN`, cut at the picture's sides."""
     left, top, right, bottom = place
     wide, high = (1 + 2 * MARGIN) * (right - left), (1 + 2 * MARGIN) * (bottom - top)
     wide, high = max(wide, NARROW * high, 2) / 2, max(high, NARROW * wide, 2) / 2
@@ -100,7 +99,7 @@ def place_view(place: Place, width: float, height: float) -> View:
 
 def _place(logits: np.ndarray, view: View) -> Place:
     """The box of the object in a view: of the regions above half of the largest probability, the one with most."""
-    inside = 1 / (1 + np.exp(-logits))
+    inside = expit(logits)
     regions, count = ndimage.label(inside > min(0.5, inside.max() / 2))
     best = np.argmax(ndimage.sum(inside, regions, np.arange(1, count + 1)))
     rows, columns = ndimage.find_objects(regions)[best]

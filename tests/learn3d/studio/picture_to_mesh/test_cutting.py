@@ -162,7 +162,7 @@ def test_wall_floor_and_shadow_stay_outside(room, box) -> None:
     assert not is_plain(colors)
     outline = find_outline(colors, box)
     assert overlap(outline.mask, inside) > 0.9 and outline.doubt is None
-    whole = cutting._grab_cut(colors, *[np.pad(np.ones((280, 380), bool), 10)] * 2, 5)
+    whole = cutting._grab_cut(colors, *[np.pad(np.ones((280, 380), bool), 10)] * 2)
     assert overlap(whole, inside) < 0.85, "GrabCut alone keeps more of the room"
 
 
