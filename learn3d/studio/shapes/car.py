@@ -1,19 +1,35 @@
-"""Procedural cars, in metres: a body, wheels, mirrors, perhaps a roof box or a spoiler."""
+"""Procedural cars, in metres: closed and open bodies on wheels, and racing cars with free wheels."""
 
 from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 
-from .draw import Draw, points, recipe, rectangle, rounded_path
-from .parts import Part, bar, box, crossbar, join, loft, revolve, slab, wing
+from .draw import Draw, Perhaps, points, recipe, rectangle, rounded_path
+from .parts import (
+    Part,
+    bar,
+    between,
+    board,
+    box,
+    crossbar,
+    ellipsoid,
+    join,
+    loft,
+    revolve,
+    sheet,
+    slab,
+    tube,
+    wing,
+)
 
 TYRE = 0.22  # width of the wheels
 
 # The weight of each kind, the smallest and largest measures. length, width, height, wheel
 # (radius) and clearance (of the floor over the ground) are in metres. bonnet and screen
-# (lengths), roof (its end) and window (end of the rear window, start of the boot or bed) are
-# shares of the length. belt: height of the shoulder line under the windows, share of the height.
+# (lengths), roof (its end; a roadster has none) and window (end of the rear window or of the
+# seats, start of the boot or bed) are shares of the length. belt: height of the shoulder line
+# under the windows, share of the height.
 # lean: inward lean of the side windows per height.
 _FIELDS = "length width height wheel clearance bonnet screen roof window belt lean".split()
 _KINDS = {
@@ -31,6 +47,8 @@ _KINDS = {
                        ( 6.0,  2.05,  2.60,  0.37,  0.25,  0.20,  0.14, 0.97,  1.00, 0.52, 0.13)),
     "pickup":    (1.6, ( 4.8,  1.75,  1.60,  0.36,  0.24,  0.23,  0.09, 0.46,  0.57, 0.54, 0.20),
                        ( 5.9,  2.05,  1.95,  0.44,  0.34,  0.29,  0.13, 0.55,  0.64, 0.62, 0.40)),
+    "roadster":  (1.2, ( 3.5,  1.60,  1.12,  0.28,  0.12,  0.27,  0.05, 0.60,  0.66, 0.58, 0.20),
+                       ( 4.7,  1.90,  1.36,  0.34,  0.20,  0.36,  0.09, 0.60,  0.78, 0.66, 0.40)),
 }  # fmt: skip
 
 
@@ -38,20 +56,14 @@ def car(draw: Draw, kind: str) -> Part:
     """A car of one of the kinds of `_KINDS`."""
     _, least, greatest = _KINDS[kind]
     limits = dict(zip(_FIELDS, zip(least, greatest, strict=True), strict=True))
-    body = SimpleNamespace(**draw.measures(**limits), has_bed=kind == "pickup")
+    body = SimpleNamespace(**draw.measures(**limits), kind=kind)
     # height of the shoulder line, above the wheels
     body.shoulder = max(body.belt * body.height, 2 * body.wheel + 0.15)
     # Distances of the axles from the front bumper.
     body.axles = body.wheel + 0.48, body.length - body.wheel - 0.44
     part = _hull(body)
 
-    x = (body.width - TYRE) / 2 - 0.02
-    y = body.wheel
-    dish = draw(0.1, 0.6)
-    # of a wheel with a dished hub
-    rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])
-    profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [body.wheel, TYRE / 2]
-    pair = revolve(profile).rotated("z", 90).moved(x, y).both_sides() + crossbar((-x, y, 0), 0.1)
+    pair = _wheels(body.wheel, TYRE, (body.width - TYRE) / 2 - 0.02, draw(0.1, 0.6))
     part += join(pair.moved(z=body.length / 2 - s) for s in body.axles)
 
     half = body.width / 2
@@ -65,6 +77,98 @@ def car(draw: Draw, kind: str) -> Part:
         part += _roof_box(draw, body)
     if kind == "coupe" and draw.maybe(0.5):
         part += _spoiler(draw, body)
+    if kind == "roadster":
+        part += _seats(draw, body)
+    return part
+
+
+def _wheels(radius: float, width: float, x: float, dish: float) -> Part:
+    """Wheels with dished hubs at (+-x, radius, 0), on an axle."""
+    rim = np.array([(0.5, dish - 1), (0.62, -0.95), (0.92, -1), (1, -0.7)])
+    profile = np.concatenate([rim, rim[::-1] * [1, -1]]) * [radius, width / 2]
+    wheel = revolve(profile).rotated("z", 90).moved(x, radius)
+    return wheel.both_sides() + crossbar((-x, radius, 0), 0.1)
+
+
+@recipe(thick=(0.1, 0.18), lean_deg=(8, 25), head=(0.1, 0.3))
+def _seats(draw: Draw, body: SimpleNamespace, *, thick, lean_deg, head) -> Part:
+    """The windscreen of an open car, and two seats behind it."""
+    cowl = (0.5 - body.bonnet) * body.length
+    low, tall = body.shoulder, body.height - body.shoulder
+    up, across = np.array([[0.0], [1.0]]), np.linspace(-0.43, 0.43, 5) * body.width
+    screen = sheet(
+        points(
+            across * (1 - 0.12 * up),
+            low + 0.04 + (tall - 0.04) * up,
+            cowl - 0.06 - body.screen * body.length * up - 0.3 * across**2,
+        ),
+        0.035,
+    )
+    half, bottom = 0.15 * body.width, low - 0.4
+    back = max((0.5 - body.window) * body.length + 0.3, cowl - 1.1)
+    seat = box((2 * half, thick + 0.1, 0.5), (0, bottom + 0.1, back + 0.25))
+    rest = board(half, (bottom + 0.05, low + 0.25 * tall), (back - thick, back))
+    rest += board(0.6 * half, (low, low + head * tall + 0.25 * tall), (back - 0.8 * thick, back))
+    seat += rest.rotated("x", -lean_deg, (0, bottom, back))
+    return screen + seat.moved(x=0.21 * body.width).both_sides()
+
+
+@recipe(
+    length=(3.6, 5.2),
+    width=(1.6, 2.0),
+    wheel=(0.28, 0.36),
+    tyre=(0.2, 0.42),
+    girth=(0.5, 0.8),
+    nose=(0.2, 0.5),
+    pods=Perhaps(0.7, (0.3, 0.5)),
+    front_wing=0.75,
+    rear_wing=0.75,
+    airbox=0.7,
+)
+def racing_car(
+    draw: Draw, *, length, width, wheel, tyre, girth, nose, pods, front_wing, rear_wing, airbox
+) -> Part:
+    """A single seat in a narrow body between four free wheels, perhaps with wings."""
+    front, rear = length / 2 - draw(0.6, 1.0), 0.45 - length / 2
+    x = (width - tyre) / 2
+    y = wheel + 0.02
+    # The body: places from front to rear, widths, and heights over the axles.
+    z = np.array([0.5, 0.42, 0.3, 0.12, 0.06, -0.06, -0.1, -0.25, -0.44]) * length
+    wide = girth * np.array([0.2, 0.3, 0.5, 0.9, 1, 1, 1, 0.9, 0.35])
+    top = girth * np.array([nose - 0.1, nose, 0.3, 0.45, 0.15, 0.15, 0.6, 0.5, 0.2])
+    low = 0.14 - y + np.array([nose, 0.7 * nose, 0.3 * nose, 0, 0, 0, 0, 0.02, 0.1]) * 0.5
+    top = np.maximum(top, low + 0.12)
+    section = rectangle(1.0, 1.0, 0.25, 3)[None]
+    height = ((top + low) / 2)[:, None] + section[..., 1] * (top - low)[:, None]
+    part = loft(points(section[..., 0] * wide[:, None], y + height, z[:, None]))
+    part += ellipsoid((0.27, 0.3, 0.27), (0, y + 0.15 * girth + 0.22, -0.01 * length))
+    part += bar((0, y, -0.02 * length), (0, y + 0.15 * girth + 0.15, -0.02 * length), 0.2)
+    if airbox:
+        path = [(0, y + 0.5 * girth, -0.12 * length), (0, y + 0.85 * girth, -0.13 * length)]
+        path += [(0, y + 0.35 * girth, -0.36 * length)]
+        part += tube(path, [0.15, 0.12, 0.06])
+    if pods:
+        part += between(
+            (0.3 * girth, 0.13, -0.3 * length),
+            (0.42 * girth + 0.3 * pods, 0.13 + pods, 0.08 * length),
+            0.12,
+        ).both_sides()
+    pair = _wheels(wheel, tyre, x, draw(0.1, 0.6))
+    for axle in (front, rear):
+        part += pair.moved(z=axle)
+        for ahead in (-0.35, 0.35):
+            arm = bar((0.1, y, axle + ahead), (x, y, axle), 0.05)
+            part += arm.both_sides()
+    if front_wing:
+        half, z = 0.47 * width, 0.5 * length - draw(0.0, 0.1)
+        part += wing([(-half, 0.16, z, 0.35, 0.12), (half, 0.16, z, 0.35, 0.12)])
+        part += between((half - 0.03, 0.06, z - 0.4), (half, 0.34, z + 0.02)).both_sides()
+        part += bar((0, 0.16, z - 0.2), (0, y + top[1] - 0.05, z - 0.3), 0.12)
+    if rear_wing:
+        half, high = 0.4 * width, y + draw(0.35, 0.75)
+        part += wing([(-half, high, rear - 0.1, 0.4, 0.12), (half, high, rear - 0.1, 0.4, 0.12)])
+        part += between((half - 0.03, y, rear - 0.55), (half, high + 0.1, rear - 0.05)).both_sides()
+        part += bar((0, y, rear), (0, high, rear - 0.3), 0.1)
     return part
 
 
@@ -97,24 +201,25 @@ def _hull(body: SimpleNamespace) -> Part:
     length = body.length
     belt = body.shoulder
     boot = min(body.window * length, length - 0.12)
-    # start and end of the open box
-    bed = (boot + 0.06, length - 0.08) if body.has_bed else (length, length)
-
     # The upper edge of the body seen from the side: distance from the front bumper, and height.
     cowl = body.bonnet * length
     roof_rear = body.roof * length
     roof_front = cowl + body.screen * length
+    # start and end of the open box
+    beds = {"pickup": (boot + 0.06, length - 0.08), "roadster": (cowl + 0.1, boot)}
+    bed = beds.get(body.kind, (length, length))
     side_view = [
         (0, 0.75 * belt),
         (0.06, 0.9 * belt),
         (0.22, belt),
         (cowl, belt + 0.08),
-        (roof_front, body.height),
     ]
-    side_view += [
-        ((roof_front + roof_rear) / 2, body.height + 0.015),
-        (roof_rear, body.height - 0.02),
-    ]
+    if body.kind != "roadster":
+        side_view += [
+            (roof_front, body.height),
+            ((roof_front + roof_rear) / 2, body.height + 0.015),
+            (roof_rear, body.height - 0.02),
+        ]
     side_view += [(boot, belt + 0.07), (length - 0.08, belt + 0.04), (length, 0.85 * belt)]
     line = rounded_path(side_view, 0.12, 2)
     line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
@@ -181,3 +286,4 @@ def _hull(body: SimpleNamespace) -> Part:
 
 
 KINDS = {partial(car, kind=kind): weight for kind, (weight, *_) in _KINDS.items()}
+KINDS[racing_car] = 0.9

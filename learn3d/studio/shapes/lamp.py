@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .draw import Draw, ellipse, points, recipe, rectangle, rounded_path, shares
+from .draw import Draw, Perhaps, ellipse, points, recipe, rectangle, rounded_path, shares
 from .parts import Part, bar, crossbar, ellipsoid, join, pole, revolve, slab, tube
 
 
@@ -64,9 +64,9 @@ def table_lamp(
     return lamp + _shade(draw, shade * max(width, 0.09), shade_height).moved(y=top - 0.02)
 
 
-@recipe(height=(1.0, 1.5), thick=(0.025, 0.04), plate=0.5)
-def floor_lamp(draw: Draw, *, height, thick, plate) -> Part:
-    """A tall pole on a plate or on three legs, with a shade on top."""
+@recipe(height=(1.0, 1.5), thick=(0.025, 0.04), plate=0.5, tray=Perhaps(0.15, (0.3, 0.55)))
+def floor_lamp(draw: Draw, *, height, thick, plate, tray) -> Part:
+    """A tall pole on a plate or on three legs, with a shade on top, perhaps with a tray."""
     if plate:
         lamp = _foot(draw, draw(0.26, 0.4)) + pole(0.01, height, thick)
     else:
@@ -75,6 +75,10 @@ def floor_lamp(draw: Draw, *, height, thick, plate) -> Part:
         lamp = pole(knee - 0.03, height, 1.3 * thick)
         for angle in np.radians([90, 210, 330]):
             lamp += bar((reach * np.cos(angle), 0, reach * np.sin(angle)), (0, knee, 0), thick)
+    if tray:
+        size = draw(0.3, 0.5)
+        lamp += pole(0.0 if plate else tray * height, height, thick)
+        lamp += slab(draw.pick([ellipse, rectangle])(size, size), 0.025, y=tray * height)
     return lamp + _shade(draw, draw(0.17, 0.3), draw(0.2, 0.36)).moved(y=height - 0.02)
 
 

@@ -52,6 +52,9 @@ def table_with_legs(draw: Draw) -> Part:
     table = top + legs(draw, half_x, half_z, under, size=size)
     if draw.maybe(0.5):
         table += apron(half_x, half_z, under, draw(0.05, 0.16), 0.4 * size)
+    if draw.maybe(0.2):  # a shelf between the legs
+        y = draw(0.15, 0.45) * under
+        table += between((-half_x, y, -half_z), (half_x, y + 0.4 * size, half_z))
     return table
 
 
