@@ -48,7 +48,7 @@ def read_curves(files: list[str]) -> Curves:
 
 def draw(curves: Curves) -> Figure:
     """IoU above, MMD below."""
-    figure = Figure(figsize=(2.6 * len(curves) + 0.4, 4.6), layout="constrained")
+    figure = Figure(figsize=(max(2.6 * len(curves) + 0.4, 4.8), 4.6), layout="constrained")
     axes = figure.subplots(2, len(curves), sharex="col", squeeze=False)
     for column, (title, methods) in enumerate(curves.items()):
         axes[0, column].set_title(title)

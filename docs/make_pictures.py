@@ -149,6 +149,11 @@ PICTURES = {
         "{folder}/grid.png",
         ("learn3d/studio/tables/grids.py",),
     ),
+    "results-curves.png": Picture(
+        "python docs/draw_curves.py --output {folder}/curves.png ablation-5000",
+        "{folder}/curves.png",
+        ("docs/draw_curves.py", "docs/results/ablation-5000.json"),
+    ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
         "{folder}/tsne.png",

@@ -6,7 +6,7 @@ python tools/train_outlines.py --models models
 Objects are generated, drawn by nmr, and composed before drawn rooms and parts of photographs. The
 photographs, textures, and cut-outs of other things come from Debian's packages, which apt-get
 downloads (500 MB). `tools/measure_cutouts.py` measures the result; none of its photographs and
-objects is used here. It takes half an hour of processor time.
+objects is used here. It takes fifty minutes of processor time.
 """
 
 import io
@@ -520,7 +520,7 @@ def main(
     output: Path = Path("output/outlines"),
     models: Path | None = None,
     objects: int = 4000,
-    steps: int = 5600,
+    steps: int = 13000,
     learning_rate: float = 2e-3,
     coarse: float = 0.45,
     weights: Path = WEIGHTS,
