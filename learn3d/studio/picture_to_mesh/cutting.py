@@ -25,6 +25,7 @@ KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
 _ROUNDS = 3  # of GrabCut
 _AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
 _CERTAIN = 0.995  # probability from which GrabCut does not decide
+_BOXED = 0.2  # share of a box's view with which GrabCut starts if the network finds nothing there
 _SMALL_HOLE = 0.002  # smaller holes are filled, as a share of the object
 _TOUCHED = 0.03  # share of a side of the picture, from which the object touches it
 _RECTANGLE = 0.9  # share of its box that an upright rectangle fills
@@ -157,6 +158,8 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, flo
             "the box covers the whole picture; leave some background around the object"
         )
     view, logits = find_object(colors, None if box is None else (x, y, x + w, y + h))
+    if box is not None and logits.max() < 0:  # whoever drew the box sees something
+        logits = logits - np.quantile(logits, 1 - _BOXED)
     left, top, right, bottom = view
     part = Image.fromarray(colors).crop(view)
     part.thumbnail((SIDE, SIDE), Image.Resampling.BOX)
