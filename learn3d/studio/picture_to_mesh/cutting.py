@@ -158,7 +158,7 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, flo
             "the box covers the whole picture; leave some background around the object"
         )
     view, logits = find_object(colors, None if box is None else (x, y, x + w, y + h))
-    if box is not None and logits.max() < 0:  # whoever drew the box sees something
+    if box is not None and logits.max() < 0:  # the box says that something is there
         logits = logits - np.quantile(logits, 1 - _BOXED)
     left, top, right, bottom = view
     part = Image.fromarray(colors).crop(view)

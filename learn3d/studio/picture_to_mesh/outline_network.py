@@ -69,7 +69,7 @@ def load_outline_network() -> OutlineNetwork:
 
 
 def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[View, np.ndarray]:
-    """The main object of a picture uint8 [H, W, 3]: a view around it, and the network's logits [S, S] of the view.
+    """Find the main object of a picture uint8 [H, W, 3]: a view around it, and the logits [S, S] of that view.
 
     With a box, it is the object that fills the box. Otherwise the network looks at the whole
     picture first, and then at the surroundings of the object that it saw.
@@ -84,7 +84,7 @@ def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[View, np.
 
 
 def place_view(place: Place, width: float, height: float) -> View:
-    """The part of a picture for the network: the object's place, wider by `MARGIN`, cut at the picture's sides."""
+    """The part of a picture that the network sees: the object's place and `MARGIN` around it, within the picture."""
     left, top, right, bottom = place
     wide, high = (1 + 2 * MARGIN) * (right - left), (1 + 2 * MARGIN) * (bottom - top)
     wide, high = max(wide, NARROW * high, 2) / 2, max(high, NARROW * wide, 2) / 2

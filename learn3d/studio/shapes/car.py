@@ -27,10 +27,10 @@ TYRE = 0.22  # width of the wheels
 
 # The weight of each kind, the smallest and largest measures. length, width, height, wheel
 # (radius) and clearance (of the floor over the ground) are in metres. bonnet and screen
-# (lengths), roof (its end; a roadster has none) and window (end of the rear window or of the
-# seats, start of the boot or bed) are shares of the length. belt: height of the shoulder line
-# under the windows, share of the height.
-# lean: inward lean of the side windows per height.
+# (lengths), roof (where it ends) and window (where the rear window ends, and the boot or bed
+# starts) are shares of the length. belt: height of the shoulder line under the windows, share of
+# the height. lean: inward lean of the side windows per height. A roadster has no roof, so
+# that measure does not count; its open cabin ends at window.
 _FIELDS = "length width height wheel clearance bonnet screen roof window belt lean".split()
 _KINDS = {
     "sedan":     (2.5, ( 4.2,  1.70,  1.38,  0.30,  0.14,  0.25,  0.14, 0.66,  0.80, 0.56, 0.20),
@@ -132,7 +132,7 @@ def racing_car(
     front, rear = length / 2 - draw(0.6, 1.0), 0.45 - length / 2
     x = (width - tyre) / 2
     y = wheel + 0.02
-    # The body: places from front to rear, widths, and heights over the axles.
+    # Sections of the body from front to rear: z, width, and upper and lower edge over the axles.
     z = np.array([0.5, 0.42, 0.3, 0.12, 0.06, -0.06, -0.1, -0.25, -0.44]) * length
     wide = girth * np.array([0.2, 0.3, 0.5, 0.9, 1, 1, 1, 0.9, 0.35])
     top = girth * np.array([nose - 0.1, nose, 0.3, 0.45, 0.15, 0.15, 0.6, 0.5, 0.2])
@@ -201,13 +201,14 @@ def _hull(body: SimpleNamespace) -> Part:
     length = body.length
     belt = body.shoulder
     boot = min(body.window * length, length - 0.12)
-    # The upper edge of the body seen from the side: distance from the front bumper, and height.
     cowl = body.bonnet * length
-    roof_rear = body.roof * length
-    roof_front = cowl + body.screen * length
-    # start and end of the open box
+    # start and end of the open box behind the cabin, or of the open cabin
     beds = {"pickup": (boot + 0.06, length - 0.08), "roadster": (cowl + 0.1, boot)}
     bed = beds.get(body.kind, (length, length))
+
+    # The upper edge of the body seen from the side: distance from the front bumper, and height.
+    roof_rear = body.roof * length
+    roof_front = cowl + body.screen * length
     side_view = [
         (0, 0.75 * belt),
         (0.06, 0.9 * belt),

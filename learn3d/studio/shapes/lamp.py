@@ -77,7 +77,8 @@ def floor_lamp(draw: Draw, *, height, thick, plate, tray) -> Part:
             lamp += bar((reach * np.cos(angle), 0, reach * np.sin(angle)), (0, knee, 0), thick)
     if tray:
         size = draw(0.3, 0.5)
-        lamp += pole(0.0 if plate else tray * height, height, thick)
+        if not plate:  # down to the tray, which may be below the knee
+            lamp += pole(tray * height, height, thick)
         lamp += slab(draw.pick([ellipse, rectangle])(size, size), 0.025, y=tray * height)
     return lamp + _shade(draw, draw(0.17, 0.3), draw(0.2, 0.36)).moved(y=height - 0.02)
 
