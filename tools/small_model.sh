@@ -30,5 +30,4 @@ again=$([ -e "$out/run" ] && echo --resume || true)
 "$bin/learn3d" train --data "$out/data" --category "$categories" --preset many-views-around \
     --iterations "${STEPS:-36000}" --validate-every 5000 --max-val-images 720 --output "$out/run" $again
 "$bin/learn3d" evaluate "$out/run" --data "$out/data" --json "$out/evaluation.json"
-mkdir -p learn3d/models
 "$bin/learn3d" export --run "$out/run" --output learn3d/studio/picture_to_mesh/small.safetensors ${OTHERS:+--others "$OTHERS"}

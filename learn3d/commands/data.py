@@ -6,7 +6,7 @@ from pathlib import Path
 from learn3d.commands.command import Command, DataFolder, Split
 from learn3d.data import shards
 from learn3d.data.conventions import IMAGE_SIZE, SET_FILE, has_shards, shards_folder, synset_of
-from learn3d.data.layouts import Layout, check_folder, load_dataset, reader
+from learn3d.data.layouts import Layout, check_folder, check_options, load_dataset, reader
 from learn3d.files.writing import check_target, write_json
 from learn3d.settings import Count, split_names
 from learn3d.tasks import Task, Workers, run_tasks
@@ -93,6 +93,7 @@ class ConvertDataset(Command):
 
     def run(self) -> int:
         check_target(self.output, "--output", folder=True)
+        check_options(self.layout, image_size=self.image_size)
         found = reader(self.layout).contents(self.data)
         splits_of = {synset_of(category): splits for category, splits in found.items()}
         if not (wanted := split_names(self.category) or found):

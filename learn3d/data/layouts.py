@@ -65,7 +65,7 @@ def require_folder(folder: Path | str) -> None:
     folder = Path(folder)
     if not folder.is_dir():
         absolute = "" if folder.is_absolute() else f" ({folder.absolute()})"
-        advice = "give the folder of the data set with --data, or make it (learn3d make-dataset)"
+        advice = "give the folder of the data set, or make it (learn3d make-dataset)"
         raise MissingFile(folder, f"there is no such folder{absolute}; {advice}")
 
 
@@ -162,7 +162,7 @@ def _check_layout(folder: Path | str, asked: str) -> None:
         ):  # a list of objects is damaged, or of another layout
             found += [layout] * bool(reader(layout).contents(folder))
     if found and asked not in found:
-        advice = f"add --layout {found[0]}, or choose another folder or preset"
+        advice = f"add --layout {found[0]} if the command has that option, or choose another folder, preset or run"
         message = f"this is a data set of the layout {found[0]!r}, not {asked!r}; {advice}"
         raise MissingFile(Path(folder), message) from None
 
@@ -204,13 +204,15 @@ def check_folder(
     check_options(layout)
     require_folder(folder)
     found = find_splits(folder, f"*/SPLIT/{SET_FILE}")
-    with contextlib.suppress(
-        *(ValueError, OSError) if found or categories else ()
-    ):  # the check finds this fault, too
+    try:
         for category, there in reader(layout).contents(folder).items():
             found[category] = tuple(
                 split for split in SPLITS if split in (*there, *found.get(category, ()))
             )
+    except (ValueError, OSError):  # the check finds this fault, too
+        if not found and not categories:
+            _check_layout(folder, layout)
+            raise
     if not found and not categories:
         _check_layout(folder, layout)
         raise MissingFile(

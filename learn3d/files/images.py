@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile, MissingFile, faults_of, open_file
@@ -23,7 +23,10 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
     """
     wanted = f"an image in the format {', '.join(formats)}"
     with faults_of(path, wanted), open_file(path, limits.IMAGE_FILE_BYTES, wanted) as file:
-        image = Image.open(file, formats=formats)
+        try:
+            image = Image.open(file, formats=formats)
+        except UnidentifiedImageError:
+            raise ValueError("it has another format") from None
         pixels = image.width * image.height
         most = limits.IMAGE_PIXELS
         if max(image.size) > max_side or pixels > most:

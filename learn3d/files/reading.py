@@ -81,6 +81,8 @@ def faults_of(path: Path | str, wanted: str, advice: str = FETCH_AGAIN) -> Itera
         reason = (str(error).strip().splitlines() or [""])[0][:300]
         if isinstance(error, MemoryError):
             reason = "it takes too much memory"
+        elif isinstance(error, OSError) and error.strerror:
+            reason = error.strerror.lower()
         elif type(error) not in (ValueError, EOFError):
             reason = f"{type(error).__name__}: {reason}".removesuffix(": ")
         advice = FETCH_AGAIN if isinstance(error, EOFError) else advice

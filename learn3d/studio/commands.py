@@ -97,6 +97,8 @@ class EstimatePoses(Command):
 
     def run(self) -> None:
         check_target(self.output, "--output")
+        if self.output.suffix != ".npz":
+            raise ValueError(f"--output must end in .npz, got {self.output}")
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
         views = estimate_views(datasets, self.cameras, self.options)
         table, offset_deg = views.table, 0.0

@@ -97,13 +97,10 @@ def _read(path: Path, kind: str, count: int | None) -> np.ndarray:
             for prefix, splits in contents(path.parent).items()
             for s in splits
         ]
-        missing = (
-            "is missing: a split is two files, *_images.npz and *_voxels.npz. The folder holds: "
-        )
-        missing += (
-            f"{', '.join(there) or 'none'}. Choose one of these, or make it (learn3d make-dataset)"
-        )
-        raise MissingFile(path, missing)
+        missing = "is missing: a split is two files, *_images.npz and *_voxels.npz."
+        choice = f"The folder holds: {', '.join(there)}. Choose one of these, or make it"
+        advice = choice if there else "The folder holds no split. Make one"
+        raise MissingFile(path, f"{missing} {advice} (learn3d make-dataset)")
     dtype, shape = _ARRAYS[kind]
     wanted = f"an npz file with {dtype} [N, {', '.join(map(str, shape))}] under the key '{_KEY}' and no pickled objects"
     max_bytes = None if count is None else count * math.prod(shape) * dtype.itemsize

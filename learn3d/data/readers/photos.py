@@ -30,6 +30,7 @@ from learn3d.files.reading import (
     FAULTS,
     DamagedFile,
     FaultHandler,
+    MissingFile,
     OddFile,
     attempt,
     faults_of,
@@ -84,6 +85,13 @@ def load(
     """
     synset_of(category)  # raises ValueError for a path, which would lead to other folders
     table = Path(folder) / category / TABLE
+    if not table.parent.is_dir():
+        there = f"the folder holds: {', '.join(contents(folder)) or 'no category'}"
+        inside = (Path(folder) / "images").is_dir()
+        raise MissingFile(
+            table.parent,
+            f"is missing; {'give the folder that holds the category' if inside else there}",
+        )
     photos = read_photo_table(table, on_fault)
     splits = split_objects(table, photos)
     chosen, training = (

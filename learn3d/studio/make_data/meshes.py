@@ -173,9 +173,8 @@ def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
         }
         found = {name: partial(read_mesh, paths[name]) for name in sorted(paths)}
     if not found:
-        raise ValueError(
-            f"there is no mesh in {source}; give {_PACK}, or a folder of {', '.join(EXTENSIONS)}"
-        )
+        wrong = f"there is no mesh in {source}" if source.exists() else f"{source} does not exist"
+        raise ValueError(f"{wrong}; give {_PACK}, or a folder of {', '.join(EXTENSIONS)}")
     return found
 
 

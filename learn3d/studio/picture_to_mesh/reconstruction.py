@@ -107,7 +107,7 @@ def cut_out_pictures(model: Model, folder: Path) -> Tensor:
     """All PNG files with transparency in a folder as stored images uint8 [M, 4, S, S]. ValueError if there are none."""
     files = sorted(folder.rglob("*.png"))
     if not files:
-        raise ValueError(f"there is no PNG file in {folder}")
+        raise ValueError(f"there is no PNG file in {folder}; give a folder of cut-out pictures")
     photos = ((colors, keep_object(mask)[0]) for colors, mask in map(read_photo, files))
     return torch.from_numpy(np.stack([model.prepare(*photo) for photo in photos]))
 
@@ -391,8 +391,10 @@ def reconstruct_guesses(
     one.
     progress: called with the name of each stage and the share that is done.
 
-    Raises ValueError if the model was not trained on the category.
+    Raises ValueError if the model was not trained on the category, or if guesses is below 1.
     """
+    if guesses < 1:
+        raise ValueError(f"guesses must be at least 1, got {guesses}")
     if category is not None:
         check_category(model, category)
     colors, mask = fill_drawing(colors, mask)

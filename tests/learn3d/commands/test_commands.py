@@ -162,7 +162,10 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
         ("train --data {tmp} --category airplane --output {tmp}/run", "02691156_train_images.npz"),
         ("train --output {tmp} --resume", "to start a new run, leave out --resume"),
         ("train --out {tmp} --resume", "--resume needs --output: the folder of the run"),
-        ("train --data {tmp}/no --category chair --output {tmp}/run", "data set with --data"),
+        (
+            "train --data {tmp}/no --category chair --output {tmp}/run",
+            "no: there is no such folder",
+        ),
         (
             "train --output {run} --resume --preset vanilla",
             "with the preset peng2020-kato, got peng2020-kato-vanilla",
@@ -173,6 +176,14 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
             "03636649_train_images.npz: is missing",
         ),
         ("check-dataset {tmp}/no", "there is no such folder"),
+        (
+            "convert-dataset --data {data} --output {tmp}/x --image-size 128",
+            "images of the layout 'kato' have 64x64 pixels, but 128 are wanted",
+        ),
+        (
+            "estimate-poses {data} --category airplane --output {tmp}/poses.png",
+            "--output must end in .npz, got {tmp}/poses.png",
+        ),
         ("evaluate", "give at least one run"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),
         (
@@ -190,7 +201,10 @@ def test_the_help_of_evaluate_explains_every_column(command) -> None:
             "reconstruct --run {run} --data {data} --output {tmp}/file/x",
             "cannot write {tmp}/file/x: Not a directory; give another",
         ),
-        ("reconstruct --run {run} --data {tmp}/nope --output {tmp}/x", "data set with --data"),
+        (
+            "reconstruct --run {run} --data {tmp}/nope --output {tmp}/x",
+            "nope: there is no such folder",
+        ),
     ],
 )
 def test_mistakes_are_one_clear_line_before_a_model_is_loaded(

@@ -98,7 +98,7 @@ def test_missing_files_are_named_with_those_that_are_there(folder) -> None:
     (folder / VOXELS).unlink()
     with pytest.raises(FileNotFoundError, match=rf"{VOXELS}: is missing: a split is two files"):
         kato.load(folder, "chair", "test")
-    with pytest.raises(FileNotFoundError, match="The folder holds: none"):
+    with pytest.raises(FileNotFoundError, match="The folder holds no split"):
         kato.load(folder / "nowhere", "chair", "test")
 
 

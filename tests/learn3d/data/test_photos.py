@@ -241,7 +241,7 @@ def test_photographs_without_poses_learn_from_an_estimate(
     refused(chairs, "images: is empty; expected photographs")
 
 
-def test_other_files_than_tables_are_named(chairs: Path, tmp_path: Path) -> None:
+def test_other_files_than_tables_are_named(chairs: Path) -> None:
     header = ",".join(COLUMNS)
     for content, message in {
         "": "has the columns ; expected a table of photographs with the columns file, azimuth_deg",
@@ -255,8 +255,13 @@ def test_other_files_than_tables_are_named(chairs: Path, tmp_path: Path) -> None
     }.items():
         (chairs / "poses.csv").write_text(content, "latin-1")
         refused(chairs, f"poses.csv: {message}")
-    with pytest.raises(FileNotFoundError, match=r"none/chair/poses.csv: is missing; expected a"):
-        photos.load(tmp_path / "none", "chair", "train")
+
+
+def test_a_missing_category_is_named_with_those_that_are_there(chairs: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="mug: is missing; the folder holds: chair"):
+        photos.load(chairs.parent, "mug", "train")
+    with pytest.raises(FileNotFoundError, match="give the folder that holds the category"):
+        photos.load(chairs, "chair", "train")
 
 
 def test_objects_must_be_in_one_split(chairs: Path) -> None:

@@ -158,7 +158,7 @@ def test_split_is_test_then_val_then_train_of_one_permutation():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"source": "nowhere"}, "there is no mesh in .* or a folder"),
+        ({"source": "nowhere"}, "nowhere does not exist; give .* or a folder"),
         ({"source": "nothing"}, "there is no mesh"),
         ({"source": "bad"}, r"no mesh is left for training; .* a.obj: no faces"),
         ({"procedural": 3, "front": "x"}, "must have its axes: --up y --front z"),

@@ -91,6 +91,8 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
 def test_guesses_differ_and_a_known_category_is_obeyed(model: Model) -> None:
     shown = picture("chair", int(model.templates.numbers[2, 8]))
     first, *others = reconstruct_guesses(model, *shown, guesses=3)
+    with pytest.raises(ValueError, match="guesses must be at least 1, got 0"):
+        next(reconstruct_guesses(model, *shown, guesses=0))
     assert first.kind == "chair" and 1 <= len(others) <= 2
     grids = [
         nmr.voxelize(0.99 * made.surface.vertices + 0.5, made.surface.faces)
