@@ -19,6 +19,7 @@ STEP_IMAGES = 128  # the methods have steps of different sizes, so steps are cou
 METHODS = {
     "vanilla": ("Vanilla-AE", "#d1495b"),
     "without-adversarial": ("without the adversarial loss", "#edae49"),
+    "without-prior": ("without the prior", "#8d6cab"),
     "proposed": ("Proposed", "#00798c"),
     "plus": ("Plus", "#7a7a7a"),
 }

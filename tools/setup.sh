@@ -28,6 +28,11 @@ setup() { # extra of the package to install into .venv: report, site or test
         "$base" -m venv --clear .venv || fail "could not make a virtual environment in $PWD/.venv"
     fi
     step "Installing the package and compiling the renderer (torch takes most of the time)"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt ".[$1]" ||
+    install=(.venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt)
+    if [ "$(uname)" = Linux ]; then # PyPI's torch brings gigabytes of CUDA
+        "${install[@]}" --retries 0 --index-url https://download.pytorch.org/whl/cpu torch 2>/dev/null ||
+            echo "The index of torch for CPUs cannot be reached; PyPI's torch is taken."
+    fi
+    "${install[@]}" ".[$1]" ||
         fail "the installation failed; see the messages above (often: no network, no compiler or no disk space)"
 }
