@@ -3,6 +3,7 @@
 python docs/make_pictures.py views.png     # draw this one (without names: list them, and say which are out of date)
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
 OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of `learn3d experiment plus`
+OUTPUT=long python docs/make_pictures.py results-long.png         # from the runs of `learn3d experiment kato` with 5,000 steps
 """
 
 import base64
@@ -46,6 +47,8 @@ _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
+_LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
+_CURVES = ("kato-5000", "ablation-5000")
 _FUNCTIONS = (
     "silhouette",
     "rgb",
@@ -149,10 +152,15 @@ PICTURES = {
         "{folder}/grid.png",
         ("learn3d/studio/tables/grids.py",),
     ),
+    "results-long.png": Picture(
+        f"learn3d figures grid --truth --images 2 --runs {_LONG} --output {{folder}}/grid.png",
+        "{folder}/grid.png",
+        ("learn3d/studio/tables/grids.py",),
+    ),
     "results-curves.png": Picture(
-        "python docs/draw_curves.py --output {folder}/curves.png ablation-5000",
+        f"python docs/draw_curves.py --output {{folder}}/curves.png {' '.join(_CURVES)}",
         "{folder}/curves.png",
-        ("docs/draw_curves.py", "docs/results/ablation-5000.json"),
+        ("docs/draw_curves.py", *(f"docs/results/{name}.json" for name in _CURVES)),
     ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",

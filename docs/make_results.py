@@ -1,4 +1,4 @@
-"""Fills the tables of docs/results.md and docs/short-trainings.md from docs/results/*.json.
+"""Fills the tables of docs/results.md, docs/short-trainings.md and docs/methods/plus.md from docs/results/*.json.
 
 python docs/make_results.py            # write the pages
 python docs/make_results.py --check    # end with status 1 if a page differs from the files
@@ -15,7 +15,7 @@ from itertools import groupby, pairwise
 from pathlib import Path
 
 DOCS = Path(__file__).parent
-PAGES = (DOCS / "results.md", DOCS / "short-trainings.md")
+PAGES = (DOCS / "results.md", DOCS / "short-trainings.md", DOCS / "methods" / "plus.md")
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+) -->\n)(?:\|.*\n)*")
 
 
