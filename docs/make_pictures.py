@@ -3,7 +3,7 @@
 python docs/make_pictures.py views.png     # draw this one (without names: list them, and say which are out of date)
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
 OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of `learn3d experiment plus`
-OUTPUT=long python docs/make_pictures.py results-long.png         # from the runs of `learn3d experiment kato` with 5,000 steps
+OUTPUT=long python docs/make_pictures.py results-long.png         # from those of `learn3d experiment kato`, 5,000 steps
 """
 
 import base64
