@@ -1,6 +1,6 @@
 """Draws voxel IoU and MMD over the training, from the curves in docs/results/*.json: a column for each category.
 
-python docs/draw_curves.py --output results-curves.png kato-5000 kato-20000 generated-5000=generated
+python docs/draw_curves.py --output results-curves.png kato-5000 ablation-5000=fp32
 
 The name of a file may be followed by a word for its data. Files with the same word are drawn together, and the longer
 curve of a run counts. Several seeds are drawn as their mean, in the band from the lowest to the highest.

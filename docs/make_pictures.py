@@ -48,7 +48,7 @@ _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
 _LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
-_CURVES = ("kato-5000", "ablation-5000")
+_CURVES = ("kato-5000", "ablation-5000=fp32")
 _FUNCTIONS = (
     "silhouette",
     "rgb",
@@ -160,7 +160,7 @@ PICTURES = {
     "results-curves.png": Picture(
         f"python docs/draw_curves.py --output {{folder}}/curves.png {' '.join(_CURVES)}",
         "{folder}/curves.png",
-        ("docs/draw_curves.py", *(f"docs/results/{name}.json" for name in _CURVES)),
+        ("docs/draw_curves.py", *(f"docs/results/{name.partition('=')[0]}.json" for name in _CURVES)),
     ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
