@@ -160,7 +160,10 @@ PICTURES = {
     "results-curves.png": Picture(
         f"python docs/draw_curves.py --output {{folder}}/curves.png {' '.join(_CURVES)}",
         "{folder}/curves.png",
-        ("docs/draw_curves.py", *(f"docs/results/{name.partition('=')[0]}.json" for name in _CURVES)),
+        (
+            "docs/draw_curves.py",
+            *(f"docs/results/{name.partition('=')[0]}.json" for name in _CURVES),
+        ),
     ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
