@@ -48,7 +48,7 @@ _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
 _LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
-_CURVES = ("kato-5000", "ablation-5000=fp32")
+_CURVES = ("kato-5000", "ablation-5000-bf16", "ablation-5000=fp32")
 _FUNCTIONS = (
     "silhouette",
     "rgb",
