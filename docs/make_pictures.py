@@ -4,6 +4,7 @@ python docs/make_pictures.py views.png     # draw this one (without names: list 
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
 OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of `learn3d experiment plus`
 OUTPUT=long python docs/make_pictures.py results-long.png         # from those of `learn3d experiment kato`, 5,000 steps
+OUTPUT=CARS_OUTPUT python docs/make_pictures.py results-cars.png  # the same for generated cars
 """
 
 import base64
@@ -48,7 +49,8 @@ _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
 _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
 _LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
-_CURVES = ("kato-5000", "ablation-5000-bf16", "ablation-5000=fp32")
+_CARS = _LONG.replace("airplane", "car")
+_CURVES = ("kato-5000", "ablation-5000-bf16", "kato-cars=generated", "ablation-cars=generated")
 _FUNCTIONS = (
     "silhouette",
     "rgb",
@@ -154,6 +156,11 @@ PICTURES = {
     ),
     "results-long.png": Picture(
         f"learn3d figures grid --truth --images 2 --runs {_LONG} --output {{folder}}/grid.png",
+        "{folder}/grid.png",
+        ("learn3d/studio/tables/grids.py",),
+    ),
+    "results-cars.png": Picture(
+        f"learn3d figures grid --truth --images 2 --runs {_CARS} --output {{folder}}/grid.png",
         "{folder}/grid.png",
         ("learn3d/studio/tables/grids.py",),
     ),
