@@ -73,14 +73,14 @@ def losses(metrics: list[dict]) -> dict[int, dict[str, float]]:
 def difference(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> float:
     """The largest |a - b| / |a| over the tensors of the networks.
 
-    Those below 1e-5 in both are left out: biases before a batch norm, whose gradient is rounding.
+    Those below 5e-6 in both are left out: biases before a batch norm, whose gradient is rounding.
     """
     assert one.keys() == other.keys()
     parts = [(a.double(), other[k].double()) for k, a in one.items() if k.startswith("network.")]
     return max(
         float((a - b).norm() / a.norm().clamp(min=1e-3))
         for a, b in parts
-        if max(a.norm(), b.norm()) > 1e-5
+        if max(a.norm(), b.norm()) > 5e-6
     )
 
 
