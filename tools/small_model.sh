@@ -11,7 +11,7 @@ bin=${BIN:-.venv/bin}
 out=${OUT:-output/small-model}
 categories=airplane,car,chair,lamp,sofa,table
 
-[ -e "$out/models" ] || "$bin/learn3d" fetch-debian-models --output "$out/models"
+[ -e "$out/models" ] || "$bin/python" tools/free_meshes/fetch.py --output "$out/models"
 "$bin/python" - "$out" <<'EOF'
 import csv, pathlib, shutil, sys
 out = pathlib.Path(sys.argv[1])

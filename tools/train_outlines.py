@@ -1,6 +1,6 @@
 """Trains the network that finds objects in photographs, and stores it in the package.
 
-learn3d fetch-debian-models --output models
+python tools/free_meshes/fetch.py --output models
 python tools/train_outlines.py --models models
 
 Objects are generated, drawn by nmr, and composed before drawn rooms and parts of photographs. The
@@ -23,6 +23,7 @@ import torch
 import torch.nn.functional as F
 import trimesh
 import tyro
+from free_meshes.debs import get_package, read_package
 from PIL import Image
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -31,7 +32,6 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.masks import mask_box
 from learn3d.pictures import photograph, save_png, tile
-from learn3d.studio.make_data.debian.models import get_package, read_package
 from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
 from learn3d.studio.picture_to_mesh.outline_network import (
@@ -530,7 +530,7 @@ def main(
     """Draw objects, and train the network on pictures that are composed of them.
 
     output: a folder for packages and drawn objects, which are used again. models: a folder of
-    meshes, as `learn3d fetch-debian-models` writes it. objects: to be drawn. weights: the file to
+    meshes, as `tools/free_meshes/fetch.py` writes it. objects: to be drawn. weights: the file to
     write. start: weights to begin with. coarse: share of the steps with smaller views.
     """
     torch.set_num_threads(threads)

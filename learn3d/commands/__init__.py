@@ -59,11 +59,6 @@ COMMANDS = {
         "report",
         "write a page about trained models, with shapes to turn",
     ),
-    "fetch-debian-models": (
-        "studio.commands:FetchDebianModels",
-        "train",
-        "get meshes out of Debian packages",
-    ),
 }
 HELP = """usage: learn3d COMMAND [OPTIONS]
 

@@ -11,7 +11,6 @@ from learn3d.data.layouts import Layout
 from learn3d.files.writing import check_target
 from learn3d.pictures import save_png
 from learn3d.settings import Count
-from learn3d.studio.make_data.debian.models import fetch_debian_models
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset, make_shards
 from learn3d.studio.picture_to_mesh.export import export
 from learn3d.studio.picture_to_mesh.reconstruction import (
@@ -47,24 +46,6 @@ class MakeDataset(Command):
             return make_shards(self.config)
         say(make_dataset(self.config).text())
         return 0
-
-
-class FetchDebianModels(Command):
-    """Extract airplanes, chairs, tables, cabinets, sofas and lamps from Debian packages, as PLY.
-
-    Example:
-      learn3d fetch-debian-models --output models
-    """
-
-    output: Path
-    """Folder to write; it must not exist."""
-    packages_dir: Path | None = None
-    """Folder for the .deb files; missing ones are downloaded into it. If not given: a temporary
-    folder."""
-
-    def run(self) -> None:
-        say(fetch_debian_models(self.output, self.packages_dir).summary())
-        say(f"written to {self.output}")
 
 
 class EstimatePoses(Command):

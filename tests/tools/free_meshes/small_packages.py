@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from learn3d.studio.make_data.debian.models import FetchReport, fetch_debian_models
-
 CATALOGUE = "PluginFurnitureCatalog.properties"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
 
@@ -118,8 +116,3 @@ def entry(name: str, stem: str, **more: str) -> dict:
         "creator": "A. Maker",
         **more,
     }
-
-
-def fetch(folder: Path, debs: Path | None) -> FetchReport:
-    """The recipe on a folder of packages."""
-    return fetch_debian_models(folder, debs)

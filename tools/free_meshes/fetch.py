@@ -1,15 +1,16 @@
-"""Real meshes from Debian packages: furniture (Sweet Home 3D) and airplanes (FlightGear).
+"""Extracts airplanes, chairs, tables, cabinets, sofas and lamps from Debian's packages, as PLY.
 
-`fetch_debian_models` writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the
-origin, of length 1. OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the
-packages' copyright files. The same packages give the same bytes.
+python tools/free_meshes/fetch.py --output models
+
+It writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the origin, of length 1.
+OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the packages' copyright
+files. The same packages give the same bytes. It runs on Debian; docs/real-meshes.md has more.
 """
 
 import csv
 import itertools
 import re
-import subprocess
-import tempfile
+import sys
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,13 +18,15 @@ from urllib.parse import unquote
 
 import numpy as np
 import trimesh
+import tyro
+from debs import get_package, read_package
+from packages import PACKAGES
 from tqdm import tqdm
 
 from learn3d.files.formats import RawMesh
 from learn3d.files.writing import publishing
-from learn3d.studio.make_data.debian.packages import PACKAGES
 from learn3d.studio.make_data.meshes import check, fit_to_box
-from learn3d.terminal import is_watched, note
+from learn3d.terminal import is_watched, note, say, without_traceback
 
 PACKAGED_CATEGORIES = ("airplane", "chair", "table", "cabinet", "sofa", "lamp")
 GRID = 24  # cells per side of the grids that are compared to find duplicates
@@ -36,7 +39,7 @@ INDEX += ("vertices", "faces", "watertight")
 
 @dataclass
 class FetchReport:
-    """The outcome of `fetch_debian_models`."""
+    """The outcome of `fetch_models`."""
 
     models: list[dict] = field(default_factory=list)  # rows of index.csv, one for each mesh
     dropped: dict[str, str] = field(default_factory=dict)  # source of each skipped model -> reason
@@ -53,7 +56,7 @@ class FetchReport:
         )
 
 
-def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> FetchReport:
+def fetch_models(output: Path, packages_dir: Path | None = None) -> FetchReport:
     """Write the meshes into the folder `output`, which appears when it is complete.
 
     packages_dir: folder of the .deb files, into which missing ones are downloaded (default: a
@@ -98,45 +101,6 @@ def fetch_debian_models(output: Path, packages_dir: Path | None = None) -> Fetch
             rows = [[row[column] for column in INDEX] for row in report.models]
             csv.writer(file, lineterminator="\n").writerows([INDEX, *rows])
     return report
-
-
-def get_package(name: str, folder: Path) -> Path:
-    """The .deb file of a package in `folder`.
-
-    If it is missing, apt-get downloads it, which needs no root rights.
-
-    Raises ValueError if apt-get fails, OSError if it is not installed.
-    """
-    if not any(folder.glob(f"{name}_*.deb")):
-        result = subprocess.run(
-            ["apt-get", "download", "-q", name], cwd=folder, capture_output=True, text=True
-        )
-        if result.returncode != 0:
-            raise ValueError(
-                f"apt-get could not download {name} ({result.stderr.strip()}); run `apt-get update` as root, enable "
-                "the component non-free if the package is in it, or put the .deb file into the folder --packages-dir"
-            )
-    return max(
-        folder.glob(f"{name}_*.deb"), key=lambda path: [*map(int, re.findall(r"\d+", path.name))]
-    )
-
-
-def read_package(package: Path, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    """The files of a .deb file whose paths (relative to /) end in `suffixes`: path -> content.
-
-    Raises ValueError for a damaged file, OSError if dpkg-deb is not installed.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        if (
-            subprocess.run(
-                ["dpkg-deb", "--extract", package, folder], capture_output=True
-            ).returncode
-            != 0
-        ):
-            raise ValueError(f"{package} cannot be read as a Debian package; download it again")
-        found = [path for path in Path(folder).rglob("*") if path.as_posix().endswith(suffixes)]
-        regular = [path for path in found if path.is_file() and not path.is_symlink()]
-        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in regular}
 
 
 def _write_model(
@@ -207,3 +171,19 @@ def surface_grid(vertices: np.ndarray, faces: np.ndarray, size: int) -> np.ndarr
             cells = np.clip(np.floor((weights @ part).reshape(-1, 3)).astype(np.int64), 0, size - 1)
             grid[tuple(cells.T)] = True
     return grid
+
+
+@without_traceback
+def main(output: Path, packages_dir: Path | None = None) -> int:
+    """Extract airplanes, chairs, tables, cabinets, sofas and lamps from Debian packages, as PLY.
+
+    output: folder to write; it must not exist. packages_dir: folder for the .deb files; missing
+    ones are downloaded into it (default: a temporary folder).
+    """
+    say(fetch_models(output, packages_dir).summary())
+    say(f"written to {output}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

@@ -14,10 +14,10 @@ from pathlib import PurePosixPath
 
 import numpy as np
 import trimesh
+from ac3d import read_ac3d
 from scipy.spatial.distance import cdist
 
 from learn3d.files.formats import RawMesh
-from learn3d.studio.make_data.debian.formats import read_ac3d
 from nmr.obj import read_obj
 
 #: Facts about a model of a package, which are columns of index.csv, with `stem`, the file name to

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import csv
+import os
 import shutil
 import subprocess
+import sys
+from functools import partial
 from pathlib import Path
 
+import fetch
 import numpy as np
 import pytest
 import trimesh
+from ac3d import read_ac3d
+from fetch import clean_mesh, fetch_models, surface_grid
+from packages import (
+    NOT_AIRPLANES,
+    furniture_category,
+    place_furniture,
+    read_catalogue,
+    remove_effects,
+)
 from small_packages import (
     AIRCRAFT,
     AIRPLANE,
@@ -21,20 +34,9 @@ from small_packages import (
     catalogue,
     deb,
     entry,
-    fetch,
 )
 
 from learn3d.files.formats import RawMesh
-from learn3d.studio.make_data.debian import models
-from learn3d.studio.make_data.debian.formats import read_ac3d
-from learn3d.studio.make_data.debian.models import clean_mesh, surface_grid
-from learn3d.studio.make_data.debian.packages import (
-    NOT_AIRPLANES,
-    furniture_category,
-    place_furniture,
-    read_catalogue,
-    remove_effects,
-)
 from nmr.obj import triangulate
 
 
@@ -90,7 +92,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> None:
-    report = fetch(tmp_path / "out", debs)
+    report = fetch_models(tmp_path / "out", debs)
     rows = list(csv.DictReader((tmp_path / "out/index.csv").open(encoding="utf-8")))
     assert [row["file"] for row in rows] == [
         "airplane/plane.ply",
@@ -117,13 +119,13 @@ def test_recipe_writes_meshes_index_and_licences(debs: Path, tmp_path: Path) -> 
         assert mesh.extents.max() == pytest.approx(1, abs=1e-6)
         np.testing.assert_allclose(mesh.bounds.mean(axis=0), 0, atol=1e-6)
         assert mesh.is_watertight == (row["watertight"] == "True")
-    fetch(tmp_path / "again", debs)
+    fetch_models(tmp_path / "again", debs)
     assert contents(tmp_path / "again") == contents(tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again", "debs", "out"]
 
 
 def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path) -> None:
-    fetch(tmp_path / "out", debs)
+    fetch_models(tmp_path / "out", debs)
     mesh = trimesh.load(tmp_path / "out/airplane/plane.ply", process=False)
     # the fin is at the tail: the nose is towards +z
     assert mesh.vertices[mesh.vertices[:, 1].argmax(), 2] < -0.3
@@ -131,15 +133,31 @@ def test_airplane_faces_front_without_its_disc(debs: Path, tmp_path: Path) -> No
     np.testing.assert_allclose(mesh.extents, [0.8, 0.4, 1.0], atol=1e-6)  # with the disc 0.801 in z
 
 
+def test_script(debs: Path, tmp_path: Path) -> None:
+    script = Path(fetch.__file__)
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONSAFEPATH"}
+    command = [sys.executable, script, "--output", "out", "--packages-dir", debs]
+    run = partial(
+        subprocess.run, command, cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    done = run()
+    assert done.returncode == 0, done.stderr
+    assert "chair        1 meshes\n" in done.stdout
+    assert (tmp_path / "out/table/test-table.ply").exists()
+    done = run()
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("error: ") and "already exists" in done.stderr
+
+
 def test_requests_that_are_refused_leave_nothing_behind(debs: Path, tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     with pytest.raises(ValueError, match="already exists"):
-        fetch(tmp_path / "there", debs)
+        fetch_models(tmp_path / "there", debs)
     file = next(debs.glob("flightgear*"))
     for content in (b"", b"!<arch>\n", file.read_bytes()[:-200]):
         file.write_bytes(content)
         with pytest.raises(ValueError, match="cannot be read as a Debian package"):
-            fetch(tmp_path / "out", debs)
+            fetch_models(tmp_path / "out", debs)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["debs", "there"]
 
 
@@ -156,15 +174,15 @@ def test_packages_are_downloaded_if_they_are_not_there(
         shutil.copy(next(debs.glob(f"{command[-1]}_*")), options["cwd"])
         return subprocess.CompletedProcess(command, 0, "", "")
 
-    monkeypatch.setattr(models.subprocess, "run", run)
+    monkeypatch.setattr(subprocess, "run", run)
     missing = {"sweethome3d-furniture-nonfree"}
-    report = fetch(tmp_path / "out", None)
+    report = fetch_models(tmp_path / "out", None)
     assert [model["title"] for model in report.models] == ["Plane plane", "Oak chair", "Table"]
     said = capsys.readouterr().err
     assert "Unable to locate package p" in said and "the component non-free" in said
     missing.add("flightgear-data-ai")
     with pytest.raises(ValueError, match="--packages-dir"):
-        fetch(tmp_path / "other", None)
+        fetch_models(tmp_path / "other", None)
 
 
 def test_clean_mesh_welds_and_drops() -> None:
