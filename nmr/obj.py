@@ -1,5 +1,5 @@
-"""Wavefront OBJ and MTL files, and polygons cut into triangles. Imports NumPy alone, for
-processes without torch.
+"""Wavefront OBJ and MTL files, and polygons cut into triangles. Does not import torch, for
+processes without it.
 """
 
 from __future__ import annotations
@@ -7,18 +7,33 @@ from __future__ import annotations
 import os
 import re
 import warnings
+from array import array
 from collections.abc import Collection, Iterable
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-_CHUNK = 2**18  # bytes that are parsed at a time
 _MOST_BYTES = 2**30  # limit of an .obj or .mtl file
-_MOST_EARS = 4096  # corners of a polygon that is no fan; the time grows with their square
 _LARGEST = float(np.finfo(np.float32).max)
 _OPTIONS = r"(?:-(?:[sot](?:\s+[-+.\d][-+.\deE]*){1,3}|mm\s+\S+\s+\S+|[a-zA-Z]+\s+\S+)\s+)*"  # of a line `map_Kd`
-# A line of a vertex that has words behind its numbers.
-_WORDS = re.compile(rb"(?mi)^(\s*v(?:[^\S\n]+[-+.\de]+(?=\s)){3,})[^\S\n]+[^-+.\d\s][^\n]*")
+
+
+def _alike(keyword: str, word: str, count: int) -> str:
+    """A pattern for up to 4096 lines of a keyword and `count` words."""
+    return rf"((?:{keyword}(?:[ \t]+{word}){{{count}}}[ \t]*\n){{1,4096}})"
+
+
+# Lines of one kind that NumPy reads at once, as most programs write them.
+_NUMBER, _INDEX = r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?", r"[1-9]\d{0,8}"
+_CORNERS = [_INDEX, f"{_INDEX}/{_INDEX}", f"{_INDEX}//{_INDEX}", f"{_INDEX}/{_INDEX}/{_INDEX}"]
+_BLOCK = re.compile(
+    "|".join(
+        [_alike("v", _NUMBER, 3), _alike("vt", _NUMBER, 2)]
+        + [_alike("f", corner, size) for size in (3, 4) for corner in _CORNERS]
+        + [r"(?:(?:(?:vn|[gos])[ \t]|#)[^\n]*\n)+"]
+    ).encode()
+)
+_TO_BLANKS = bytes.maketrans(b"vtf/", b"    ")
 
 
 class Obj(NamedTuple):
@@ -66,263 +81,180 @@ def read_obj(file: BinaryIO, with_uv: bool = True) -> Obj:
 
     Points, lines, groups, normals and unknown lines are skipped. Lines may be indented, have
     comments, be continued by a backslash, and end as on any system. A face needs texture
-    coordinates at all corners to have any. If there is no line `vt`, no face has any. It takes
-    the memory of the result twice, and some megabytes.
+    coordinates at all corners to have any. If there is no line `vt`, no face has any.
 
     with_uv: False skips texture coordinates. Raises ValueError, with the number of the line, if a
     line cannot be read or a face refers to a missing element.
     """
-    lines, rest, number = _Lines(with_uv), b"", 1
-    while True:
-        more = file.read(max(_CHUNK, len(rest)))
-        text = rest + more
-        if number == 1:
-            text = text.removeprefix(b"\xef\xbb\xbf")
-            if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
-                raise ValueError("it is UTF-16; save it as UTF-8")
-        end = _last_line_end(text) if more else len(text)
-        text, rest = text[:end], text[end:]
-        # Every replacement is as long as what it replaces. Where a backslash continues a line, a
-        # vertical tab replaces the line end.
-        if b"\r" in text:
-            text = text.replace(b"\r\n", b" \n").replace(b"\r", b"\n")
-        if b"\\" in text:
-            text = re.sub(rb"(?m)^([^#\n]*)\\( ?)\n", rb"\1 \2\v", text)
-        lines.take(text if text.endswith(b"\n") else text.rstrip(b"\0") + b"\n", number)
-        number += _count_lines(text)
-        if not more:
-            return lines.joined()
+    text = file.read().removeprefix(b"\xef\xbb\xbf")
+    if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        raise ValueError("it is UTF-16; save it as UTF-8")
+    text = text.rstrip(b"\0").replace(b"\r\n", b"\n").replace(b"\r", b"\n") + b"\n"
+    if b"\\" in text:  # a vertical tab replaces a line end, so that lines can be counted
+        text = re.sub(rb"(?m)^([^#\n]*)\\ ?\n", rb"\1 \v", text)
+    elements = _Elements(with_uv)
+    elements.read(text)
+    if elements.have_faults():  # of lines that were read at once
+        _Elements(with_uv, (len(elements.vertices) // 3, len(elements.uv) // 2)).read(text)
+    return elements.joined()
 
 
-def _last_line_end(text: bytes) -> int:
-    """The end of the last complete line, 0 if there is none. Lone carriage returns end lines if
-    no other line ends.
+class _Elements:
+    """The elements of the lines so far. counts: numbers of vertices and of texture coordinates of
+    the text; None if not known yet. With them each line is read by itself, and the first one at
+    fault is named.
     """
-    end = text.rfind(b"\n") + 1 or text.rfind(b"\r", 0, len(text) - 1) + 1
-    while text[max(end - 3, 0) : end].rstrip(b"\r\n").endswith(b"\\"):
-        end = text.rfind(b"\n", 0, end - 1) + 1
-    return end
 
-
-def _count_lines(text: bytes) -> int:
-    return text.count(b"\n") + text.count(b"\v")
-
-
-class _Lines:
-    """The elements of the lines so far."""
-
-    def __init__(self, with_uv: bool) -> None:
-        self.with_uv = with_uv
-        self.vertices, self.colors, self.uv = [], [], []  # arrays of each chunk
-        self.corners, self.uv_corners, self.sizes = [], [], []
-        self.num_vertices = self.num_uv = self.num_polygons = 0
+    def __init__(self, with_uv: bool, counts: tuple[int, int] | None = None) -> None:
+        self.with_uv, self.counts = with_uv, counts
+        self.vertices, self.colors, self.uv = array("d"), array("d"), array("d")
+        self.corners, self.uv_corners, self.sizes = array("q"), array("q"), array("q")
         self.materials, self.first_polygons, self.libraries = [""], [0], []
-        self.largest = {
-            "vertex": (-1, ""),
-            "texture coordinate": (-1, ""),
-        }  # index of a corner, and its line
 
-    def take(self, text: bytes, number: int) -> None:
-        """Add complete lines, which count from `number`. The first wrong one is found by
-        bisection.
-        """
+    def read(self, text: bytes) -> None:
+        at = 0
+        while at < len(text):
+            block = None if self.counts else _BLOCK.match(text, at)
+            if block:
+                self._take_block(block)
+                at = block.end()
+                continue
+            end = text.index(b"\n", at)
+            try:
+                self._take_line(text[at:end])
+            except (ValueError, OverflowError) as error:
+                number = 1 + text.count(b"\n", 0, at) + text.count(b"\v", 0, at)
+                shown = repr(text[at:end].decode("utf-8", "replace").strip()[:200])
+                raise ValueError(f"line {number}: {shown} cannot be read: {error}") from None
+            at = end + 1
+
+    def _take_block(self, block: re.Match[bytes]) -> None:
+        kind = (block.lastindex or 0) - 1
+        if kind < 0:
+            return
+        dtype = np.float64 if kind < 2 else np.int64
+        numbers = np.fromstring(block[0].translate(_TO_BLANKS), dtype, sep=" ")
+        if kind == 0:
+            self.vertices.frombytes(numbers.tobytes())
+        elif kind == 1:
+            self.uv.frombytes(numbers.tobytes() if self.with_uv else b"")
+        else:
+            size, form = divmod(kind - 2, len(_CORNERS))
+            corners = numbers.reshape(-1, 1 + (form > 0) + (form > 2)) - 1
+            has_uv = self.with_uv and form in (1, 3)
+            uv = corners[:, 1] if has_uv else np.full(len(corners), -1)
+            self.corners.frombytes(corners[:, 0].tobytes())
+            self.uv_corners.frombytes(uv.tobytes())
+            self.sizes.frombytes(np.full(len(corners) // (3 + size), 3 + size).tobytes())
+
+    def _take_line(self, line: bytes) -> None:
+        keyword, *words = line.partition(b"#")[0].split() or [b""]
+        keyword = keyword.lower()
+        if keyword == b"v":
+            self._take_color(words[3:])
+            self.vertices.extend(_numbers(words, 3, 3))
+        elif keyword == b"vt" and self.with_uv:
+            self.uv.extend(_numbers(words, 1, 2))
+        elif keyword in (b"f", b"fo"):
+            self._take_face(words)
+        elif keyword in (b"usemtl", b"mtllib"):
+            _, name = _keyword(line.decode("utf-8", "replace"))
+            if keyword == b"mtllib":
+                self.libraries.append(name)
+            else:
+                self.materials.append(_without_comment(name))
+                self.first_polygons.append(len(self.sizes))
+
+    def _take_color(self, words: list[bytes]) -> None:
+        """The colour of the next vertex, if the words begin with three numbers."""
         try:
-            self._parse(text, number)
-        except (ValueError, OverflowError) as error:
-            plain = _WORDS.sub(rb"\1", text)
-            if plain != text:
-                return self.take(plain, number)
-            half = len(text) // 2
-            end = text.find(b"\n", half, len(text) - 1) + 1 or text.rfind(b"\n", 0, half) + 1
-            if end == 0:
-                raise ValueError(f"line {number}: {_shown(text)} cannot be read: {error}") from None
-            self.take(text[:end], number)
-            self.take(text[end:], number + _count_lines(text[:end]))
+            color = [float(word) for word in words[:3]]
+        except ValueError:
+            return
+        if len(color) == 3:
+            self.colors.extend([np.nan] * (len(self.vertices) - len(self.colors)) + color)
 
-    def _parse(self, text: bytes, number: int) -> None:
-        plain = (
-            re.sub(rb"#[^\n]*", lambda comment: b" " * len(comment[0]), text)
-            if b"#" in text
-            else text
+    def _take_face(self, words: list[bytes]) -> None:
+        if not words:
+            raise ValueError("a face needs corners")
+        for word in words:
+            try:
+                vertex, uv, *_ = [int(part or 0) for part in word.split(b"/")] + [0]
+            except ValueError:
+                vertex = None
+            if vertex is None or word.startswith(b"/"):
+                raise ValueError("corners such as 1, 1/2, 1//3 or 1/2/3 are needed")
+            self.corners.append(self._index("vertex", vertex, len(self.vertices) // 3))
+            uv = (
+                self._index("texture coordinate", uv, len(self.uv) // 2)
+                if uv and self.with_uv
+                else -1
+            )
+            self.uv_corners.append(uv)
+        self.sizes.append(len(words))
+
+    def _index(self, name: str, number: int, before: int) -> int:
+        """The index from 0 of an element. Negative numbers count back from the elements before."""
+        index = number - 1 if number > 0 else number + before
+        if number == 0 or index < 0:
+            raise ValueError(f"there is no element {number}")
+        count = self.counts[name != "vertex"] if self.counts else None
+        if count is not None and index >= count and (count or name == "vertex"):
+            raise ValueError(f"it refers to {name} {number}, but there are {count}")
+        return index
+
+    def have_faults(self) -> bool:
+        """Whether an element is missing, or too large for float32."""
+        num_vertices, num_uv = len(self.vertices) // 3, len(self.uv) // 2
+        return (
+            max(self.corners, default=-1) >= num_vertices
+            or max(self.uv_corners, default=-1) >= (num_uv or np.inf)
+            or any(np.abs(values).max(initial=0) > _LARGEST for values in (self.vertices, self.uv))
         )
-        content = np.frombuffer(plain, np.uint8)
-        gap = _is_gap(content)
-        ends = np.flatnonzero(content == ord("\n"))
-        words = _starts(~gap)
-        rows = np.searchsorted(ends, words)
-        first = np.flatnonzero(np.diff(rows, prepend=-1))  # the words that begin a line
-        keys, rows = words[first], rows[first]
-        counts = np.diff(first, append=len(words)) - 1  # words behind the keyword
-        # in lower case
-        a, b, _ = (content[np.minimum(keys + i, len(content) - 1)] | 32 for i in range(3))
-        one, two = (gap[np.minimum(keys + i, len(content) - 1)] for i in (1, 2))
-        is_vertex = (a == ord("v")) & one
-        is_uv = (a == ord("v")) & (b == ord("t")) & two & self.with_uv
-        is_face = (a == ord("f")) & (one | ((b == ord("o")) & two))
-
-        def behind_keywords(chosen: np.ndarray) -> np.ndarray:
-            """The bytes of these lines, with blanks for the first two of each."""
-            line_chosen = np.zeros(len(ends), bool)
-            line_chosen[rows[chosen]] = True
-            blank = content.copy()
-            blank[keys[chosen]] = blank[keys[chosen] + 1] = ord(" ")
-            return blank[np.repeat(line_chosen, np.diff(ends, prepend=-1))]
-
-        width = 6 if (counts[is_vertex] > 5).any() else 3
-        vertices = _table(behind_keywords(is_vertex), counts[is_vertex], 3, 3, width)
-        uv = _table(behind_keywords(is_uv), counts[is_uv], 1, 2, 2)
-        sizes, before = counts[is_face], (np.cumsum(is_vertex)[is_face], np.cumsum(is_uv)[is_face])
-        corners = _corners(behind_keywords(is_face), sizes)
-        corners[1] *= self.with_uv
-        for k, (name, total) in enumerate(
-            zip(self.largest, (self.num_vertices, self.num_uv), strict=True)
-        ):
-            corners[k] = _absolute(corners[k], np.repeat(total + before[k], sizes), optional=k == 1)
-            at = int(corners[k].argmax()) if len(corners[k]) else 0
-            if len(corners[k]) and corners[k][at] > self.largest[name][0]:
-                row = rows[is_face][np.searchsorted(np.cumsum(sizes), at, "right")]
-                line = text[ends[row - 1] + 1 if row else 0 : ends[row] + 1]
-                where = number + _count_lines(text[: ends[row]])
-                self.largest[name] = (int(corners[k][at]), f"line {where}: {_shown(line)}")
-        for i in np.flatnonzero((a == ord("u")) | (a == ord("m"))):
-            keyword, rest = _keyword(text[keys[i] : ends[rows[i]]].decode("utf-8", "replace"))
-            if keyword == "usemtl":
-                self.materials.append(_without_comment(rest))
-                self.first_polygons.append(self.num_polygons + int(is_face[:i].sum()))
-            elif keyword == "mtllib":
-                self.libraries.append(rest)
-        self.vertices.append(vertices[:, :3])
-        self.colors.append(vertices[:, 3:].copy())
-        self.uv.append(uv)
-        self.corners.append(corners[0].astype(np.int32))
-        self.uv_corners.append(corners[1].astype(np.int32))
-        self.sizes.append(sizes.astype(np.int32))
-        self.num_vertices += len(vertices)
-        self.num_uv += len(uv)
-        self.num_polygons += len(sizes)
 
     def joined(self) -> Obj:
-        for name, count in (("vertex", self.num_vertices), ("texture coordinate", self.num_uv)):
-            index, line = self.largest[name]
-            if index >= count and (name == "vertex" or count):
-                raise ValueError(
-                    f"{line} cannot be read: it refers to {name} {index + 1}, but there are {count}"
-                )
-        has_colors = any(part.shape[1] for part in self.colors)
-        colors = [
-            part if part.shape[1] else np.full((len(part), 3), np.nan)
-            for part in self.colors
-            if has_colors
-        ]
-        vertices, uv = _joined(self.vertices, 3), _joined(self.uv, 2)
-        corners, uv_corners, sizes = (
-            _joined(parts, 1)[:, 0] for parts in (self.corners, self.uv_corners, self.sizes)
+        vertices, uv = np.array(self.vertices).reshape(-1, 3), np.array(self.uv).reshape(-1, 2)
+        corners, sizes = np.array(self.corners), np.array(self.sizes)
+        triangles = triangulate(vertices, corners, sizes)
+        uv_faces = np.array(self.uv_corners, np.int32)[triangles]
+        uv_faces[(uv_faces < 0).any(axis=1) | (len(uv) == 0)] = -1
+        polygons = np.searchsorted(np.cumsum(sizes), triangles[:, 0], "right")
+        materials = np.searchsorted(self.first_polygons, polygons, "right") - 1
+        colors = None
+        if self.colors:
+            colors = np.full(len(vertices) * 3, np.nan)
+            colors[: len(self.colors)] = self.colors
+            colors = colors.reshape(-1, 3)
+        return Obj(
+            vertices,
+            colors,
+            uv,
+            corners[triangles].astype(np.int32),
+            uv_faces,
+            materials.astype(np.int32),
+            self.materials,
+            self.libraries,
         )
-        if (sizes == 3).all():
-            faces, uv_faces = corners.reshape(-1, 3), uv_corners.reshape(-1, 3)
-        else:
-            triangles = triangulate(vertices, corners, sizes)
-            faces, uv_faces = corners[triangles], uv_corners[triangles]
-        uv_faces[(uv_faces < 0).any(axis=1) | (self.num_uv == 0)] = -1
-        runs = np.diff(self.first_polygons, append=self.num_polygons)
-        of_polygon = np.repeat(np.arange(len(runs), dtype=np.int32), runs)
-        of_face = np.repeat(of_polygon, np.maximum(sizes - 2, 0))
-        found = _joined(colors, 3) if has_colors else None
-        return Obj(vertices, found, uv, faces, uv_faces, of_face, self.materials, self.libraries)
 
 
-def _joined(parts: list[np.ndarray], width: int) -> np.ndarray:
-    """The rows of all parts, which are forgotten."""
-    joined = np.concatenate(parts).reshape(-1, width)
-    parts.clear()
-    return joined
-
-
-def _shown(line: bytes) -> str:
-    return repr(line.decode("utf-8", "replace").strip()[:200])
-
-
-def _is_gap(content: np.ndarray) -> np.ndarray:
-    """Which bytes are white space."""
-    return (content == ord(" ")) | ((content >= ord("\t")) & (content <= ord("\r")))
-
-
-def _starts(inside: np.ndarray) -> np.ndarray:
-    """The first index of each run of True."""
-    return np.flatnonzero(inside & ~np.concatenate([[False], inside[:-1]]))
-
-
-def _numbers(data: np.ndarray, dtype: type, count: int, wanted: str) -> np.ndarray:
-    """The numbers of a text. Raises ValueError(wanted) if there are others than `count`."""
+def _numbers(words: list[bytes], least: int, needed: int) -> list[float]:
+    """The first `needed` numbers of a line, 0 for missing ones. Raises ValueError for fewer than
+    `least`.
+    """
     try:
-        values = np.fromstring(data.tobytes(), dtype=dtype, sep=" ")
+        values = [float(word) for word in words[:needed]]
     except ValueError:
-        values = np.empty(0)
-    if len(values) != count:
-        raise ValueError(wanted)
-    return values
-
-
-def _table(data: np.ndarray, counts: np.ndarray, least: int, needed: int, width: int) -> np.ndarray:
-    """The first numbers of each line, float64 [N, width].
-
-    A missing number is 0 in the first `needed` columns, else NaN. Raises ValueError for lines of
-    fewer than `least` numbers, and if one of the needed ones is not finite in float32.
-    """
-    wanted = f"{needed} numbers are needed, finite in float32"
-    if not len(counts):
-        return np.empty((0, width))
-    values = _numbers(data, np.float64, counts.sum(), wanted)
-    column = np.arange(width)
-    index = (np.cumsum(counts) - counts)[:, None] + column
-    missing = np.where(column < needed, 0, np.nan)
-    table = np.where(column < counts[:, None], values[np.minimum(index, len(values) - 1)], missing)
-    if counts.min() < least or not (np.abs(table[:, :needed]) <= _LARGEST).all():
-        raise ValueError(wanted)
-    return table
-
-
-def _corners(data: np.ndarray, sizes: np.ndarray) -> list[np.ndarray]:
-    """The numbers of the vertices and of the texture coordinates (0 if missing) of all corners,
-    int64 [N] each.
-    """
-    wanted, count = "corners such as 1, 1/2, 1//3 or 1/2/3 are needed", int(sizes.sum())
-    if len(sizes) and sizes.min() == 0:
-        raise ValueError("a face needs corners")
-    slash, gap = data == ord("/"), _is_gap(data)
-    starts = _starts(~(slash | gap))
-    numbers = _numbers(np.where(slash, np.uint8(ord(" ")), data), np.int64, len(starts), wanted)
-    if not slash.any():
-        return [numbers, np.zeros(count, np.int64)]
-    slashes, corners = np.cumsum(slash, dtype=np.int32), _starts(~gap)
-    corner = np.searchsorted(corners, starts, "right") - 1
-    place = slashes[starts] - (slashes[corners] - slash[corners])[corner]
-    if np.count_nonzero(place == 0) != count:
-        raise ValueError(wanted)
-    uv = np.zeros(count, np.int64)
-    uv[corner[place == 1]] = numbers[place == 1]
-    return [numbers[place == 0], uv]
-
-
-def _absolute(numbers: np.ndarray, before: np.ndarray, optional: bool) -> np.ndarray:
-    """Indices from 0; -1 for the number 0 if it is optional. Negative numbers count back from the
-    elements before.
-    """
-    indices = np.where(numbers > 0, numbers - 1, numbers + before)
-    missing = numbers == 0
-    indices[missing] = -1
-    wrong = (indices < 0) & ~(missing & optional)
-    if wrong.any():
-        raise ValueError(f"there is no element {numbers[wrong][0]}")
-    return np.minimum(indices, 2**31 - 1)
+        values = []
+    if len(values) < least or not all(abs(value) <= _LARGEST for value in values):
+        raise ValueError(f"{needed} numbers are needed, finite in float32")
+    return values + [0.0] * (needed - len(values))
 
 
 def triangulate(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Cut simple polygons, convex or not, into triangles.
 
-    A polygon becomes the fan around its first corner whose triangles do not fold over: for convex
-    polygons, corner 0. If every fan around its first eight corners folds, the polygon is cut by
-    its ears.
+    A polygon becomes the fan around its first corner. If a triangle of the fan folds over, as in
+    concave polygons, Mapbox's earcut cuts the polygon, and leaves out corners on a straight side.
 
     Parameters
     ----------
@@ -334,106 +266,46 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) ->
 
     Returns
     -------
-    int32 [T, 3]
-        Indices in `corners`. Polygon i gives ``sizes[i] - 2`` consecutive rows, in the order of
-        the polygons, with its winding.
+    integers [T, 3]
+        Indices in `corners`, in the order of the polygons, with their winding.
 
     Raises
     ------
     ValueError
-        If a corner is outside of the vertices, and for polygons of over 4096 corners that are no
-        fan.
+        If a corner is outside of the vertices.
     """
     if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
         raise ValueError(f"a polygon refers to a missing vertex; there are {len(vertices)}")
-    if (sizes == 3).all():
-        return np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-    rows, starts = np.maximum(sizes - 2, 0), np.cumsum(sizes) - sizes
-    first_rows = np.cumsum(rows) - rows
-    triangles = np.empty((int(rows.sum()), 3), np.int32)
-    order = np.argsort(sizes, kind="stable")
-    for group in np.split(order, np.flatnonzero(np.diff(sizes[order])) + 1):
-        size = int(sizes[group[0]]) if len(group) else 0
-        for part in np.array_split(group, 1 + len(group) * size // 2**17) if size > 2 else ():
-            at = starts[part][:, None]
-            cut = _cut(vertices[corners[at + np.arange(size)]]) if size > 3 else np.arange(3)
-            triangles[first_rows[part][:, None] + np.arange(size - 2)] = at[:, None] + cut
-    return triangles
+    rows, ends = np.maximum(sizes - 2, 0), np.cumsum(sizes)
+    polygon = np.repeat(np.arange(len(sizes)), rows)
+    first = (ends - sizes)[polygon]
+    last = first + 2 + np.arange(len(polygon)) - (np.cumsum(rows) - rows)[polygon]
+    fans = np.stack([first, last - 1, last], axis=1)
+    if (rows <= 1).all():
+        return fans
+    a, b, c = (vertices[corners[fans[:, k]]] for k in range(3))
+    areas = np.cross(b - a, c - a)
+    # their sum is Newell's normal, right for concave polygons
+    normals = np.stack([np.bincount(polygon, areas[:, k], len(sizes)) for k in range(3)], axis=1)
+    is_folded = np.zeros(len(sizes), bool)
+    is_folded[polygon[np.einsum("ij,ij->i", areas, normals[polygon]) < 0]] = True
+    triangles = [fans[~is_folded[polygon]]]
+    for k in np.flatnonzero(is_folded):
+        inside = slice(ends[k] - sizes[k], ends[k])
+        triangles.append(inside.start + _cut_concave(vertices[corners[inside]], normals[k]))
+    triangles = np.concatenate(triangles)
+    return triangles[np.argsort(np.searchsorted(ends, triangles[:, 0], "right"), kind="stable")]
 
 
-def _cut(points: np.ndarray) -> np.ndarray:
-    """The triangles int64 [P, N - 2, 3] of polygons [P, N, 3]."""
-    count, size = points.shape[:2]
-    fan = np.stack(
-        [np.zeros(size - 2, np.int32), np.arange(1, size - 1), np.arange(2, size)],
-        axis=1,
-        dtype=np.int32,
-    )
-    triangles = np.repeat(fan[None], count, axis=0)
-    left = np.arange(count)
-    for shift in range(min(size, 8)):
-        turned = np.roll(points[left], -shift, axis=1)
-        turned -= turned[:, :1].copy()
-        # their sum is Newell's normal, right for concave polygons
-        areas = np.cross(turned[:, 1:-1], turned[:, 2:])
-        folded = (np.einsum("pij,pj->pi", areas, areas.sum(axis=1)) < 0).any(axis=1)
-        triangles[left[~folded]] = (fan + shift) % size
-        left = left[folded]
-        if not len(left):
-            break
-    for polygon in left:
-        triangles[polygon] = _cut_ears(points[polygon])
-    return triangles
+def _cut_concave(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Triangles [T, 3] of a polygon [N, 3], in the coordinate plane of its largest projection."""
+    from mapbox_earcut import triangulate_float64
 
-
-def _cut_ears(points: np.ndarray) -> list[tuple[int, int, int]]:
-    """N - 2 triangles of a polygon [N, 3], by ear clipping in the coordinate plane of its largest
-    projection.
-    """
-    size = len(points)
-    if size > _MOST_EARS:
-        raise ValueError(
-            f"a polygon of {size} corners is not convex; at most {_MOST_EARS} are cut into triangles"
-        )
-    points = points - points[0]
-    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
     axis = int(np.abs(normal).argmax())
-    u, v = (axis + 1) % 3, (axis + 2) % 3
-    flat = points[:, [u, v] if normal[axis] >= 0 else [v, u]].tolist()  # counter-clockwise
-    before, after = [*range(-1, size - 1)], [*range(1, size), 0]
-    before[0] = size - 1
-
-    def turn(a: list[float], b: list[float], c: list[float]) -> float:
-        """Twice the signed area of a triangle: positive if c is left of the line from a to b."""
-        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-
-    def angle(j: int) -> float:
-        return turn(flat[before[j]], flat[j], flat[after[j]])
-
-    def is_ear(j: int) -> bool:
-        a, b, c = flat[before[j]], flat[j], flat[after[j]]
-        others = (flat[i] for i in reflex)  # if any corner lies in the triangle, a reflex one does
-        inside = (p for p in others if turn(a, b, p) >= 0 <= turn(b, c, p) and turn(c, a, p) >= 0)
-        return all(p in (a, b, c) for p in inside)
-
-    reflex = {j for j in range(size) if angle(j) <= 0}
-    triangles, j, misses, crosses = [], 0, 0, False
-    while len(triangles) < size - 2:
-        left = size - len(triangles)
-        # Without an ear, corners without area go first. A polygon that crosses itself is cut
-        # anyhow.
-        crosses = crosses or misses > 2 * left
-        if crosses or (misses > left and angle(j) == 0) or (angle(j) > 0 and is_ear(j)):
-            triangles.append((before[j], j, after[j]))
-            after[before[j]], before[after[j]] = after[j], before[j]
-            reflex.discard(j)
-            for side in (before[j], after[j]):
-                (reflex.add if angle(side) <= 0 else reflex.discard)(side)
-            misses = 0
-        else:
-            misses += 1
-        j = after[j]
-    return triangles
+    flat = (points - points[0])[:, [(axis + 1) % 3, (axis + 2) % 3]]
+    found = triangulate_float64(flat, np.array([len(flat)], np.uint32)).reshape(-1, 3)
+    # they are counter-clockwise whichever way the polygon runs
+    return (found if normal[axis] >= 0 else found[:, ::-1]).astype(np.int64)
 
 
 def _keyword(line: str) -> tuple[str, str]:
@@ -463,15 +335,12 @@ def read_mtl(filename: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         elif keyword == "map_kd":
             images[material] = rest
         elif keyword == "kd":
-            words = _without_comment(rest).split()[:3]
+            words = _without_comment(rest).split()
             try:
-                data = np.frombuffer(" ".join(words).encode(), np.uint8)
-                colors[material] = _table(data, np.array([len(words)]), 3, 3, 3)[0].astype(
-                    np.float32
-                )
+                colors[material] = np.float32(_numbers(words, 3, 3))
             except ValueError as error:
                 raise ValueError(
-                    f"{filename}, line {number}: {_shown(line.encode())} cannot be read: {error}"
+                    f"{filename}, line {number}: {line.strip()[:200]!r} cannot be read: {error}"
                 ) from None
     return colors, images
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from nmr.obj import read_obj, triangulate
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 SQUARE = CORNERS + "f 1 2 3\nf 1 3 4\n"
+NOTHING = re.compile(b"(?!)")
 SAME_SQUARES = {
     "one polygon": CORNERS + "f 1 2 3 4\n",
     "relative numbers": CORNERS + "f -4 -3 -2\nf -4 -2 -1\n",
@@ -53,12 +55,13 @@ def triangles(text: str, **options: bool) -> list:
 
 
 @pytest.mark.parametrize("with_uv", [True, False])
-@pytest.mark.parametrize("chunk", [2**19, 7])
+@pytest.mark.parametrize("in_blocks", [True, False])
 @pytest.mark.parametrize("name", SAME_SQUARES)
 def test_the_same_square(
-    monkeypatch: pytest.MonkeyPatch, name: str, chunk: int, with_uv: bool
+    monkeypatch: pytest.MonkeyPatch, name: str, in_blocks: bool, with_uv: bool
 ) -> None:
-    monkeypatch.setattr("nmr.obj._CHUNK", chunk)
+    if not in_blocks:
+        monkeypatch.setattr("nmr.obj._BLOCK", NOTHING)
     assert triangles(SAME_SQUARES[name], with_uv=with_uv) == triangles(SQUARE)
 
 
@@ -71,15 +74,14 @@ WRONG = {
     "f 1 2 3.5": "line 5: .* corners such as",
     "f": "line 5: .* a face needs corners",
     "v 1,5 0 0": "line 5: .* 3 numbers are needed, finite in float32",
+    "v 1 1e39 0": "line 5: .* 3 numbers are needed, finite in float32",
     "v 1 nan 0": "line 5: .* 3 numbers are needed",
     "f 1 2 \\\n 3\n# \\\nv 1 2": "line 8: 'v 1 2' cannot be read",
 }
 
 
-@pytest.mark.parametrize("chunk", [2**19, 7])
 @pytest.mark.parametrize("lines", WRONG)
-def test_wrong_lines_are_named(monkeypatch: pytest.MonkeyPatch, lines: str, chunk: int) -> None:
-    monkeypatch.setattr("nmr.obj._CHUNK", chunk)
+def test_wrong_lines_are_named(lines: str) -> None:
     with pytest.raises(ValueError, match=WRONG[lines]):
         triangles(CORNERS + lines + "\nf 1 2 3\n")
 
@@ -109,6 +111,7 @@ OUTLINES = {
     "window, joined to its hole by a double edge": [
         [0, 0], [4, 0], [4, 4], [0, 4], [0, 0], [1, 1], [1, 3], [3, 3], [3, 1], [1, 1],
     ],
+    "zigzag": [[0, 5], *([k, k % 2] for k in range(5000))],
     "star": [[np.cos(0.2 * np.pi * i) * r, np.sin(0.2 * np.pi * i) * r] for i, r in enumerate([1, 0.4] * 5)],
 }  # fmt: skip
 
@@ -118,7 +121,7 @@ OUTLINES = {
 def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -> None:
     outline = np.array(OUTLINES[name])[:: -1 if turned else 1]
     count = len(outline)
-    for start in range(count):
+    for start in range(0, count, 1 + count // 10):
         flat = np.roll(outline, start, axis=0)
         # in a slanted plane, at UTM coordinates
         vertices = np.column_stack([flat, flat[:, 0]]) + [4.5e6, 5e5, 100]
@@ -127,7 +130,6 @@ def test_concave_polygons_keep_their_area_and_winding(name: str, turned: bool) -
         whole = np.cross(outwards, np.roll(outwards, -1, axis=0)).sum(0)
         a, b, c = np.moveaxis(vertices[faces], 1, 0)
         parts = np.cross(b - a, c - a)
-        assert len(faces) == count - 2
         np.testing.assert_allclose(np.linalg.norm(parts, axis=1).sum(), np.linalg.norm(whole))
         assert (parts @ whole >= -1e-9).all()
 
@@ -141,11 +143,6 @@ def test_polygons_stay_in_order_and_convex_ones_are_fans() -> None:
     assert faces[:4].tolist() == [[5, 6, 7], [0, 1, 2], [0, 2, 3], [0, 3, 4]] and len(faces) == 6
     with pytest.raises(ValueError, match="missing vertex; there are 9"):
         triangulate(vertices, np.array([0, 1, 9]), np.array([3]))
-    many = np.arange(5000)
-    zigzag = np.column_stack([many, many % 2, 0 * many]).astype(float)
-    zigzag[-1] = [0, 5, 0]
-    with pytest.raises(ValueError, match="polygon of 5000 corners is not convex"):
-        triangulate(zigzag, many, np.array([5000]))
 
 
 TEXTURED = "mtllib {library}\n" + CORNERS + "vt 0 0\nvt 1 0\nvt 1 1\n{used}\nf 1/1 2/2 3/3\n"
