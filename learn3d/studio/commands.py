@@ -18,7 +18,6 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     load_model,
     reconstruct_dataset,
     reconstruct_files,
-    reconstruct_object_files,
 )
 from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import PoseOptions
@@ -141,7 +140,6 @@ class Reconstruct(OnDataset):
 
     Examples:
       learn3d reconstruct photo.png --output meshes    (transparent background; the package's model)
-      learn3d reconstruct a.jpg b.jpg c.jpg --same-object --output meshes
       learn3d reconstruct photo.jpg --masks mask.png --run runs/airplane --output meshes
       learn3d reconstruct --data DATA --indices 0 31 62 --run runs/airplane --output meshes
     """
@@ -154,9 +152,6 @@ class Reconstruct(OnDataset):
     guesses: Count = 1
     """Largest number of different shapes for each image file, the best first; a model without
     templates makes one."""
-    same_object: bool = False
-    """The image files, two to eight, show the same object from several sides, and become one
-    mesh."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model. If not given: the small model of the
     package."""
@@ -192,24 +187,15 @@ class Reconstruct(OnDataset):
             raise ValueError("give either image files, or --data with --indices")
         if self.box is not None and (len(self.images) > 1 or self.masks):
             raise ValueError("--box is for one photograph, without --masks")
-        own = ("masks", "box", "crop", "guesses", "same_object")  # options for image files
+        own = ("masks", "box", "crop", "guesses")  # options for image files
         self.refuse(*(("--data", *own) if self.data else ("image files", "split", "indices")))
         check_target(self.output, "--output", folder=True)
         if self.data is not None:
             options = self.pick("indices") | {"refined": bool(self.refine)}
             paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
         else:
-            options = {
-                name: getattr(self, name)
-                for name in ("images", "which", "category", "masks", "crop")
-            }
-            if self.same_object:
-                self.refuse("--same-object", "box", "guesses", "refine")
-                paths = reconstruct_object_files(
-                    self.model, self.output, mesh_format=self.format, **options
-                )
-                return say("\n".join(map(str, paths)))
-            options |= {"box": self.box, "guesses": self.guesses}
+            names = ("images", "which", "category", "masks", "crop", "box", "guesses")
+            options = {name: getattr(self, name) for name in names}
             options["refined"] = self.refine is not False
             paths = reconstruct_files(self.model, self.output, mesh_format=self.format, **options)
         say("\n".join(map(str, paths)))

@@ -2,7 +2,6 @@
 
 import base64
 import io
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -20,9 +19,7 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     Reconstruction,
     mesh_bytes,
     reconstruct_guesses,
-    reconstruct_several,
 )
-from learn3d.studio.picture_to_mesh.several import MOST_PICTURES
 from learn3d.studio.shapes import make_shape
 
 SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
@@ -78,22 +75,6 @@ def find_object(picture: Picture) -> tuple[Outline, str | None]:
     return outline._replace(mask=mask), left_out
 
 
-def unpack_several(content: bytes, widths: Sequence[int], heights: Sequence[int]) -> list[Picture]:
-    """Decode several pictures, each R, G, B and mask for each pixel, one after the other.
-
-    Raises ValueError for a wrong number of pictures or bytes.
-    """
-    if len(widths) != len(heights) or not 2 <= len(widths) <= MOST_PICTURES:
-        raise ValueError(
-            f"{len(widths)} widths and {len(heights)} heights came for 2 to {MOST_PICTURES} pictures"
-        )
-    ends = [0, *itertools.accumulate(4 * w * h for w, h in zip(widths, heights, strict=True))]
-    if ends[-1] != len(content):
-        raise ValueError(f"{len(content)} bytes came for pictures of {ends[-1]} bytes")
-    parts = (content[start:end] for start, end in itertools.pairwise(ends))
-    return [unpack(*each) for each in zip(parts, widths, heights, strict=True)]
-
-
 def make_meshes(
     models: Mapping[str, Model],
     pictures: Sequence[Picture],
@@ -102,8 +83,7 @@ def make_meshes(
 ) -> None:
     """Send the masks, the progress, and in the end the meshes of all models, or an error as a sentence.
 
-    Several pictures show one object; the first model makes one mesh of it. category: the
-    object's, None if unknown.
+    There is one picture. category: the object's, None if unknown.
     """
     try:
         masks = []
@@ -131,21 +111,15 @@ def make_meshes(
         def progress(text: str, part: float) -> None:
             send({"progress": text, "part": part})
 
-        photos = [(picture.colors, mask) for picture, mask in zip(pictures, masks, strict=True)]
-        if len(photos) == 1:
-            options = {"progress": progress, "category": category, "guesses": GUESSES}
-            made = {
-                label: reconstruct_guesses(model, *photos[0], **options)
-                for label, model in models.items()
-            }
-            send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
-            for label, guesses in made.items():
-                for guess in guesses:
-                    send({"guess": _message(label, guess)})
-            return
-        label, model = next(iter(models.items()))
-        found = reconstruct_several(model, photos, category=category, progress=progress)
-        send({"meshes": [_message(label, found.made)], "unused": found.left_out})
+        photo = pictures[0].colors, masks[0]
+        options = {"progress": progress, "category": category, "guesses": GUESSES}
+        made = {
+            label: reconstruct_guesses(model, *photo, **options) for label, model in models.items()
+        }
+        send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
+        for label, guesses in made.items():
+            for guess in guesses:
+                send({"guess": _message(label, guess)})
     except ValueError as error:
         send({"error": str(error)})
 

@@ -39,10 +39,8 @@ from learn3d.studio.demo.picture import (
     example,
     make_meshes,
     unpack,
-    unpack_several,
 )
 from learn3d.studio.picture_to_mesh.reconstruction import Model, load_model
-from learn3d.studio.picture_to_mesh.several import MOST_PICTURES
 from learn3d.terminal import plain, say
 
 MOST_BYTES = 5 * SIDE**2  # largest body of a request
@@ -179,7 +177,7 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
     kinds = [kind for model in models.values() for kind in model.categories]
 
     def about(_: Request) -> Response:
-        limits = {"side": SIDE, "most": MOST_PICTURES}
+        limits = {"side": SIDE, "most": 1}
         return JSONResponse(
             {"kinds": list(dict.fromkeys(kinds)), "examples": list(pictures), **limits}
         )
@@ -210,10 +208,7 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
 
 
 async def _receive(request: Request) -> list[Picture]:
-    """The pictures in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with their bytes in the body.
-
-    Several pictures have W,W,... and H,H,..., and no box.
-    """
+    """The pictures in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with their bytes in the body."""
     query = request.query_params
     box = tuple(map(_number, query["box"].split(","))) if "box" in query else None
     if box is not None and len(box) != 4:
@@ -223,10 +218,7 @@ async def _receive(request: Request) -> list[Picture]:
         content += chunk
         if len(content) > MOST_BYTES:
             raise HTTPException(413, f"a picture has at most {MOST_BYTES} bytes")
-    sizes = [[_number(number) for number in query[name].split(",")] for name in ("width", "height")]
-    if len(sizes[0]) > 1:
-        return unpack_several(bytes(content), *sizes)
-    return [unpack(bytes(content), *(numbers[0] for numbers in sizes), box)]
+    return [unpack(bytes(content), *(_number(query[name]) for name in ("width", "height")), box)]
 
 
 def _number(text: str) -> int:

@@ -4,7 +4,7 @@ Hidden parts get blurred colours of their neighbours. Each face has a triangle o
 texture image.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -26,7 +26,6 @@ GRAZING = 0.25  # cosine between normal and line of sight below which a colour i
 EQUAL = 0.06  # two parts are equal if the sizes of their boxes and their heights above the ground differ by less
 BORDER = 2  # width in pixels of the border inside the outline that may have the background's colours; its inner
 # pixels count half, as thin legs have no others
-BEST_PICTURE = 4  # power of the reliabilities by which the colours of several pictures are averaged
 WIDTH = 1024  # texels; the height of a texture depends on the mesh
 TEXELS = 250.0  # per unit of the object frame
 SIDES = (2, 4, 8, 16, 24, 32)  # sides that a triangle in the image can have, in texels
@@ -39,29 +38,19 @@ LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 def color_mesh(
     mesh: tuple[Tensor, Tensor],
     view: View,
-    pictures: Sequence[np.ndarray],
+    picture: np.ndarray,
     mirror: Tensor | None = None,
     textured: bool = False,
 ) -> Surface:
-    """A surface with the colours of pictures, mostly of those that see a part best. Hidden vertices get the colours of
-    their mirror images or, if these are hidden, too, blurred colours of their neighbours.
+    """A surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if these are
+    hidden, too, blurred colours of their neighbours.
 
-    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the cameras
-    of N pictures.
-    pictures: N of R, G, B and mask, uint8 [4, S, S], framed as in `fitting.fit`. mirror: float32
+    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the picture's camera.
+    picture: R, G, B and mask, uint8 [4, S, S], framed as in `fitting.fit`. mirror: float32
     [3, 3], the reflection that maps the shape to itself, None without symmetry. textured: double
     the vertices along sharp edges, and add a texture image.
     """
-    of_pictures = [
-        _seen(*mesh, view.select(torch.tensor([n])), picture) for n, picture in enumerate(pictures)
-    ]
-
-    def look_up_seen(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        seen, weight = map(
-            torch.stack, zip(*(each(points, normals) for each in of_pictures), strict=True)
-        )
-        shares = (weight**BEST_PICTURE)[..., None]
-        return (shares * seen).sum(0) / shares.sum(0).clamp(min=1e-9), weight.amax(0)
+    look_up_seen = _seen(*mesh, view, picture)
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         seen, weight = look_up_seen(points, normals)

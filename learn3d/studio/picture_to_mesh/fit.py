@@ -32,8 +32,7 @@ PULL = 0.1  # weight of the squared relative distance between the code and the p
 SMOOTHNESS = 3e-4  # weight of the smoothness loss
 STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
 # Units of the parts of a view as variables: a step moves the outline about equally far for each.
-_SCALES = (60.0, 60.0, 1.0, 1.0, 60.0, 1.0)
-LEVEL = 4  # parts of a view that are free if the camera is level and has a normal lens
+_SCALES = (60.0, 60.0, 1.0, 1.0)
 #: Options of torch's function `adam`. Its class Adam would import torch._dynamo, which takes a second.
 _ADAM = {
     "beta1": 0.9,
@@ -57,8 +56,6 @@ class View(NamedTuple):
     log_distance: Tensor  # float32 [N]
     shift: Tensor  # float32 [N, 2]: shift of the object to the right and up, in units of the object frame
     roll_deg: Tensor  # float32 [N]: angle by which the camera is turned clockwise about its axis
-    # float32 [N]: log of the factor by which the field of view is wider, and the camera nearer
-    perspective: Tensor
 
     def axes(self) -> Tensor:
         """Right, up and forward of each camera in the object frame, float32 [N, 3, 3]."""
@@ -72,10 +69,6 @@ class View(NamedTuple):
 
     def cameras(self) -> nmr.LookAt:
         """The cameras, which look at the origin; `place` shifts shapes for them."""
-        half_fov_deg = HALF_FOV_DEG * self.perspective.exp()
-        usual, own = (
-            torch.deg2rad(each).tan() for each in (torch.tensor(HALF_FOV_DEG), half_fov_deg)
-        )
         right = self._replace(roll_deg=torch.zeros_like(self.roll_deg)).axes()[:, 0]
         roll, elevation = (
             torch.deg2rad(each)[:, None] for each in (self.roll_deg, self.elevation_deg)
@@ -83,11 +76,11 @@ class View(NamedTuple):
         # across the line of sight, the vertical axis is shorter by the cosine of the elevation
         up = roll.cos() * torch.tensor([0.0, 1.0, 0.0]) + roll.sin() * elevation.cos() * right
         return nmr.LookAt.from_angles(
-            self.log_distance.exp() * (usual / own),
+            self.log_distance.exp(),
             self.elevation_deg,
             self.azimuth_deg,
             up=up,
-            half_fov_deg=half_fov_deg,
+            half_fov_deg=HALF_FOV_DEG,
         )
 
     def place(self, vertices: Meshes) -> Meshes:
@@ -117,7 +110,7 @@ class View(NamedTuple):
 def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> View:
     """Cameras in N directions, angles [N], at which vertices [V, 3] are framed like pictures."""
     zero, tangent = torch.zeros(len(azimuth_deg)), math.tan(math.radians(HALF_FOV_DEG))
-    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(zero), 2), zero, zero)
+    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(zero), 2), zero)
     points = vertices @ view.axes().transpose(1, 2)
     distance, shift = torch.full_like(zero, 1.0 / tangent), view.shift
     for _ in range(6):
@@ -173,19 +166,16 @@ def minimize(
     steps: int,
     rates: Sequence[float],
     *variables: Tensor,
-    free: int = LEVEL,
 ) -> View:
-    """The view, from `view` on, that minimises a loss together with other variables, by Adam.
+    """The view, from `view` on, that minimises a loss together with other variables, by Adam. Its roll stays.
 
     rates: learning rates of the view and of each variable, which fall to a tenth in the end.
-    free: number of the view's parts, from the first on, that change.
     """
-    scales = _SCALES[:free]
-    parts = [(part / scale).requires_grad_() for part, scale in zip(view, scales, strict=False)]
+    parts = [(part / scale).requires_grad_() for part, scale in zip(view, _SCALES, strict=False)]
 
     def current() -> View:
-        changed = (scale * part for part, scale in zip(parts, scales, strict=True))
-        found = View(*changed, *view[free:])
+        changed = (scale * part for part, scale in zip(parts, _SCALES, strict=True))
+        found = View(*changed, view.roll_deg)
         return found._replace(elevation_deg=found.elevation_deg.clamp(-30, 85))
 
     values, rates = [*parts, *variables], [*[rates[0]] * len(parts), *rates[1:]]

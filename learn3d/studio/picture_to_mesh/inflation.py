@@ -43,7 +43,7 @@ def inflate(picture: np.ndarray) -> tuple[Surface, View]:
     vertices, faces = smooth(surface.vertices, surface.faces, rounds=_ROUNDS), surface.faces
     zero = torch.zeros(1)  # the grid is the picture, whatever thin parts smoothing has removed
     distance = zero + 0.5 / math.tan(math.radians(HALF_FOV_DEG))
-    view = View(zero, zero, distance.log(), torch.zeros(1, 2), zero, zero)
+    view = View(zero, zero, distance.log(), torch.zeros(1, 2), zero)
     x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
     image = _spread(picture)
     size = image.shape[0]

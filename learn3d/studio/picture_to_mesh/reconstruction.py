@@ -10,7 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 from scipy import ndimage
-from torch import Tensor, nn
+from torch import Tensor
 
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import mesh_to_object
@@ -40,15 +40,9 @@ from learn3d.settings import split_names
 from learn3d.studio.picture_to_mesh.coloring import color_mesh
 from learn3d.studio.picture_to_mesh.cutting import Box, find_outline
 from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
-from learn3d.studio.picture_to_mesh.fit import Progress, View, find_view, fit, predict
+from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.refinement import refine
-from learn3d.studio.picture_to_mesh.several import (
-    MOST_PICTURES,
-    find_outliers,
-    find_strangers,
-    fit_several,
-)
 from learn3d.studio.picture_to_mesh.smoothing import divide, outer_surface
 from learn3d.studio.picture_to_mesh.templates import MIRROR, TEMPLATES, Templates, fit_template
 from learn3d.terminal import note
@@ -134,7 +128,7 @@ def reconstruct_files(
     further guesses (see `save`). Raises ValueError if a mask is empty, or if a result would
     replace an input file. A file that cannot be used is an error after all others are done.
     """
-    names = check_files(folder, images, images, masks)
+    names = check_files(folder, images, masks)
     model = load_model(run, which)
     if category is not None:
         check_category(model, category)
@@ -165,52 +159,13 @@ def reconstruct_files(
     return paths
 
 
-def reconstruct_object_files(
-    run: Path | None,
-    folder: Path,
-    images: Sequence[Path],
-    masks: Sequence[Path] = (),
-    *,
-    crop: bool = True,
-    category: str | None = None,
-    which: str = "last",
-    mesh_format: MeshFormat = "glb",
-) -> list[Path]:
-    """Reconstruct one object from several image files, and save the result in `folder` under the first one's name.
-
-    See `reconstruct_files` for the arguments, and `reconstruct_several` for the errors. A file
-    that cannot be used is left out with a line, as is a picture that does not fit the others.
-    """
-    name = check_files(folder, images[:1], images, masks)[0]
-    model = load_model(run, which)
-    photos, names = [], []
-    for image, mask in zip(images, masks or [None] * len(images), strict=True):
-        try:
-            photos.append(_read(image, mask))
-            names.append(image)
-        except (ValueError, OSError) as error:
-            note(f"left out: {error}")
-    found = reconstruct_several(model, photos, crop=crop, category=category)
-    for number, reason in found.left_out.items():
-        note(f"left out: {names[number]}: {reason}")
-    for number, azimuth_deg in zip(found.used, found.azimuths_deg, strict=True):
-        note(f"{names[number]}: azimuth {azimuth_deg:.0f} degrees")
-    if found.made.warning:
-        note(f"warning: {found.made.warning}")
-    elif found.made.kind:
-        note(f"{name}: category {found.made.kind}")
-    return save(folder, [name], [found.made], model, mesh_format)
-
-
-def check_files(
-    folder: Path, named: Sequence[Path], images: Sequence[Path], masks: Sequence[Path]
-) -> list[str]:
-    """Names of the results of `named` images. ValueError if a result would replace a file, or if a mask is missing."""
+def check_files(folder: Path, images: Sequence[Path], masks: Sequence[Path]) -> list[str]:
+    """Names of the results of images. ValueError if a result would replace a file, or if a mask is missing."""
     if masks and len(masks) != len(images):
         raise ValueError(
             f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none"
         )
-    names = [Path(image).stem for image in named]
+    names = [Path(image).stem for image in images]
     if len(set(names)) < len(names):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
     given = {Path(path).resolve() for path in (*images, *masks)}
@@ -421,7 +376,7 @@ def reconstruct_guesses(
         fitted = fit(method, predicted, mask, progress)
         mesh = outer_surface(fitted.vertices, fitted.faces)
         progress("colours", 0.9)
-        surface = color_mesh(mesh, fitted.view, [framed], method.generator.reflection)
+        surface = color_mesh(mesh, fitted.view, framed, method.generator.reflection)
         yield Reconstruction(
             surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning
         )
@@ -432,91 +387,8 @@ def reconstruct_guesses(
     ):
         mesh = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE)
         progress("colours", 0.9)
-        surface = color_mesh(mesh, fitted.view, [framed], MIRROR, textured=True)
+        surface = color_mesh(mesh, fitted.view, framed, MIRROR, textured=True)
         yield Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind)
-
-
-class SeveralPictures(NamedTuple):
-    """The shape of an object in several pictures, and how it was found."""
-
-    made: Reconstruction  # its input and azimuth are the first used picture's
-    used: list[int]  # the pictures that it explains
-    left_out: dict[int, str]  # the other pictures, each with a reason
-    azimuths_deg: list[float]  # of the cameras of the used pictures
-
-
-@torch.no_grad()
-def reconstruct_several(
-    model: Model,
-    pictures: Sequence[tuple[np.ndarray, np.ndarray]],
-    *,
-    crop: bool = True,
-    category: str | None = None,
-    known: View | None = None,
-    progress: Progress = lambda *_: None,
-) -> SeveralPictures:
-    """Reconstruct an object from 2 to 8 pictures uint8 [H, W, 3] with masks uint8 [H, W].
-
-    Of three pictures or more, those that show something else, or have a wrong outline, are left
-    out. known: the cameras of the framed pictures; None if unknown. category, progress: see
-    `reconstruct_guesses`. Raises ValueError for another number of pictures, for an unknown
-    category, or if the model has no templates.
-    """
-    if not 2 <= len(pictures) <= MOST_PICTURES:
-        raise ValueError(
-            f"an object needs 2 to {MOST_PICTURES} pictures, got {len(pictures)}; leave some out or add some"
-        )
-    if model.templates is None or not isinstance(model.method, MeshMethod):
-        raise ValueError(
-            "this model has no templates, which several pictures need; use the small model of the package"
-        )
-    if category is not None:
-        check_category(model, category)
-    progress("camera", 0.0)
-    stored = [model.prepare(*picture, crop=crop) for picture in pictures]
-    framed = [enlarge(*picture) for picture in pictures]
-    masks = torch.stack([reduce_mask(each[3]) for each in framed])
-    outlines = torch.from_numpy(np.stack([each[3] for each in framed]))
-    predicted = []
-    for number, image in enumerate(stored):
-        predicted.append(predict(model.method, torch.from_numpy(image), masks[number]))
-        progress("camera", 0.3 * (number + 1) / len(stored))
-    left_out = dict.fromkeys(
-        find_strangers(predicted, framed),
-        "it seems to show another object, or its outline is wrong",
-    )
-    while True:
-        used = [number for number in range(len(pictures)) if number not in left_out]
-        chosen = [predicted[number] for number in used]
-        options = {"category": category, "known": known and known.select(torch.tensor(used))}
-        fitted = fit_several(
-            model.templates,
-            model.categories,
-            chosen,
-            masks[used],
-            outlines[used],
-            progress,
-            **options,
-        )
-        outliers = find_outliers(fitted.ious)
-        if not outliers:
-            break
-        left_out |= {used[row]: "its outline does not fit the others" for row in outliers}
-    progress("colours", 0.9)
-    mesh = fitted.vertices, fitted.faces
-    if fitted.is_template:
-        mesh = divide(*mesh, _LONGEST_EDGE)
-    surface = color_mesh(
-        mesh, fitted.views, [framed[number] for number in used], MIRROR, textured=True
-    )
-    code = torch.stack([nn.functional.normalize(each.code[0], dim=0) for each in chosen]).mean(0)
-    warning = None if category else recognize(model, code)[1]
-    azimuths_deg = fitted.views.azimuth_deg.tolist()
-    iou = float(fitted.ious.mean())
-    made = Reconstruction(
-        surface, stored[used[0]], azimuths_deg[0], iou, category or fitted.kind, warning
-    )
-    return SeveralPictures(made, used, left_out, azimuths_deg)
 
 
 def check_category(model: Model, category: str) -> None:

@@ -6,7 +6,6 @@ knows the codes of its templates; the shapes themselves are made again from thei
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -28,7 +27,6 @@ from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.studio.picture_to_mesh.fit import (
-    LEVEL,
     Fit,
     Prediction,
     Progress,
@@ -165,22 +163,18 @@ class Candidates(NamedTuple):
 def find_candidates(
     templates: Templates,
     categories: Sequence[str],
-    predicted: Sequence[Prediction],
+    predicted: Prediction,
     category: str | None = None,
 ) -> Candidates:
-    """The templates with codes nearest to the mean of those that were predicted for one or several pictures.
+    """The templates with codes nearest to the predicted one.
 
     category: the only one whose templates are taken, None if unknown.
     """
-    code = torch.stack([F.normalize(each.code[0], dim=0) for each in predicted]).mean(0)
-    names, nearness = templates.nearest(code, categories, category)
+    names, nearness = templates.nearest(predicted.code[0], categories, category)
     shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
     voxels = torch.cat([_voxels(*mesh) for mesh in zip(shapes, faces, strict=True)])
-    alike = [
-        nmr.metrics.voxel_iou(voxels, _voxels(*each.shape[:2]).expand_as(voxels))
-        for each in predicted
-    ]
-    prior = VOXELS * torch.stack(alike).mean(0).float() + NEARNESS * nearness
+    alike = nmr.metrics.voxel_iou(voxels, _voxels(*predicted.shape[:2]).expand_as(voxels))
+    prior = VOXELS * alike.float() + NEARNESS * nearness
     return Candidates(shapes, faces, [name for name, _ in names], prior)
 
 
@@ -205,7 +199,7 @@ def fit_template(
     those whose voxel IoU with a better one is below `DIFFERENT`. category: see `find_candidates`.
     """
     progress("shape", 0.3)
-    found = find_candidates(templates, categories, [predicted], category)
+    found = find_candidates(templates, categories, predicted, category)
     views = predicted.shape.view.select(torch.zeros(len(found.shapes), dtype=torch.int64))
     scores = likeness(views, found.shapes, found.faces, mask) + found.prior
     best = scores.topk(min(KEPT, len(scores))).indices
@@ -248,23 +242,15 @@ def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
     return nmr.voxelize(0.998 * vertices[None].clamp(-0.5, 0.5) + 0.5, faces)
 
 
-def likeness(views: View, shapes: list[Tensor], faces: list[Tensor], masks: Tensor) -> Tensor:
-    """How alike the outlines of N shapes and of masks are: their IoU less the distance of their edges, [N].
+def likeness(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> Tensor:
+    """How alike the outlines of N shapes and of a mask [64, 64] are: their IoU less the distance of their edges, [N].
 
-    By the IoU alone a solid back is better than slats beside the true ones. masks: [64, 64], or
-    [M, 64, 64] for N a multiple of M, which are taken in turn.
+    By the IoU alone a solid back is better than slats beside the true ones.
     """
-    masks = masks.view(-1, *masks.shape[-2:])
-    wanted = [_edges(mask) for mask in masks]
+    outline, near_wanted = _edges(mask)
     drawn = map(_edges, views.silhouettes(shapes, faces))
-    apart = [
-        (near_wanted[edge].mean() + near[outline].mean()) / 2
-        for (edge, near), (outline, near_wanted) in zip(
-            drawn, itertools.cycle(wanted), strict=False
-        )
-    ]
-    ious = views.ious(shapes, faces, masks.repeat(len(shapes) // len(masks), 1, 1))
-    return ious - EDGES * torch.tensor(apart).float()
+    apart = [(near_wanted[edge].mean() + near[outline].mean()) / 2 for edge, near in drawn]
+    return views.ious(shapes, faces, mask) - EDGES * torch.tensor(apart).float()
 
 
 def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -314,20 +300,12 @@ def _mean(values: np.ndarray) -> float:
 
 
 def stretch(
-    views: View,
-    shapes: list[Tensor],
-    faces: list[Tensor],
-    masks: Tensor,
-    free: int = LEVEL,
+    views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor
 ) -> tuple[View, list[Tensor], Tensor]:
-    """Stretch N shapes along the three axes until they have the outlines of masks [64, 64] or [M, 64, 64].
+    """Stretch N shapes along the three axes until they have the outline of a mask [64, 64] in N views.
 
-    views: N, or N M with those of the first shape first. free: see `minimize`. Returns the fitted
-    views, the shapes, and how unequal the factors are, [N].
+    Returns the fitted views, the shapes, and how unequal the factors are, [N].
     """
-    copies = len(views.azimuth_deg) // len(shapes)
-    wanted = masks if masks.dim() == 2 else masks.repeat(len(shapes), 1, 1)
-    faces = [each for each in faces for _ in range(copies)]
     logs = torch.zeros(len(shapes), 3).requires_grad_()
 
     def stretched() -> list[Tensor]:
@@ -337,24 +315,15 @@ def stretch(
         return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
 
     def loss(views: View) -> Tensor:
-        ious = views.ious([shape for shape in stretched() for _ in range(copies)], faces, wanted)
-        return (costs() + 0.1 * logs.square().sum(1)).sum() - ious.sum() / copies
+        size = 0.1 * logs.square().sum(1)
+        return (costs() + size - views.ious(stretched(), faces, mask)).sum()
 
-    views = minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs, free=free)
+    views = minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs)
     return views, stretched(), costs()
 
 
-def bend(
-    view: View,
-    vertices: Tensor,
-    faces: Tensor,
-    masks: Tensor,
-    free: int = LEVEL,
-) -> tuple[View, Tensor]:
-    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them.
-
-    masks: [64, 64] for one view, or [N, 64, 64] for N. free: see `minimize`.
-    """
+def bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[View, Tensor]:
+    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them."""
     low, high = vertices.amin(0), vertices.amax(0)
     place = (vertices - low) / (high - low).clamp(min=1e-3)
     x, y, z = (
@@ -381,6 +350,6 @@ def bend(
             sum(moves().diff(dim=axis).square().sum() for axis in range(3))
             + 0.1 * moves().square().sum()
         )
-        return BENDING * rough - view.ious(bent()[None], faces, masks).mean()
+        return BENDING * rough - view.ious(bent()[None], faces, mask).sum()
 
-    return minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice, free=free), bent()
+    return minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice), bent()

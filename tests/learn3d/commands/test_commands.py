@@ -282,12 +282,6 @@ def test_the_fit_of_pictures_is_measured(tmp_path, capsys) -> None:
     numbered_shape("airplane", 1, 0).export(tmp_path / "airplane" / "plane.ply")
     runpy.run_path(str(TOOLS / "measure_fit.py"))["main"](tmp_path, "airplane", images=2)
     assert len(capsys.readouterr().out.splitlines()[1].split()) == 10
-    main = runpy.run_path(str(TOOLS / "measure_several.py"))["main"]
-    main(tmp_path / "airplane", counts=(2,), hand_held=True, sheet=tmp_path / "sheet.png")
-    lines = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
-    assert [line[:2] for line in lines] == [["2", "unknown"], ["2", "known"]]
-    assert all(len(line) == 8 and float(line[4]) > 0.5 for line in lines)
-    assert (tmp_path / "sheet.png").is_file()
 
 
 def test_likenesses_are_measured(tmp_path, capsys) -> None:

@@ -121,10 +121,6 @@ def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> Non
     assert np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)).sum() == 8 * 120
     asked = "Is this the object? Its outline touches 2 sides of the picture. Drag a box around it."
     assert error == {"error": asked, "tool": "box"}
-    picture = pictures.Picture(colors, unknown)
-    pictures.make_meshes(models, [picture, picture], sent.append)
-    of_first = asked.replace("object?", "object in picture 1?")
-    assert sent[-1] == {"error": of_first, "tool": "box", "of": 0}
 
 
 def test_the_side_of_the_input_is_found() -> None:

@@ -136,13 +136,13 @@ def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_m
     )
     picture = np.concatenate([rgb[0].transpose(2, 0, 1), alpha])
     reflection = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
-    surface = color_mesh((vertices, faces), view, [picture], reflection)
+    surface = color_mesh((vertices, faces), view, picture, reflection)
     _, y, z = surface.vertices.T
     for side in (z < -0.1, z > 0.1):  # the camera stands at z < 0
         for part, wanted in ((y > 0.05, [0.9, 0.1, 0.1]), (y < -0.05, [0.1, 0.1, 0.9])):
             found = surface.colors[side & part].mean(0)
             assert torch.allclose(found, torch.tensor(wanted), atol=0.12), (found, wanted)
-    alone = color_mesh((vertices, faces), view, [picture])
+    alone = color_mesh((vertices, faces), view, picture)
     assert (
         torch.isfinite(alone.colors).all() and alone.colors.min() >= 0 and alone.colors.max() <= 1
     )
@@ -164,8 +164,8 @@ def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
 def test_a_picture_without_a_seen_vertex_still_has_colours() -> None:
     vertices, faces = arrow()
     level = torch.zeros(1)
-    view = View(level, level, torch.tensor([3.0]), torch.zeros(1, 2), level, level)
-    surface = color_mesh((vertices, faces), view, [np.zeros((4, 64, 64), np.uint8)])
+    view = View(level, level, torch.tensor([3.0]), torch.zeros(1, 2), level)
+    surface = color_mesh((vertices, faces), view, np.zeros((4, 64, 64), np.uint8))
     assert surface.colors.isfinite().all()
 
 
