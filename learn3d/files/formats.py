@@ -11,8 +11,7 @@ import numpy as np
 from learn3d.files import limits, sandbox
 from learn3d.files.reading import DamagedFile, faults_of, open_file, read_bytes, read_text
 
-# the last two need further packages
-EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".3mf", ".dae")
+EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,16 +78,6 @@ def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:
         from learn3d.files.gltf import read_gltf
 
         return read_gltf(file.read(), lambda name: _file_below(path.parent, name))
-    if kind in (".3mf", ".dae"):
-        from learn3d.files.meshes import read_3mf, read_dae
-
-        read, packages = (read_3mf, "lxml networkx") if kind == ".3mf" else (read_dae, "pycollada")
-        try:
-            return read(file)
-        except ImportError:
-            raise ValueError(
-                f"{kind} files need further packages; run `pip install {packages}`"
-            ) from None
     from learn3d.files.meshes import read_off, read_ply, read_stl
 
     return {".off": read_off, ".ply": read_ply, ".stl": read_stl}[kind](file.read())

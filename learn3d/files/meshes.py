@@ -6,7 +6,6 @@ raises EOFError if the file is cut short, and ValueError or another error if it 
 
 import re
 import struct
-from typing import BinaryIO
 
 import numpy as np
 
@@ -236,35 +235,3 @@ def _cut(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> Triang
     if sizes.sum() != len(corners) or (len(sizes) and sizes.min() < 0):
         raise ValueError("a face has fewer corners than it says")
     return vertices, corners[triangulate(vertices, corners, sizes)]
-
-
-def read_3mf(file: BinaryIO) -> Triangles:
-    """Read a 3MF file. Needs lxml and networkx."""
-    import trimesh
-
-    scene = trimesh.load(file, file_type="3mf", force="scene", process=False)
-    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
-    return trimesh.util.append_faces(
-        [part.vertices for part in parts], [part.faces for part in parts]
-    )
-
-
-def read_dae(file: BinaryIO) -> Triangles:
-    """Read a COLLADA file. Needs pycollada."""
-    import collada
-
-    vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
-    scene = collada.Collada(file).scene
-    if scene is None:
-        raise ValueError("it has no scene")
-    for geometry in scene.objects("geometry"):
-        for part in geometry.primitives():
-            if isinstance(part, collada.lineset.BoundLineSet):
-                continue
-            corners = np.asarray(part.vertex_index, np.int64).reshape(-1)
-            is_polygons = hasattr(part, "polyindex")  # [P, 2]: first corner, end
-            sizes = np.diff(part.polyindex)[:, 0] if is_polygons else np.full(len(part), 3)
-            vertices.append(np.asarray(part.vertex, np.float64))
-            faces.append(_cut(vertices[-1], corners, sizes)[1] + total)
-            total += len(vertices[-1])
-    return np.concatenate(vertices), np.concatenate(faces)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ import pytest
 import trimesh
 from gltf_files import Arrays, glb
 
-from learn3d.files import formats
 from learn3d.files.formats import read_mesh
 from learn3d.files.reading import FETCH_AGAIN, DamagedFile
 
@@ -179,43 +177,14 @@ def write_trimesh(path: Path, parts: Parts, rng: np.random.Generator) -> None:
         matrix[:3, 3] = rng.normal(size=3)
         local = (vertices - matrix[:3, 3]) @ matrix[:3, :3]
         scene.add_geometry(trimesh.Trimesh(local, triangles, process=False), transform=matrix)
-    if path.suffix == ".3mf":
-        pytest.importorskip("lxml"), pytest.importorskip("networkx")
     if path.suffix == ".gltf":
         for name, content in scene.export(file_type="gltf").items():
             (path if name == "model.gltf" else path.parent / name).write_bytes(content)
-    elif path.suffix in (".glb", ".3mf", ".obj"):
+    elif path.suffix in (".glb", ".obj"):
         scene.export(path)
     else:
         options = {"encoding": rng.choice(["ascii", "binary"])} if path.suffix == ".ply" else {}
         scene.to_mesh().export(path, **options)
-
-
-def write_dae(path: Path, parts: Parts, rng: np.random.Generator) -> None:
-    import collada
-
-    document = collada.Collada()
-    nodes = []
-    for k, (vertices, polygons) in enumerate(parts):
-        shift = rng.normal(size=3)
-        source = collada.source.FloatSource(f"v{k}", (vertices - shift).ravel(), ("X", "Y", "Z"))
-        geometry = collada.geometry.Geometry(document, f"g{k}", f"g{k}", [source])
-        inputs = collada.source.InputList()
-        inputs.addInput(0, "VERTEX", f"#v{k}")
-        sizes = np.array([*map(len, polygons)])
-        geometry.primitives.append(
-            geometry.createPolylist(np.concatenate(polygons), sizes, inputs, "m")
-        )
-        document.geometries.append(geometry)
-        move = [collada.scene.TranslateTransform(*shift)]
-        nodes.append(
-            collada.scene.Node(
-                f"n{k}", children=[collada.scene.GeometryNode(geometry)], transforms=move
-            )
-        )
-    document.scene = collada.scene.Scene("s", nodes)
-    document.scenes.append(document.scene)
-    document.write(str(path))
 
 
 WRITERS = {  # name of the file: writer, whether it takes polygons
@@ -225,10 +194,9 @@ WRITERS = {  # name of the file: writer, whether it takes polygons
     "own.stl": (write_stl, False),
     "own.glb": (write_gltf, False),
     "own.gltf": (write_gltf, False),
-    "collada.dae": (write_dae, True),
     **{
         f"trimesh.{kind}": (write_trimesh, False)
-        for kind in ("obj", "off", "ply", "stl", "glb", "gltf", "3mf")
+        for kind in ("obj", "off", "ply", "stl", "glb", "gltf")
     },
 }
 
@@ -368,14 +336,6 @@ def test_a_missing_buffer_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text(gltf(buffers=[{"byteLength": 36, "uri": "b.bin"}]))
     with pytest.raises(FileNotFoundError, match=r"b\.bin: is missing"):
         read_mesh(tmp_path / "a.gltf")
-
-
-def test_a_missing_package_is_named(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "collada", None)
-    path = tmp_path / "a.dae"
-    path.write_text("<COLLADA/>")
-    with path.open("rb") as file, pytest.raises(ValueError, match="run `pip install pycollada`"):
-        formats._triangles(path, file)
 
 
 def test_skins_and_morph_targets_move_corners(tmp_path: Path) -> None:
