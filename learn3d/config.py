@@ -60,7 +60,7 @@ class TrainConfig:
     after 1/2, 1/4, ... of all steps. 0: never."""
     sampling: Sampling = "views"
     """How batches are drawn. views: single images. pairs: two views of each object. groups: five
-    views of each object. classes: single images, every category equally often."""
+    views of each object."""
     augment: Annotated[tuple[Augmentation, ...], Items] = ()
     """Random augmentations of the training images (--augment without a name: none)."""
     lr_schedule: LRSchedule = "constant"

@@ -125,18 +125,12 @@ def mean_losses(losses: dict[str, float], stopped_by: str) -> tuple[dict[str, fl
     return means, max(name for _, name in everywhere)
 
 
-def whole_batch(batch: Batch) -> tuple[Batch, Tensor]:
-    """The batch with poses, view classes and categories of all ranks' rows; and the places of its
-    own, int64 [b].
-    """
-    own = torch.arange(len(batch)) + rank() * len(batch)
+def whole_batch(batch: Batch) -> Batch:
+    """The batch with poses and view classes of all ranks' rows."""
     if world_size() == 1:
-        return batch, own
-    poses, view_ids, class_ids = zip(
-        *all_gather_objects((batch.poses, batch.view_ids, batch.class_ids)), strict=True
-    )
-    parts = {"view_ids": torch.cat(view_ids), "class_ids": torch.cat(class_ids)}
-    return dataclasses.replace(batch, poses=poses[0].join(poses), **parts), own
+        return batch
+    poses, view_ids = zip(*all_gather_objects((batch.poses, batch.view_ids)), strict=True)
+    return dataclasses.replace(batch, poses=poses[0].join(poses), view_ids=torch.cat(view_ids))
 
 
 def _all_reduce(values: Tensor) -> Tensor:

@@ -67,23 +67,6 @@ def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tens
     return torch.linalg.vector_norm(codes, dim=1).mean()
 
 
-def silhouette_pyramid_loss(prediction: Tensor, target: Tensor) -> Tensor:
-    """Distance between silhouettes at five resolutions (published code of Kato and Harada 2019).
-
-    The sum over levels l of the batch mean of |p_l / |p_l| - t_l / |t_l||^2. p_0 is the
-    prediction, and p_(l+1) has the means of 2x2 pixels of p_l. An empty silhouette has p / |p| =
-    0. prediction, target: float [B,S,S], S >= 16; differentiable in both.
-    """
-    pair = torch.stack([prediction.float(), target.float()])
-    total = pair.new_zeros(())
-    for level in range(5):
-        if level > 0:
-            pair = F.avg_pool2d(pair, 2)
-        p, t = F.normalize(pair.flatten(2), dim=2)
-        total = total + (p - t).square().sum(1).mean()
-    return total
-
-
 def silhouette_energy_distance(silhouettes: Tensor, masks: Tensor) -> Tensor:
     """Energy distance between the distributions of silhouettes p and masks t (Szekely and Rizzo
     2013).

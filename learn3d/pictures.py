@@ -150,11 +150,6 @@ def orbit(poses: Poses, turns_deg: Sequence[float], *, zoom: float = 1.0) -> Cam
     return cameras
 
 
-def eyes(poses: Poses) -> Tensor:
-    """Directions from the object to every camera, float64 [M, 3], of any length."""
-    return (poses.features() if isinstance(poses, LookAtPoses) else -poses.rotation[:, 2]).double()
-
-
 def azimuths_deg(poses: Poses | None) -> Tensor:
     """Azimuth of every camera, float64 [M] in -180 .. 180: the eye is at (sin a, ., -cos a) of the object frame.
 
@@ -162,7 +157,7 @@ def azimuths_deg(poses: Poses | None) -> Tensor:
     """
     if poses is None:
         raise ValueError("this figure needs camera poses, and these data have none")
-    x, _, z = eyes(poses).T
+    x, _, z = poses.eyes().double().T
     return torch.rad2deg(torch.atan2(x, -z))
 
 

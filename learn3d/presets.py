@@ -98,44 +98,6 @@ _MANY_VIEWS = replace(
     ema_decay=0.995,
     iterations=20_000,
 )
-#: Settings of Kato and Harada 2019 on both data sets.
-_VPL: dict[str, Any] = {
-    "image_size": 224,
-    "silhouette_size": 224,
-    "adversary": "reversal",
-    "anti_aliasing": False,
-    "renderer_gradient": "local",
-    "adam_beta1": 0.5,
-    "lambda_smooth": 0.0,
-}
-#: Kar's data: one view of each object, silhouettes only, with lambda_D = 0.1.
-_KAR_VPL = VPLSettings(
-    **_VPL,
-    encoder="preact-resnet18",
-    generator="cube-conv",
-    discriminator="spectral-patch",
-    discriminator_channels=32,
-    other_views="reversed",
-    silhouette_loss="pyramid",
-    learning_rate=4e-4,
-    lambda_inflation=1e-4,
-    lambda_discriminator=0.1,
-)
-#: Pascal3D+, without the published perceptual loss of colours.
-_PASCAL_VPL = VPLSettings(
-    **_VPL,
-    encoder="resnet18",
-    generator="cube-fc",
-    symmetry="z",
-    vertex_scale=0.1,
-    object_scale=1.0,
-    discriminator="patch",
-    discriminator_channels=64,
-    other_views="next",
-    learning_rate=2e-5,
-    lambda_inflation=3e-5,
-    lambda_discriminator=0.5,
-)
 
 
 def _vanilla(preset: TrainConfig) -> TrainConfig:
@@ -187,25 +149,6 @@ _NAMED = {
     ),
     # Published code of Peng et al. 2020: its VPL for Kato's data.
     "peng2020-kato-vpl": replace(_KATO, label="VPL", settings=VPLSettings()),
-    # Published code of Kato and Harada 2019: train_shapenet.sh, shapenet_single_sil_nv1_uvr.
-    "kato2019-kar": replace(
-        _KAR,
-        label="VPL",
-        settings=_KAR_VPL,
-        iterations=100_000,
-        batch_size=64,
-        sampling="classes",
-        augment=("flip", "channels"),
-    ),
-    # The same code: train_pascal.sh, pascal_proposed_color, without lambda_perceptual.
-    "kato2019-pascal": replace(
-        _PASCAL,
-        label="VPL",
-        settings=_PASCAL_VPL,
-        iterations=80_000,
-        batch_size=16,
-        sampling="classes",
-    ),
     "peng2020-pascal": _PASCAL,
     "peng2020-pascal-vanilla": _vanilla(_PASCAL),
 }
@@ -250,6 +193,24 @@ def configure(preset: str = DEFAULT_PRESET, **options: Any) -> TrainConfig:
     return replace(base, settings=settings, **options)
 
 
+#: Options of older runs of VPL that are gone, with their only value that is still possible.
+_GONE = {
+    "image_size": 64,
+    "vertex_scale": 0.01,
+    "object_scale": 0.5,
+    "discriminator": "dcgan",
+    "class_conditional": False,
+    "adversary": "alternating",
+    "other_views": "random",
+    "silhouette_size": 64,
+    "anti_aliasing": True,
+    "renderer_gradient": "nmr",
+    "silhouette_loss": "iou",
+    "adam_beta1": 0.9,
+    "lambda_inflation": 0.0,
+}
+
+
 def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
     """Build a TrainConfig from plain values.
 
@@ -258,6 +219,13 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
     try:
         if not isinstance(values, dict):
             raise ValueError(f"must hold options by name ({{...}}), got {type(values).__name__}")
+        if isinstance(settings := values.get("settings"), dict):
+            kept = {
+                name: value
+                for name, value in settings.items()
+                if name not in _GONE or value != _GONE[name]
+            }
+            values = values | {"settings": kept}
         return configure(**values)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None

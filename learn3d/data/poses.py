@@ -94,8 +94,8 @@ class LookAtPoses(_PoseSet):
         angles = self.distance, self.elevation_deg, self.azimuth_deg
         return nmr.LookAt.from_angles(*angles, half_fov_deg=self.half_fov_deg)
 
-    def features(self) -> Tensor:
-        """The input of a discriminator: the eye's position of each view, float32 [M, 3]."""
+    def eyes(self) -> Tensor:
+        """Positions of the eyes in the object frame, float32 [M, 3]."""
         return nmr.cameras.points_from_angles(
             self.distance, self.elevation_deg, self.azimuth_deg
         ).to(torch.float32)
@@ -137,9 +137,9 @@ class RotationPoses(_PoseSet):
             torch.cat([self.rotation, offset], dim=2), intrinsics, perspective=False
         )
 
-    def features(self) -> Tensor:
-        """The input of a discriminator: the nine entries of each rotation, float32 [M, 9]."""
-        return self.rotation.reshape(len(self), 9)
+    def eyes(self) -> Tensor:
+        """Directions from the object to the cameras, float32 [M, 3]; the cameras are far away."""
+        return -self.rotation[:, 2]
 
     def mirrored(self, chosen: Tensor) -> RotationPoses:
         """The poses of the images, those with `chosen` (bool [M]) flipped left-right (x' -> -x').

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from learn3d.data.dataset import Batch, ViewDataset
 
-Sampling = Literal["views", "pairs", "groups", "classes"]
+Sampling = Literal["views", "pairs", "groups"]
 ALL_ROWS = slice(None)
 GROUP_SIZE = 5  # views per object of sampling "groups"
 #: Views of each object in a batch, ordered [a_1 .. a_n, b_1 .. b_n, ...]; 1 if views are drawn independently.
-VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_SIZE, "classes": 1}
+VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_SIZE}
 
 
 def batches(
@@ -63,19 +63,13 @@ def sample_indices(
     "views": epochs of shuffled views. "pairs": two different views of each of batch_size / 2
     random objects, [a_1 .. a_n, b_1 .. b_n] (Kato et al. 2018). "groups": GROUP_SIZE views of
     each of batch_size / GROUP_SIZE random objects; views repeat if the object has fewer.
-    "classes": a random view of each of batch_size random categories (Kato and Harada 2019).
     Raises ValueError if "pairs" or "groups" finds no object with two views.
     """
     if sampling == "views":
         return shuffled_epochs(len(dataset), batch_size, seed, step)
     rng = np.random.default_rng([seed, step])
-    starts, order = _grouped_views(dataset, by_class=sampling == "classes")
+    starts, order = _views_of_objects(dataset)
     sizes = np.diff(starts)
-    if sampling == "classes":
-        drawn = rng.integers(dataset.num_classes, size=batch_size)
-        return torch.from_numpy(
-            np.array([order[starts[c] + rng.integers(sizes[c])] for c in drawn])
-        )
     able = np.flatnonzero(sizes >= 2)
     if len(able) == 0:
         raise ValueError(
@@ -110,17 +104,11 @@ def _epoch_order(num_samples: int, seed: int, epoch: int) -> Tensor:
 
 
 @functools.lru_cache(maxsize=2)
-def _grouped_views(dataset: ViewDataset, by_class: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Samples int64 [M] sorted by object or category, after the positions int64 at which each
-    starts, and M.
-    """
+def _views_of_objects(dataset: ViewDataset) -> tuple[np.ndarray, np.ndarray]:
+    """Samples int64 [M] sorted by object, after the positions int64 at which each starts, and M."""
     ids = dataset.object_ids
-    count = dataset.num_objects
-    if by_class:
-        ids = np.zeros_like(ids) if dataset.class_ids is None else dataset.class_ids[ids]
-        count = dataset.num_classes
     order = np.argsort(ids, kind="stable")
-    return np.searchsorted(ids[order], np.arange(count + 1)), order
+    return np.searchsorted(ids[order], np.arange(dataset.num_objects + 1)), order
 
 
 Augmentation = Literal["flip", "flip-image", "channels", "colors", "crop"]

@@ -31,9 +31,8 @@ CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts 
 class MeshSettings(MethodSettings):
     """Networks from images to meshes."""
 
-    # Subclasses may make these fields.
+    # A subclass may make this a field.
     lambda_view = 0.0  # weight of the loss of a network that classifies the azimuth of an image
-    adam_beta1 = 0.9
 
     encoder: EncoderName = "conv"
     """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask.
@@ -43,8 +42,7 @@ class MeshSettings(MethodSettings):
     generator: GeneratorName = "sphere"
     """Network from codes to vertices. sphere: 642 free vertices. sphere-smooth: the same;
     neighbours learn to move together first. auto: sphere-smooth if the training masks are
-    compact, else sphere. sphere-small: sphere with half the weights. cube-conv, cube-fc: 1352
-    vertices of a cube's surface, from convolutions or from linear layers (Kato and Harada 2019)."""
+    compact, else sphere. sphere-small: sphere with half the weights."""
     symmetry: SymmetryOption = None
     """Vertical mirror plane of all shapes: x (x = 0), z (z = 0), or the azimuth in degrees of a
     camera that looks along it (0 is x = 0). auto: found from the training masks, if they have
@@ -56,7 +54,7 @@ class MeshSettings(MethodSettings):
     reconstruction. The voxelizers find no inside in a shape that exceeds their grid."""
     pretrained: FilePath | None = None
     """File of ImageNet weights for the encoder resnet18: a state dict of torchvision's resnet18.
-    If not given: random weights. VPL then freezes its batch norms."""
+    If not given: random weights."""
     lambda_smooth: Weight = 0.001
     """Weight of the smoothness loss (lambda_1 in Peng et al. 2020)."""
 
@@ -135,8 +133,7 @@ class MeshMethod(Method):
             name: network for name, network in self.networks.items() if list(network.parameters())
         }
         rate = self.settings.learning_rate
-        betas = (self.settings.adam_beta1, 0.999)
-        return {name: adam(network, rate, betas) for name, network in trained.items()}
+        return {name: adam(network, rate) for name, network in trained.items()}
 
     def start_from_pretrained(self) -> None:
         if self.settings.pretrained is not None:

@@ -125,7 +125,7 @@ class Plus(PoseInvariant):
         between these silhouettes and the masks of this view class in the mask bank, mostly of
         other objects.
         """
-        whole, _ = whole_batch(batch)
+        whole = whole_batch(batch)
         self.mask_bank.add(all_gather(_reduced(batch.masks)), whole.view_ids)
         seen_by = int(torch.randint(len(whole.view_ids), ()))
         if not self.mask_bank.full:

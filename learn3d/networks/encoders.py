@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from learn3d.networks.layers import initialize_he, linear_layers, norm_relu
+from learn3d.networks.layers import initialize_he, linear_layers
 from learn3d.networks.resnet import ResNet18Encoder
 
 CODE_SIZE = 512
@@ -177,55 +177,3 @@ def network_input(
     for channel in range(4):  # one pass converts and copies; torch's own change of layout is slower
         pixels[:, channel].copy_(images[:, channel])
     return pixels.div_(255)
-
-
-class PreactResNet18(nn.Module):
-    """Images [B,4,S,S] in [0,1] -> shape code [B,512], unbounded; S is a multiple of 32
-    (published: 224).
-
-    As published by Kato and Harada 2019: colours in [-1,1], 0 (grey) if the mask is 0; 7x7
-    convolution of stride 2, batch norm, ReLU, 3x3 maximum of stride 2; four stages of two blocks
-    with 64, 128, 256, 512 channels, with batch norm and ReLU before each convolution; batch norm,
-    ReLU; a linear layer from all 512 * (S/32)^2 features. He's initial weights.
-    """
-
-    def __init__(self, image_size: int = 224, channels: int = 64) -> None:
-        super().__init__()
-        layers = [nn.Conv2d(3, channels, 7, stride=2, padding=3, bias=False), *norm_relu(channels)]
-        layers += [
-            nn.MaxPool2d(3, stride=2, ceil_mode=True),
-            _Block(channels, channels, first=True),
-        ]
-        layers.append(_Block(channels, channels))
-        for width in (2 * channels, 4 * channels, 8 * channels):
-            layers += [_Block(width // 2, width), _Block(width, width)]
-        self.layers = nn.Sequential(*layers, *norm_relu(8 * channels), nn.Flatten())
-        initialize_he(self)
-        self.code = nn.Linear(8 * channels * (image_size // 32) ** 2, CODE_SIZE)
-
-    def forward(self, images: Tensor) -> Tensor:
-        # Inverted colours (Kato's files) get the opposite sign, which makes no difference to training from scratch.
-        return self.code(self.layers((2 * images[:, :3] - 1) * images[:, 3:]))
-
-
-class _Block(nn.Module):
-    """x + f(x): f is two 3x3 convolutions, with batch norm and ReLU before each (except at the
-    input of the first block). If the number of channels changes, x passes a 1x1 convolution, and
-    it and the first one have stride 2.
-    """
-
-    def __init__(self, before: int, after: int, first: bool = False) -> None:
-        super().__init__()
-        stride = 1 if before == after else 2
-        self.residual = nn.Sequential(
-            *([] if first else norm_relu(before)),
-            nn.Conv2d(before, after, 3, stride=stride, padding=1, bias=False),
-            *norm_relu(after),
-            nn.Conv2d(after, after, 3, padding=1, bias=False),
-        )
-        self.shortcut = (
-            nn.Identity() if stride == 1 else nn.Conv2d(before, after, 1, stride=2, bias=False)
-        )
-
-    def forward(self, features: Tensor) -> Tensor:
-        return self.shortcut(features) + self.residual(features)

@@ -1,5 +1,5 @@
-"""Mesh generators, shape codes -> vertices: deformed spheres and cubes, with mirror symmetry
-about a vertical plane.
+"""Mesh generators, shape codes -> vertices: deformed spheres, with mirror symmetry about a
+vertical plane.
 """
 
 import math
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 import nmr
 from learn3d.networks.encoders import CODE_SIZE
-from learn3d.networks.layers import initialize_he, linear_layers, norm_relu
+from learn3d.networks.layers import linear_layers
 
 #: The mirror plane x = 0 or z = 0, or the vertical plane along which a camera of this azimuth in degrees looks
 #: (x = 0 is 0, z = 0 is 90).
@@ -184,146 +184,9 @@ class SmallSphereGenerator(SphereGenerator):
         self.layers = linear_layers(CODE_SIZE, 1024, 1024, self.outputs)
 
 
-GRID_SIZE = 16  # vertices along an edge of the cube
-INITIAL_RADIUS = 0.5
-BOUND = 1.2  # coordinates lie between -BOUND and BOUND
-
-
-def cube_surface(size: int = GRID_SIZE) -> tuple[Tensor, Tensor, Tensor]:
-    """The surface of a grid of size^3 points: (points int64 [V,3], patches int64 [6,size,size],
-    faces int64 [F,3]).
-
-    patches[f, i, j] is the vertex at (i, j) of side f of the cube; sides share the vertices at
-    edges and corners. Faces are counter-clockwise seen from outside. size = 16 gives V = 1352 and
-    F = 2700.
-    """
-    grid = torch.cartesian_prod(*[torch.arange(size)] * 3)
-    outside = ((grid == 0) | (grid == size - 1)).any(1)
-    points = grid[outside]
-    vertex = torch.full((size**3,), -1)
-    vertex[outside] = torch.arange(len(points))
-    vertex = vertex.view(size, size, size)
-    patches = torch.stack([vertex.select(axis, end) for axis in range(3) for end in (0, size - 1)])
-    faces = []
-    for side, patch in enumerate(patches):
-        a, b, c, d = patch[:-1, :-1], patch[1:, :-1], patch[1:, 1:], patch[:-1, 1:]
-        # (first axis) x (second axis) of the patch is the third axis for x and z and its opposite for y.
-        outwards = (side % 2 == 1) != (side // 2 == 1)
-        corners = (a, b, c, a, c, d) if outwards else (a, c, b, a, d, c)
-        faces.append(torch.stack(corners, dim=-1).view(-1, 3))
-    return points, patches, torch.cat(faces)
-
-
-class CubeGenerator(MeshGenerator):
-    """Base class: vertices = object_scale * 1.2 * tanh(base + scale * bias), float32 [B,1352,3].
-
-    `base` is a parameter that starts as the sphere of radius 0.5 (times object_scale); a subclass
-    computes `bias`, the offsets [B,1352,3], from the codes. With `symmetry`, as published: z
-    becomes |z|, each vertex becomes the mean of itself and its mirror image, and z gets the sign
-    that the vertex has on the cube. The vertices are then exactly symmetric, but the faces'
-    diagonals are not.
-    """
-
-    signs: Tensor  # float32 [V,3]: (1, 1, -1) if z < 0 on the cube, else 1
-
-    def __init__(self, scale: float, object_scale: float, symmetry: Symmetry | None) -> None:
-        points, patches, faces = cube_surface()
-        centred = 2 * points.double() / (GRID_SIZE - 1) - 1
-        super().__init__(centred, faces, symmetry)
-        self.patches = patches
-        self.scale = scale
-        self.object_scale = object_scale
-        sphere = centred / centred.norm(dim=1, keepdim=True)
-        self.base = nn.Parameter(torch.atanh(INITIAL_RADIUS * sphere / BOUND).float())
-        signs = torch.ones(len(points), 3)
-        signs[centred[:, 2] < 0, 2] = -1
-        self.register_buffer("signs", signs, persistent=False)
-
-    def forward(self, codes: Tensor) -> Tensor:
-        points = self.base + self.scale * self.bias(codes).float()
-        if self.mirror is not None:
-            points = torch.cat([points[..., :2], points[..., 2:].abs()], dim=-1)
-            points = (points + points[:, self.mirror]) / 2
-        vertices = self.object_scale * BOUND * torch.tanh(points)
-        return vertices if self.mirror is None else self.place(vertices * self.signs)
-
-
-class ConvCubeGenerator(CubeGenerator):
-    """A stack of transposed convolutions for each side of the cube; shared vertices get the mean
-    (ShapeNet).
-
-    Each stack: linear to 512@2x2, three 3x3 transposed convolutions of stride 2 to 256, 128, 64
-    channels, batch norm and ReLU after each of the four; 3x3 convolution to 3@16x16.
-    """
-
-    positions: Tensor  # int64 [V,3]: places of a vertex among the 6 * 16 * 16 outputs, padded with the first
-    shares: Tensor  # float32 [V,3,1]: their weights 1, 1/2 or 1/3; 0 for the padding
-
-    def __init__(
-        self,
-        symmetry: Symmetry | None = None,
-        scale: float = 0.01,
-        object_scale: float = 0.5,
-        channels: int = 512,
-    ) -> None:
-        super().__init__(scale, object_scale, symmetry)
-        self.sides = nn.ModuleList(_side_decoder(channels) for _ in self.patches)
-        places: list[list[int]] = [[] for _ in self.base]
-        for place, vertex in enumerate(self.patches.flatten().tolist()):
-            places[vertex].append(place)
-        positions = torch.tensor([[*p, *[p[0]] * (3 - len(p))] for p in places])
-        shares = torch.tensor([[1 / len(p)] * len(p) + [0.0] * (3 - len(p)) for p in places])
-        self.register_buffer("positions", positions, persistent=False)
-        self.register_buffer("shares", shares[:, :, None], persistent=False)
-
-    def bias(self, codes: Tensor) -> Tensor:
-        sides = torch.stack([side(codes) for side in self.sides], dim=1)  # [B,6,3,16,16]
-        outputs = sides.float().permute(0, 1, 3, 4, 2).flatten(1, 3)
-        # A gather: unlike a scatter's, its sums have a fixed order on every device.
-        return (outputs[:, self.positions] * self.shares).sum(2)
-
-
-def _side_decoder(channels: int) -> nn.Sequential:
-    layers: list[nn.Module] = [
-        nn.Linear(CODE_SIZE, 4 * channels, bias=False),
-        nn.Unflatten(1, (channels, 2, 2)),
-    ]
-    layers += norm_relu(channels)
-    for width in (channels // 2, channels // 4, channels // 8):
-        layers.append(
-            nn.ConvTranspose2d(
-                2 * width, width, 3, stride=2, padding=1, output_padding=1, bias=False
-            )
-        )
-        layers += norm_relu(width)
-    decoder = nn.Sequential(*layers, nn.Conv2d(width, 3, 3, padding=1))
-    initialize_he(decoder)
-    return decoder
-
-
-class LinearCubeGenerator(CubeGenerator):
-    """Linear layers 512-4096-4096-1352*3 with ReLU (Pascal3D+)."""
-
-    def __init__(
-        self,
-        symmetry: Symmetry | None = None,
-        scale: float = 0.1,
-        object_scale: float = 1.0,
-        channels: int = 4096,
-    ) -> None:
-        super().__init__(scale, object_scale, symmetry)
-        self.layers = linear_layers(CODE_SIZE, channels, channels, self.base.numel())
-        initialize_he(self)
-
-    def bias(self, codes: Tensor) -> Tensor:
-        return self.layers(codes).unflatten(1, (-1, 3))
-
-
-GeneratorName = Literal["auto", "sphere", "sphere-smooth", "sphere-small", "cube-conv", "cube-fc"]
+GeneratorName = Literal["auto", "sphere", "sphere-smooth", "sphere-small"]
 GENERATORS: dict[str, type[MeshGenerator]] = {
     "sphere": SphereGenerator,
     "sphere-smooth": SmoothSphereGenerator,
     "sphere-small": SmallSphereGenerator,
-    "cube-conv": ConvCubeGenerator,
-    "cube-fc": LinearCubeGenerator,
 }

@@ -1,8 +1,8 @@
-"""Parts that several networks share: layers, initial weights, gradient reversal."""
+"""Parts that several networks share: layers and initial weights."""
 
 import itertools
 
-from torch import Tensor, nn
+from torch import nn
 
 BATCH_NORM_EPS = 2e-5  # batch norms have it in the published code of Kato and Harada 2019
 
@@ -29,14 +29,3 @@ def initialize_he(network: nn.Module) -> None:
             nn.init.kaiming_normal_(module.weight)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
-
-
-def reverse_gradient(values: Tensor, factor: float) -> Tensor:
-    """The identity, with the gradient times -factor (Ganin and Lempitsky 2015).
-
-    Networks after it minimise a loss; networks before it maximise the same loss, `factor` times
-    as fast.
-    """
-    same = values.view_as(values)
-    same.register_hook(lambda grad: -factor * grad)
-    return same

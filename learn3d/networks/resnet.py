@@ -47,18 +47,11 @@ class ResNet18Encoder(nn.Module):
     images hold 1 - colour (Kato's files); natural colours are restored first. The code is the
     average of the last features, which is not negative, as in the published code of Peng et al.
     2020 on Pascal3D+ (S = 224).
-
-    flat_size: S of the encoder of Kato and Harada 2019, whose code is a linear layer on all 512 *
-    (S/32)^2 features.
-    frozen_norms: statistics, gain and offset of the batch norms do not change, as they published
-    for ImageNet weights.
     """
 
     image_size = 224
 
-    def __init__(
-        self, inverted: bool = False, *, flat_size: int | None = None, frozen_norms: bool = False
-    ) -> None:
+    def __init__(self, inverted: bool = False) -> None:
         super().__init__()
         self.inverted = inverted
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
@@ -72,31 +65,18 @@ class ResNet18Encoder(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):  # torchvision's initialisation
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        self.code = None if flat_size is None else nn.Linear(512 * (flat_size // 32) ** 2, 512)
-        norms = [module for module in self.modules() if isinstance(module, nn.BatchNorm2d)]
-        self.frozen_norms = (
-            [norm.requires_grad_(False).eval() for norm in norms] if frozen_norms else []
-        )
-
-    def train(self, mode: bool = True) -> ResNet18Encoder:
-        super().train(mode)
-        for norm in self.frozen_norms:
-            norm.eval()
-        return self
 
     def forward(self, images: Tensor) -> Tensor:
         colors = 1 - images[:, :3] if self.inverted else images[:, :3]
         x = (colors - self.mean) / self.std
         x = F.max_pool2d(F.relu(self.bn1(self.conv1(x))), 3, 2, padding=1)
-        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
-        return x.mean(dim=(2, 3)) if self.code is None else self.code(x.flatten(1))
+        return self.layer4(self.layer3(self.layer2(self.layer1(x)))).mean(dim=(2, 3))
 
 
 def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
     """Copy weights of torchvision's resnet18 (.pth, .pt or .safetensors) into an encoder, in place.
 
-    The layers "fc" of the file and "code" of the encoder are left out. Nothing in the file is
-    executed (weights_only).
+    The layer "fc" of the file is left out. Nothing in the file is executed (weights_only).
 
     Raises FileNotFoundError if the file is missing, ValueError if it cannot be read or has
     weights of another network.
@@ -110,9 +90,6 @@ def load_pretrained(encoder: ResNet18Encoder, path: Path | str) -> None:
     read = sandbox.read(formats.read_state_dict, path, wanted="weights of torchvision's resnet18")
     weights = {
         name: torch.from_numpy(value) for name, value in read.items() if not name.startswith("fc.")
-    }
-    weights |= {
-        name: value for name, value in encoder.state_dict().items() if name.startswith("code.")
     }
     try:
         encoder.load_state_dict(weights)

@@ -105,7 +105,7 @@ def layout_target(tmp: Path, layout: str) -> Target:
         assert not found, f"load read what the scan refused: {found}"
         batch = dataset.batch(torch.arange(min(3, len(dataset))))
         assert dataset.images.dtype == np.uint8 and batch.masks.isfinite().all()
-        assert dataset.poses.features().isfinite().all()
+        assert dataset.poses.eyes().isfinite().all()
         if dataset.voxels is not None:
             assert dataset.voxels.dtype == bool and dataset.voxels.view(np.uint8).max() <= 1
         if dataset.points is not None:

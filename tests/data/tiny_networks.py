@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
 import torch
 from torch import nn
 
-from learn3d.methods import vpl
 from learn3d.methods.method import Method
-from learn3d.networks.encoders import CODE_SIZE, ENCODERS, PreactResNet18, SmallConvEncoder
+from learn3d.networks.encoders import CODE_SIZE, ENCODERS, SmallConvEncoder
 from learn3d.networks.generators import GENERATORS, SmallSphereGenerator, Symmetry
 from learn3d.networks.layers import linear_layers
 
@@ -32,7 +29,7 @@ class TinyGenerator(SmallSphereGenerator):
 
 
 def put_in_place(patch: pytest.MonkeyPatch | None = None) -> None:
-    """Let the names conv, conv-small and sphere-small mean these, and preact-resnet18 be narrow.
+    """Let the names conv, conv-small and sphere-small mean these.
 
     Until `patch` is undone, or as long as this process lives.
     """
@@ -40,7 +37,6 @@ def put_in_place(patch: pytest.MonkeyPatch | None = None) -> None:
     patch.setitem(ENCODERS, "conv", TinyEncoder)
     patch.setitem(ENCODERS, "conv-small", TinyEncoder)
     patch.setitem(GENERATORS, "sphere-small", TinyGenerator)
-    patch.setattr(vpl, "PreactResNet18", partial(PreactResNet18, channels=4))
 
 
 class FixedMethod(Method):

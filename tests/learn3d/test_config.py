@@ -79,6 +79,16 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 
+def test_runs_of_vpl_from_before_its_other_forms_went_are_read():
+    options = {"adversary": "alternating", "anti_aliasing": True, "image_size": 64}
+    vpl = BASE | {"preset": "vpl", "settings": {"discriminator_channels": 8}}
+    older = vpl | {"settings": vpl["settings"] | options}
+    assert config_from_dict(older) == config_from_dict(vpl)
+    older["settings"]["adversary"] = "reversal"
+    with pytest.raises(ValueError, match="there is no option 'adversary'"):
+        config_from_dict(older)
+
+
 def test_images_may_be_flipped_if_their_view_classes_are_not_read():
     settings = {"encoder": "conv-light", "lambda_view": 1.0}
     config = config_from_dict(

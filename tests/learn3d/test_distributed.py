@@ -31,17 +31,6 @@ RUNS = {  # for each: its preset, options, and the bound of relative differences
     "pairs": ("multi-view-kato", TINY, 1e-5),
     "groups": ("many-views-kato", TINY | {"symmetry": "x", "batch_size": 20}, 1e-5),
     "vpl": ("peng2020-kato-vpl", TINY_VPL, 1e-4),
-    "vpl-kar": (
-        "kato2019-kar",
-        {
-            "layout": "kato",
-            "image_size": 64,
-            "silhouette_size": 64,
-            "discriminator_channels": 2,
-            "augment": ("flip", "channels"),
-        },
-        1e-3,
-    ),
     "prgan": ("gadelha2017-kato", TINY_PRGAN, 1e-3),
 }
 OFTEN = {"log_every": 1, "validate_every": 2, "checkpoint_every": 2, "pictures_every": 4}

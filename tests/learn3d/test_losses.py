@@ -17,7 +17,6 @@ from learn3d.losses import (
     mmd,
     pose_classification_loss,
     silhouette_energy_distance,
-    silhouette_pyramid_loss,
 )
 from learn3d.networks.discriminators import pose_discriminator
 
@@ -139,34 +138,6 @@ def test_mmd_as_printed_equals_its_double_sum() -> None:
     assert mmd_of_views(x, y, "mmd_paper") == pytest.approx(float(expected), rel=1e-5)
     for name in ("mmd", "mmd_paper"):
         assert mmd_of_views(torch.ones(4, 3), torch.ones(4, 3), name) == 0
-
-
-def test_silhouette_pyramid_equals_its_sum() -> None:
-    torch.manual_seed(0)
-    prediction, target = torch.rand(3, 48, 48), (torch.rand(3, 48, 48) > 0.6).float()
-    expected = 0.0
-    for p, t in zip(prediction, target, strict=True):
-        for level in range(5):
-            size = 48 // 2**level
-            a, b = (
-                image.unfold(0, 2**level, 2**level).unfold(1, 2**level, 2**level).mean((2, 3))
-                for image in (p, t)
-            )
-            assert a.shape == (size, size)
-            expected += float((a / a.norm() - b / b.norm()).square().sum()) / 3
-    assert float(silhouette_pyramid_loss(prediction, target)) == pytest.approx(expected, rel=1e-5)
-
-
-def test_silhouette_pyramid_of_equal_and_of_empty_images() -> None:
-    x = torch.arange(64) - 32
-    disc = (x[:, None] ** 2 + x**2 < 300).float()[None]
-    empty = torch.zeros(1, 64, 64, requires_grad=True)
-    # the grey does not count
-    assert float(silhouette_pyramid_loss(disc / 2, disc)) == pytest.approx(0, abs=1e-10)
-    loss = silhouette_pyramid_loss(empty, disc)
-    assert loss.item() == pytest.approx(5)
-    loss.backward()
-    assert torch.isfinite(empty.grad).all()
 
 
 def test_energy_distance_equals_its_sum() -> None:

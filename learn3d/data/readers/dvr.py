@@ -125,7 +125,7 @@ def _fit_world(path: Path, cameras: list[np.ndarray]) -> np.ndarray:
         )
     eyes = -np.einsum("kij,ki->kj", rotations, matrices[:, :, 3])
     poses = view_poses(torch.arange(NUM_VIEWS))
-    true_eyes = poses.features().double().numpy()
+    true_eyes = poses.eyes().double().numpy()
     u, _, v = np.linalg.svd(true_eyes.T @ eyes)
     to_object = u @ v
     # rows: right, down, forward

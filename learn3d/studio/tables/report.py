@@ -18,7 +18,7 @@ from learn3d.data.poses import LookAtPoses
 from learn3d.evaluation import Evaluation, evaluate
 from learn3d.files import limits, writing
 from learn3d.files.reading import read_bytes
-from learn3d.pictures import Surface, azimuths_deg, eyes, grid_surface, natural_colors
+from learn3d.pictures import Surface, azimuths_deg, grid_surface, natural_colors
 from learn3d.presets import command_line
 from learn3d.runs.folder import METRICS
 from learn3d.runs.log import read_records
@@ -260,7 +260,7 @@ def pack_shapes(runs: Sequence[TrainedModel], samples: Sequence[int]) -> list[di
         )
     pictures = natural_colors(batch.images.numpy(), inverted=dataset.inverted)
     oblique = LookAtPoses(torch.full((len(samples),), -30.0), 20.0, 1.0, 15.0)
-    cameras = eyes(batch.poses or oblique).numpy() @ _TO_PAGE
+    cameras = (batch.poses or oblique).eyes().double().numpy() @ _TO_PAGE
     cameras /= np.linalg.norm(cameras, axis=1, keepdims=True)
     items = []
     for number, (sample, *surfaces) in enumerate(zip(samples, *shapes, strict=True)):

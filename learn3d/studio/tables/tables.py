@@ -96,11 +96,9 @@ VARIANTS: dict[str, Variant] = {
         for widths in BIN_WIDTHS
     },
     "kar-vanilla": Variant("peng2020-kar-vanilla", checkpoint="best"),
-    "kar-vpl": Variant("kato2019-kar", checkpoint="best"),
     "kar-plus": Variant("plus-kar", checkpoint="best", small_batches_of="peng2020-kar"),
     "pascal-proposed": Variant("peng2020-pascal", checkpoint="best"),
     "pascal-baseline": Variant("peng2020-pascal-vanilla", checkpoint="best"),
-    "pascal-vpl": Variant("kato2019-pascal"),
     "pascal-plus": Variant("plus-pascal", checkpoint="best", small_batches_of="peng2020-pascal"),
     "vanilla-schedule-symmetry": Variant(_VANILLA, _SCHEDULE | _SYMMETRY),
     "proposed-schedule": Variant(_PROPOSED, _SCHEDULE),

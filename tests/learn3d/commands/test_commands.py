@@ -145,7 +145,7 @@ def test_help_has_every_preset_and_the_options_of_the_chosen_one(command) -> Non
     page = command("train", "--help", "--preset", "vpl")[1]
     for option in ("--lambda-discriminator", "--augment", "--encoder", "--pictures-every"):
         assert option in page
-    assert "  kato2019-pascal " in page and "  prgan " in page
+    assert "  plus-pascal " in page and "  prgan " in page
     assert "Images per training step" in page and "(default: peng2020-kato-vpl)" in page
 
 

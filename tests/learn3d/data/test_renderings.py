@@ -77,7 +77,7 @@ def test_images_and_cameras_of_dvr_are_those_of_katos_files(originals) -> None:
     colors = dataset.images[:, :3].transpose(0, 2, 3, 1)
     np.testing.assert_array_equal(np.unique(colors[inside], axis=0), [[255 - c for c in COLOR]])
     assert not colors[~inside].any()
-    assert torch.equal(dataset.poses.features(), view_poses(torch.arange(24)).features())
+    assert torch.equal(dataset.poses.eyes(), view_poses(torch.arange(24)).eyes())
     assert silhouette_iou(dataset, *mesh(1)).min() > 0.94
 
 

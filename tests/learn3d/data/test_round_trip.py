@@ -123,7 +123,7 @@ def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
     for name in ("images", "masks", "view_ids", "object_ids", "class_ids", "voxels"):
         a, b = getattr(one, name), getattr(other, name)
         assert (a is None and b is None) or torch.equal(a, b), name
-    assert torch.equal(one.poses.features(), other.poses.features())
+    assert torch.equal(one.poses.eyes(), other.poses.eyes())
     assert after.mean_object_size() == pytest.approx(before.mean_object_size())
     assert after.check_masks() == before.check_masks()
     if LAYOUTS[made.layout].angles:

@@ -65,15 +65,6 @@ def test_the_silhouette_comes_closer(tiny_set, monkeypatch, steps: tuple[int, in
     assert loss(after.vertices) < loss(before) - 0.02
 
 
-def test_methods_that_train_on_larger_silhouettes_are_refined(tiny_set, monkeypatch) -> None:
-    take_steps(monkeypatch, 1, 1)
-    method = make_method("kato2019-kar")
-    batch = tiny_set.batch(torch.tensor([0]))
-    images = torch.zeros(1, 4, method.image_size, method.image_size, dtype=torch.uint8)
-    shapes = refine(method, images, batch.masks, batch.poses)
-    assert shapes.vertices.shape == (1, 1352, 3) and shapes.vertices.isfinite().all()
-
-
 def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(
     tiny_set, monkeypatch
 ) -> None:

@@ -1,42 +1,27 @@
-"""Mesh generators: the cube's surface, the rules of their vertices, and mirror symmetry about any vertical plane."""
+"""Mesh generators: the rules of their vertices, and mirror symmetry about any vertical plane."""
 
 from __future__ import annotations
-
-import math
 
 import pytest
 import torch
 from mirrors import reflected
 from torch import nn
 
-import nmr
-from learn3d.networks.generators import (
-    GENERATORS,
-    ConvCubeGenerator,
-    CubeGenerator,
-    LinearCubeGenerator,
-    MeshGenerator,
-    Symmetry,
-    cube_surface,
-)
+from learn3d.networks.generators import GENERATORS, MeshGenerator, Symmetry
 
 PLANES = {"x": 0.0, "z": 90.0, 0.0: 0.0, 37.5: 37.5, -90.0: -90.0}
 
 
-def narrow(name: str, symmetry: Symmetry | None) -> MeshGenerator:
+def create(name: str, symmetry: Symmetry | None) -> MeshGenerator:
     torch.manual_seed(0)
-    cubes = {"cube-conv": (ConvCubeGenerator, 16), "cube-fc": (LinearCubeGenerator, 32)}
-    if name not in cubes:
-        return GENERATORS[name](symmetry)
-    kind, channels = cubes[name]
-    return kind(symmetry, channels=channels)
+    return GENERATORS[name](symmetry)
 
 
 @pytest.mark.parametrize("name", GENERATORS)
 @pytest.mark.parametrize("symmetry", PLANES)
 def test_shapes_are_their_own_mirror_images(name: str, symmetry: Symmetry) -> None:
     """Shapes of codes are, and any vertices can be made so."""
-    generator = narrow(name, symmetry)
+    generator = create(name, symmetry)
     vertices = generator(3 * torch.randn(3, 512)).detach()
     mirrored = reflected(vertices, PLANES[symmetry])
     torch.testing.assert_close(vertices[:, generator.mirror], mirrored, atol=1e-6, rtol=0)
@@ -50,7 +35,7 @@ def test_shapes_are_their_own_mirror_images(name: str, symmetry: Symmetry) -> No
     torch.testing.assert_close(
         symmetric[:, generator.mirror], reflected(symmetric, PLANES[symmetry]), atol=1e-6, rtol=0
     )
-    assert narrow("sphere-small", None).symmetrized(vertices) is vertices
+    assert create("sphere-small", None).symmetrized(vertices) is vertices
 
 
 def test_the_smooth_sphere_moves_neighbours_together() -> None:
@@ -99,51 +84,3 @@ def test_the_symmetric_sphere_is_the_published_one() -> None:
         )
         assert gradient.nonzero().tolist() == [[0, output]]
         assert gradient[0, output] == 0.5 * sign
-
-
-def test_cube_is_closed_and_its_faces_look_outwards() -> None:
-    points, patches, faces = cube_surface()
-    edges = nmr.edge_table(faces)  # raises unless every edge has two faces
-    assert (len(points), len(edges), len(faces)) == (1352, 4050, 2700)
-    assert patches.shape == (6, 16, 16)
-    assert torch.equal(faces.unique(), torch.arange(1352))
-    vertices = points.double() - 7.5
-    outwards = (nmr.face_normals(vertices, faces) * vertices[faces].mean(1)).sum(1)
-    torch.testing.assert_close(outwards, torch.full((2700,), 7.5, dtype=torch.float64))
-    sides = ((points == 0) | (points == 15)).sum(1)  # 1 within a side, 2 at an edge, 3 at a corner
-    assert torch.equal(torch.bincount(patches.flatten()), sides)
-
-
-@pytest.mark.parametrize("name", ["cube-conv", "cube-fc"])
-@pytest.mark.parametrize("symmetry", [None, "z"])
-def test_rule_of_the_vertices(name: str, symmetry: Symmetry | None, monkeypatch) -> None:
-    generator: CubeGenerator = narrow(name, symmetry).eval()
-    assert (generator.scale, generator.object_scale) == (
-        (0.01, 0.5) if name == "cube-conv" else (0.1, 1.0)
-    )
-    codes = torch.randn(2, 512)
-    points = (generator.base + generator.scale * generator.bias(codes)).clone()
-    if symmetry is not None:
-        points[..., 2] = points[..., 2].abs()
-        points = torch.stack(
-            [(points[:, i] + points[:, j]) / 2 for i, j in enumerate(generator.mirror.tolist())], 1
-        )
-        points[..., 2] *= torch.where(cube_surface()[0][:, 2] < 8, -1, 1)
-    torch.testing.assert_close(generator(codes), generator.object_scale * 1.2 * torch.tanh(points))
-    monkeypatch.setattr(generator, "bias", lambda codes: torch.zeros(len(codes), 1352, 3))
-    lengths = generator(codes).norm(dim=2)
-    torch.testing.assert_close(lengths, torch.full_like(lengths, 0.5 * generator.object_scale))
-
-
-def test_sides_are_averaged_at_shared_vertices() -> None:
-    generator = ConvCubeGenerator(channels=8)
-    values = torch.randn(6)
-    for side, value in zip(generator.sides, values, strict=True):
-        torch.nn.init.zeros_(side[-1].weight)
-        torch.nn.init.constant_(side[-1].bias, float(value))
-    bias = generator.bias(torch.randn(2, 512))
-    _, patches, _ = cube_surface()
-    for vertex in (0, 1, 17, 700, 1351):
-        sides = [side for side in range(6) if (patches[side] == vertex).any()]
-        expected = math.fsum(values[side] for side in sides) / len(sides)
-        torch.testing.assert_close(bias[:, vertex], torch.full((2, 3), expected))

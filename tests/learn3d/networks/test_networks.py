@@ -13,28 +13,15 @@ from vectors import load_vector
 
 from learn3d.methods import create_method
 from learn3d.methods.method import Method
-from learn3d.networks.discriminators import (
-    OneHotViewDiscriminator,
-    PatchDiscriminator,
-    SpectralPatchDiscriminator,
-    pose_discriminator,
-)
+from learn3d.networks.discriminators import OneHotViewDiscriminator, pose_discriminator
 from learn3d.networks.encoders import (
     CENTRED_SIZE,
     ENCODERS,
     EncoderName,
-    PreactResNet18,
     centre,
     network_input,
 )
-from learn3d.networks.generators import (
-    GENERATORS,
-    ConvCubeGenerator,
-    LinearCubeGenerator,
-    deform_sphere,
-)
-from learn3d.networks.layers import reverse_gradient
-from learn3d.networks.resnet import ResNet18Encoder
+from learn3d.networks.generators import GENERATORS, deform_sphere
 from learn3d.networks.voxel_gan import InverseEncoder, SilhouetteDiscriminator, VoxelGenerator
 from learn3d.presets import PRESETS
 
@@ -42,15 +29,10 @@ from learn3d.presets import PRESETS
 #: Strides and padding follow from the shapes of the table below.
 PUBLISHED: dict[str, tuple[Callable[[], nn.Module], int]] = {
     "encoder": (ENCODERS["conv"], 19_383_488),
-    "preact": (PreactResNet18, 24_020_288),
     "generator": (GENERATORS["sphere"], 6_570_886),
     "symmetric generator": (lambda: GENERATORS["sphere"]("z"), 4_630_483),
-    "cube-conv": (ConvCubeGenerator, 15_607_146),
-    "cube-fc": (LinearCubeGenerator, 35_504_048),
     "discriminator": (lambda: pose_discriminator(24), 167_320),
     "dcgan": (lambda: OneHotViewDiscriminator(24), 11_083_137),
-    "spectral-patch": (lambda: SpectralPatchDiscriminator(3), 2_772_865),
-    "patch": (lambda: PatchDiscriminator(9), 2_894_401),
     "voxels": (VoxelGenerator, 2_304_612),
     "silhouettes": (SilhouetteDiscriminator, 17_228_545),
     "inverse encoder": (InverseEncoder, 2_463_433),
@@ -71,40 +53,18 @@ def test_networks_have_the_published_size(name: str) -> None:
     if create in (VoxelGenerator, SilhouetteDiscriminator, InverseEncoder):
         assert all(abs(m.weight.std() - 0.1) < 0.01 for m in layers(network, nn.Linear))
         assert all(m.momentum == 0.1 for m in batch_norms)
-    if name == "spectral-patch":  # a gain would undo the normalisation
-        assert all(not m.weight.requires_grad and m.bias.requires_grad for m in batch_norms)
 
 
 IMAGES, CODES, MASKS = (2, 4, 64, 64), (2, 512), (2, 64, 64)
-LARGE_IMAGES, LARGE_MASKS = (2, 4, 96, 96), (2, 224, 224)
-SPHERES, CUBES = (2, 642, 3), (2, 1352, 3)
+SPHERES = (2, 642, 3)
 
 #: A network of small width, the shapes of its inputs (an integer: classes below it), and of its output.
 SMALL: dict[str, tuple[Callable[[], nn.Module], list, tuple[int, ...]]] = {
     **{name: (encoder, [IMAGES], CODES) for name, encoder in ENCODERS.items()},
-    "preact": (lambda: PreactResNet18(96, channels=4), [LARGE_IMAGES], CODES),
-    "flat": (lambda: ResNet18Encoder(flat_size=96), [LARGE_IMAGES], CODES),
-    **{
-        name: (generator, [CODES], SPHERES)
-        for name, generator in GENERATORS.items()
-        if not name.startswith("cube")
-    },
+    **{name: (generator, [CODES], SPHERES) for name, generator in GENERATORS.items()},
     "symmetric": (lambda: GENERATORS["sphere-small"](30.0), [CODES], SPHERES),
-    "cube-conv": (lambda: ConvCubeGenerator(channels=16), [CODES], CUBES),
-    "cube-fc": (lambda: LinearCubeGenerator("z", channels=32), [CODES], CUBES),
     "discriminator": (lambda: pose_discriminator(24), [CODES], (2, 24)),
     "dcgan": (lambda: OneHotViewDiscriminator(5, channels=4), [MASKS, 5], (2,)),
-    "spectral-patch": (
-        lambda: SpectralPatchDiscriminator(3, channels=4),
-        [LARGE_MASKS, (2, 3)],
-        (2, 4, 4),
-    ),
-    "classes": (
-        lambda: SpectralPatchDiscriminator(3, 4, num_classes=3),
-        [LARGE_MASKS, (2, 3), 3],
-        (2, 4, 4),
-    ),
-    "patch": (lambda: PatchDiscriminator(9, channels=4), [LARGE_MASKS, (2, 9)], (2, 31, 31)),
     "voxels": (lambda: VoxelGenerator((4, 4, 2, 1)), [(2, 200)], (2, 64, 64, 64)),
     "silhouettes": (lambda: SilhouetteDiscriminator((4, 4, 4, 8)), [MASKS], (2,)),
     "inverse encoder": (InverseEncoder, [MASKS], (2, 201)),
@@ -133,18 +93,6 @@ def test_shapes_and_gradients_of_all_networks(name: str) -> None:
     assert [key for key, g in gradients.items() if not g.any()] == []
 
 
-def test_every_weight_of_spectral_patch_has_spectral_norm_1() -> None:
-    torch.manual_seed(0)
-    network = SpectralPatchDiscriminator(3, channels=8, num_classes=4)
-    for _ in range(20):  # one power iteration each
-        network(torch.rand(2, 64, 64), torch.rand(2, 3), torch.tensor([0, 1]))
-    normalised = layers(network.eval(), nn.Conv2d, nn.Linear)
-    assert len(normalised) == 8
-    for layer in normalised:
-        norm = torch.linalg.matrix_norm(layer.weight.detach().flatten(1), 2)
-        assert float(norm) == pytest.approx(1, abs=0.05)
-
-
 def test_dcgan_sees_silhouette_and_view() -> None:
     network, silhouettes = OneHotViewDiscriminator(5, channels=4), torch.rand(2, 64, 64)
     expected = torch.zeros(2, 6, 64, 64)
@@ -153,39 +101,10 @@ def test_dcgan_sees_silhouette_and_view() -> None:
     assert torch.equal(network(silhouettes, torch.tensor([0, 3])), expected.flatten(1))
 
 
-def test_class_conditioning_is_a_projection_on_the_last_features() -> None:
-    torch.manual_seed(0)
-    network = SpectralPatchDiscriminator(3, channels=4, num_classes=3).eval()
-    features, plain = [], []
-    network.layers.register_forward_hook(lambda _, __, output: features.append(output))
-    network.last.register_forward_hook(lambda _, __, output: plain.append(output))
-    logits = network(torch.rand(2, 224, 224), torch.rand(2, 3), torch.tensor([0, 2]))
-    vectors = network.classes.weight.T[torch.tensor([0, 2])]
-    product = (vectors[:, :, None, None] * features[0]).sum(1)
-    torch.testing.assert_close(logits, plain[0][:, 0] + product[:, ::2, ::2])
-
-
-def test_gradient_reversal_has_sign_and_scale() -> None:
-    values = torch.randn(3, requires_grad=True)
-    reversed_values = reverse_gradient(values, 0.25)
-    assert torch.equal(reversed_values, values)
-    (reversed_values * torch.tensor([1.0, -2, 4])).sum().backward()
-    assert torch.equal(values.grad, torch.tensor([-0.25, 0.5, -1]))
-
-
 def test_generator_rule_vectors() -> None:
     case = load_vector("generator_rule")
     base, bias, vertices = (torch.from_numpy(case[key]) for key in ("base", "bias", "vertices"))
     assert torch.equal(deform_sphere(base, bias), vertices)
-
-
-def test_background_of_preact_is_grey() -> None:
-    pixels = torch.tensor([[0.0, 1.0, 0.5, 0.0], [0.0, 1.0, 0.5, 1.0]])
-    images = pixels[:, :, None, None].expand(2, 4, 32, 32)
-    network, seen = PreactResNet18(32, channels=4), []
-    network.layers[0].register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
-    network(images)
-    assert seen[0][:, :, 0, 0].tolist() == [[0, 0, 0], [-1, 1, 0]]
 
 
 @pytest.mark.parametrize("memory_format", [torch.channels_last, torch.contiguous_format])

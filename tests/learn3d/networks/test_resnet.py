@@ -1,8 +1,7 @@
-"""Both ResNets-18: torchvision's names and shapes, its arithmetic written out slowly, and weights from files."""
+"""ResNet-18: torchvision's names and shapes, its arithmetic written out slowly, and weights from files."""
 
 from __future__ import annotations
 
-import copy
 import math
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from torch import Tensor
 from learn3d.data.dataset import DatasetInfo
 from learn3d.files import limits
 from learn3d.methods.pose_invariant import PoseInvariantSettings
-from learn3d.methods.vpl import VPLSettings
 from learn3d.networks.resnet import IMAGENET_MEAN, IMAGENET_STD, ResNet18Encoder, load_pretrained
 
 
@@ -89,20 +87,15 @@ def test_weights_from_a_file_give_the_published_networks_output(tmp_path: Path, 
     assert torch.equal(encoder(images), encoder(changed))  # the mask is not looked at
 
 
-KINDS = {
-    "pooled": PoseInvariantSettings(encoder="resnet18"),
-    "flat": VPLSettings(encoder="resnet18", image_size=224),
-}
-
-
 @pytest.mark.parametrize("inverted", [True, False])
-@pytest.mark.parametrize("kind", KINDS)
-def test_it_sees_natural_colours_of_every_layout(kind: str, inverted: bool) -> None:
+def test_it_sees_natural_colours_of_every_layout(inverted: bool) -> None:
     """A red pixel reaches the first convolution as ImageNet's red, whether it is stored as red or as 255 - red."""
     stored = torch.zeros(1, 4, 224, 224, dtype=torch.uint8)
     stored[:, 0], stored[:, 3] = 255, 255
     stored[:, :3] = 255 - stored[:, :3] if inverted else stored[:, :3]
-    method = make_method(KINDS[kind], DatasetInfo(3, inverted=inverted))
+    method = make_method(
+        PoseInvariantSettings(encoder="resnet18"), DatasetInfo(3, inverted=inverted)
+    )
     seen = []
     method.encoder.conv1.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
     with torch.no_grad():
@@ -166,28 +159,3 @@ def test_wrong_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         file.truncate(limits.WEIGHTS_BYTES + 1)
     with pytest.raises(ValueError, match=r"w\.pth: has \d+ bytes; the limit is"):
         load_pretrained(encoder, path)
-
-
-def test_flat_resnet_is_linear_in_the_features_and_keeps_pretrained_batch_norms(
-    tmp_path: Path,
-) -> None:
-    torch.save(random_weights(), tmp_path / "w.pth")
-    network, plain = ResNet18Encoder(flat_size=64, frozen_norms=True), ResNet18Encoder().eval()
-    load_pretrained(network, tmp_path / "w.pth")
-    load_pretrained(plain, tmp_path / "w.pth")
-    images, features = torch.rand(2, 4, 64, 64), []
-    network.layer4.register_forward_hook(lambda _, __, output: features.append(output))
-    codes = network.train()(images)
-    torch.testing.assert_close(features[0].mean((2, 3)), plain(images))
-    torch.testing.assert_close(
-        codes, features[0].flatten(1) @ network.code.weight.T + network.code.bias
-    )
-    assert network.code.in_features == 512 * 2 * 2
-
-    before = copy.deepcopy(network.state_dict())
-    codes.square().sum().backward()
-    torch.optim.SGD([p for p in network.parameters() if p.requires_grad], lr=0.1).step()
-    after = network.state_dict()
-    changed = {name for name in after if not torch.equal(before[name], after[name])}
-    assert "conv1.weight" in changed
-    assert not [name for name in changed if "bn" in name or "downsample.1" in name]

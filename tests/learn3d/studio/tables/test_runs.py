@@ -137,7 +137,7 @@ def test_wrong_requests_are_named(given, message, request_for) -> None:
 @pytest.mark.parametrize("table", ["kato", "ablation", "bins", "prgan"])
 def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> None:
     changes = ("precision=fp32", "augment=flip-image,channels", "max_val_images=4")
-    changes += {"kato": ("vpl:anti_aliasing=false",), "prgan": ("distance=2.5",)}.get(
+    changes += {"kato": ("vpl:clamp_to_cube=true",), "prgan": ("distance=2.5",)}.get(
         table, ("lambda_prior=0.25",)
     )
     asked = {"iterations": 7, "layout": "kar", "set": changes}

@@ -35,7 +35,6 @@ DATA = {
     "pascal3d": {"procedural": 6, "val": 2, "views": 6},
 }
 _SMALL = ("encoder=conv-small", "generator=sphere-small")
-_VPL = ("discriminator_channels=8", "image_size=64", "silhouette_size=64")
 #: --set of every variant: its smallest networks.
 SMALLER = dict.fromkeys(VARIANTS, _SMALL) | {
     **{
@@ -48,9 +47,7 @@ SMALLER = dict.fromkeys(VARIANTS, _SMALL) | {
         for name in VARIANTS
         if "schedule" in name or "shared" in name
     },
-    "vpl": ("discriminator_channels=8", "encoder=preact-resnet18"),
-    "kar-vpl": _VPL,
-    "pascal-vpl": (*_VPL, "generator=cube-conv"),
+    "vpl": (*_SMALL, "discriminator_channels=8"),
     **dict.fromkeys(("pascal-baseline", "pascal-proposed"), _SMALL[:1]),
     "pascal-plus": (_SMALL[0], "bank_size=4"),
     "prgan": ("discriminator_channels=4,8,16,32", "generator_channels=16,8,4,1"),
