@@ -114,6 +114,29 @@ def check_faces(faces: object, batch: int, device: torch.device, name: str = "fa
     return faces.to(device=device, dtype=torch.int64)
 
 
+def check_indices(
+    indices: Tensor,
+    count: int,
+    name: str = "faces",
+    row: str = "vertex",
+    table: str = "a mesh",
+    rows: str = "vertices",
+) -> None:
+    """Raise a ValueError if an index is outside 0..count-1. (Values are unknown when compiled or
+    under vmap.)
+    """
+    if torch.compiler.is_compiling() or indices.numel() == 0:
+        return
+    try:
+        low, high = (int(x) for x in indices.aminmax())
+    except RuntimeError:  # inside torch.func.vmap values cannot be read
+        return
+    if low < 0 or high >= count:
+        raise ValueError(
+            f"{name} refer to {row} {low if low < 0 else high}, but {table} has {count} {rows} (the first is 0)"
+        )
+
+
 def check_camera(camera: object, packed: bool) -> None:
     """A camera must have ``transform(vertices)``; for lists of meshes
     ``transform(vertices, starts)``.

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
 from . import ops
-from ._validate import check_number, check_vertices, describe
-from .mesh import _check_indices, face_normals, face_vertices
+from ._validate import check_indices, check_number, check_vertices, describe
+from .mesh import face_normals, face_vertices
 
 __all__ = [
     "area_loss",
@@ -248,7 +248,7 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     edges = _check_edge_table(edges).to(vertices.device)
     if len(edges) == 0:
         raise ValueError("edges must hold at least one edge, got int64 [0, 4]")
-    _check_indices(edges, vertices.shape[1], "edges")
+    check_indices(edges, vertices.shape[1], "edges")
     rows = _batch_last(vertices)
     origin, end, left, right = (rows.index_select(0, column) for column in edges.unbind(1))
     normal, other = _cross(end - origin, left - origin), _cross(right - origin, end - origin)
@@ -408,5 +408,5 @@ def _check_edges(edges: object, vertices: Tensor) -> tuple[Tensor, Tensor]:
             f"nmr.edge_table(faces), got {describe(edges)}"
         )
     edges = edges[:, :2].to(vertices.device)
-    _check_indices(edges, vertices.shape[1], "edges")
+    check_indices(edges, vertices.shape[1], "edges")
     return edges[:, 0], edges[:, 1]

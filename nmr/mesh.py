@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._validate import check_faces, check_vertices, describe
+from ._validate import check_faces, check_indices, check_vertices, describe
 from .obj import find_image, find_libraries, load, match_materials, read_mtl
 
 
@@ -271,7 +271,7 @@ def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
     """
     batched = check_vertices(vertices)
     faces = check_faces(faces, batched.shape[0], batched.device)
-    _check_indices(faces, batched.shape[1])
+    check_indices(faces, batched.shape[1])
     corners = _gather(batched, faces.flatten(-2)).unflatten(1, (-1, 3))
     return corners if vertices.ndim == 3 else corners.squeeze(0)
 
@@ -372,23 +372,6 @@ def _one_mesh(faces: Tensor) -> Tensor:
 def _sides(faces: Tensor) -> Tensor:
     """Vertices of all sides 0-1, then all 1-2, then all 2-0, [3 F, 2], the smaller first."""
     return torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
-
-
-def _check_indices(indices: Tensor, num_vertices: int, name: str = "faces") -> None:
-    """Raise a ValueError if an index is outside 0..V-1. (Values are unknown when compiled or
-    under vmap.)
-    """
-    if torch.compiler.is_compiling() or indices.numel() == 0:
-        return
-    try:
-        low, high = (int(x) for x in indices.aminmax())
-    except RuntimeError:  # inside torch.func.vmap values cannot be read
-        return
-    if low < 0 or high >= num_vertices:
-        raise ValueError(
-            f"{name} refer to vertex {low if low < 0 else high}, "
-            f"but a mesh has {num_vertices} vertices (the first is 0)"
-        )
 
 
 def _expanded(indices: Tensor, batch: int) -> Tensor:

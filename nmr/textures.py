@@ -16,7 +16,14 @@ from torch import Tensor
 
 from . import ops
 from ._packing import is_list
-from ._validate import callers_level, check_choice, check_faces, check_values, describe
+from ._validate import (
+    callers_level,
+    check_choice,
+    check_faces,
+    check_indices,
+    check_values,
+    describe,
+)
 from .cameras.projection import has_perspective
 from .mesh import _unit
 
@@ -236,6 +243,9 @@ class UVTexture:
             for faces in _each(self.uv_faces):
                 batch = len(faces) if isinstance(faces, Tensor) and faces.ndim else 0
                 check_faces(faces, batch, torch.device("cpu"), "uv_faces")
+            if len(_each(self.uv)) == len(_each(self.uv_faces)):  # else refused when drawn
+                for faces, uv in zip(_each(self.uv_faces), _each(self.uv), strict=True):
+                    check_indices(faces, uv.shape[-2], "uv_faces", "row", "uv", "rows")
         check_choice(self.wrap, "wrap", ops.WRAPS)
         check_choice(self.filter, "filter", ("bilinear", "mipmap"))
 
@@ -277,7 +287,6 @@ class UVTexture:
             raise ValueError(
                 f"image must be one for all {batch} images drawn, or one for each, got {len(image)}"
             )
-        image = _once(image)
         sizes = [tuple(part.shape[:2]) for part in image]
         levels = (
             max([1, *(max(size).bit_length() for size in sizes)]) if self.filter == "mipmap" else 1
@@ -346,7 +355,6 @@ def sample_texture(
         raise ValueError(
             f"image must be one for all {len(uv)} images drawn, or one for each, got {len(image)}"
         )
-    image = _once(image)
     check_choice(wrap, "wrap", ops.WRAPS)
     height, width = image.shape[1:3]
     levels = 1 if derivatives is None else max(height, width).bit_length()
@@ -360,29 +368,6 @@ def sample_texture(
         level = steps.square().sum(-2).amax(-1).clamp(min=1).log2() / 2
         level = level.nan_to_num(0).clamp(max=levels - 1)
     return sample_places(texels, grids, level, uv.to(image), wrap)
-
-
-def _once(image: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
-    """One image [1, H, W, C] instead of its copies if it was expanded over the batch; other
-    images as they are.
-
-    The gradient then goes to the tensor that was expanded, which is ``_base`` unless that has
-    more texels.
-    """
-    if is_list(image) or len(image) < 2 or image.stride(0) != 0 or torch.compiler.is_compiling():
-        return image
-    if not image.requires_grad:
-        return image[:1]
-    whole = image._base
-    if image.retains_grad or whole is None or whole.numel() != image[0].numel():
-        return image
-    same = (
-        whole.stride()[-3:] == image.stride()[1:]
-        and whole.storage_offset() == image.storage_offset()
-    )
-    return (
-        whole.view(1, *image.shape[1:]) if same and whole.shape[-3:] == image.shape[1:] else image
-    )
 
 
 def level_grids(sizes: list[tuple[int, int]], levels: int) -> tuple[Tensor, int]:
@@ -457,7 +442,7 @@ class NormalMap(UVTexture):
         n = _unit(ops.interpolate(normals, fragments.faces, *fragments._at))
         sides, changes = [], []  # from corner 0 to corners 1 and 2, in space and in uv
         for k in (1, 2):
-            weights = torch.zeros(3).to(fragments.weights)
+            weights = fragments.weights.new_zeros(3)
             weights[0], weights[k] = -1.0, 1.0
             side = replace(fragments, weights=weights.expand_as(fragments.weights))
             sides.append(ops.interpolate(world, fragments.faces, *side._at))

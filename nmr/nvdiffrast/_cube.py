@@ -7,6 +7,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,7 +35,7 @@ def places(directions: Tensor, derivatives: Tensor | None) -> Places:
     axis = directions.detach().abs().argmax(-1)
     along = directions.gather(-1, axis.unsqueeze(-1))
     face = 2 * axis + (along[..., 0] < 0)
-    frame = torch.tensor([_COLUMNS, _ROWS]).to(directions)[:, face]  # [2, B, H, W, 3]
+    frame = directions.new_tensor([_COLUMNS, _ROWS])[:, face]  # [2, B, H, W, 3]
     at = (frame * directions).sum(-1).movedim(0, -1) / along.abs()
     slopes = None
     if derivatives is not None:
@@ -55,44 +56,31 @@ def with_borders(image: Tensor) -> Tensor:
     A corner of the border is the mean of the three texels that meet at the cube's corner.
     """
     batch, _, size, _, channels = image.shape
-    texels, corners = (x.to(image.device) for x in _neighbours(size))
+    texels, corners = (torch.from_numpy(x).to(image.device) for x in _neighbours(size))
     flat = image.reshape(batch, -1, channels)
     flat = torch.cat([flat, flat[:, corners].mean(2)], dim=1)
     return flat[:, texels].view(batch, 6 * (size + 2), size + 2, channels)
 
 
 @lru_cache(maxsize=32)
-def _neighbours(size: int) -> tuple[Tensor, Tensor]:
+def _neighbours(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Texels at the places of faces with borders ``[6 (n+2) (n+2)]``, and those that meet at
     corners ``[24, 3]``.
+
+    Arrays, because a tensor would belong to the mode of the first call, such as inference mode.
     """
-    centres = (2 * torch.arange(-1, size + 1, dtype=torch.float64) + 1 - size) / size
-    row, column = torch.meshgrid(centres, centres, indexing="ij")
-    columns, rows = torch.tensor(_COLUMNS).double(), torch.tensor(_ROWS).double()
-    outward = (
-        torch.eye(3, dtype=torch.float64).repeat_interleave(2, 0)
-        * torch.tensor([1.0, -1.0] * 3).double()[:, None]
-    )
-    grid = (
-        column[..., None] * columns[:, None, None]
-        + row[..., None] * rows[:, None, None]
-        + outward[:, None, None]
-    )
-    place = places(grid, None)
-    at = (place.at * size).floor().long().clamp(0, size - 1)
-    texels = place.face * size * size + at[..., 1] * size + at[..., 0]
-    inner, corners = [1, size], []
-    for face in range(6):
-        for y, near_y in ((0, inner[0]), (size + 1, inner[1])):
-            for x, near_x in ((0, inner[0]), (size + 1, inner[1])):
-                corners.append(
-                    torch.stack(
-                        [
-                            texels[face, near_y, near_x],
-                            texels[face, y, near_x],
-                            texels[face, near_y, x],
-                        ]
-                    )
-                )
-                texels[face, y, x] = 6 * size * size + len(corners) - 1
-    return texels.flatten(), torch.stack(corners)
+    centres = (2 * np.arange(-1, size + 1) + 1 - size) / size
+    row, column = (x[..., None] for x in np.meshgrid(centres, centres, indexing="ij"))
+    columns, rows = (np.array(x)[:, None, None] for x in (_COLUMNS, _ROWS))
+    outward = np.repeat(np.eye(3), 2, axis=0) * np.array([1.0, -1.0] * 3)[:, None]
+    grid = column * columns + row * rows + outward[:, None, None]
+    place = places(torch.from_numpy(grid), None)
+    at = (place.at.numpy() * size).astype(np.int64).clip(0, size - 1)
+    texels = place.face.numpy() * size * size + at[..., 1] * size + at[..., 0]
+    sides, corners = ((0, 1), (size + 1, size)), []  # the border, and the row next to it
+    for face in texels:
+        for y, near_y in sides:
+            for x, near_x in sides:
+                corners.append([face[near_y, near_x], face[y, near_x], face[near_y, x]])
+                face[y, x] = 6 * size * size + len(corners) - 1
+    return texels.flatten(), np.array(corners)

@@ -16,7 +16,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nmr import ops
-from nmr._validate import cast_under_autocast, check_choice, check_faces, check_image_size, describe
+from nmr._validate import (
+    cast_under_autocast,
+    check_choice,
+    check_faces,
+    check_image_size,
+    check_indices,
+    describe,
+)
 from nmr.nvdiffrast import _cube
 from nmr.textures import level_grids, sample_places
 
@@ -153,7 +160,7 @@ class _Scene(NamedTuple):
     @staticmethod
     def checked(pos: object, tri: object, resolution: object, ranges: object) -> _Scene:
         pos = _positions(pos)
-        tri = _faces(tri, pos)
+        tri = _faces(tri, pos, pos)
         size = check_image_size(
             list(resolution) if hasattr(resolution, "__iter__") else resolution, _LARGEST
         )
@@ -266,7 +273,7 @@ def interpolate(
     rast = _pixels(rast, "rast", 4)
     attr = _floats(attr, "attr", "[B, N, C] or [N, C]", (2, 3)).to(rast)
     attr = attr if attr.ndim == 3 else attr.unsqueeze(0)
-    corners, face_index = _faces(tri, rast), _ids(rast)
+    corners, face_index = _faces(tri, rast, attr, "attr"), _ids(rast)
 
     def at(values, u, v, w):
         return ops.interpolate(values, corners, face_index, torch.stack([u, v, w], dim=-1), None)
@@ -447,8 +454,9 @@ def _filtered(mip: _Mip, place: _cube.Places, level: Tensor | None, boundary_mod
     if boundary_mode in ("wrap", "clamp"):
         texels, grids = mip.pack()
         wrap = "repeat" if boundary_mode == "wrap" else "clamp"
+        at = place.at if boundary_mode == "clamp" else place.at - place.at.detach().floor()
         # row 0 of the kernel is v = 1
-        upright = torch.stack([place.at[..., 0], 1 - place.at[..., 1]], dim=-1)
+        upright = torch.stack([at[..., 0], 1 - at[..., 1]], dim=-1)
 
         def sample(level: Tensor | None) -> Tensor:
             return sample_places(texels, grids, level, upright, wrap)
@@ -559,7 +567,7 @@ def antialias(
     rast = _pixels(rast, "rast", 4).detach()
     color = _pixels(color, "color", None).to(rast)
     pos = _positions(pos).to(rast)
-    tri = _faces(tri, pos)
+    tri = _faces(tri, pos, pos)
     if topology_hash is None:
         topology_hash = antialias_construct_topology_hash(tri)
     if not isinstance(topology_hash, _Topology):
@@ -611,10 +619,11 @@ def _positions(pos: object) -> Tensor:
     return pos
 
 
-def _faces(tri: object, like: Tensor) -> Tensor:
+def _faces(tri: object, like: Tensor, rows: Tensor, name: str = "pos") -> Tensor:
     tri = check_faces(tri, 1, like.device, "tri")
     if tri.ndim != 2:
         raise ValueError(f"tri must have shape [F, 3], got {describe(tri)}")
+    check_indices(tri, rows.shape[-2], "tri", "row", name, "rows")
     if like.dtype == torch.float32 and len(tri) >= 2**24:
         raise ValueError(
             f"rast in float32 numbers at most {2**24 - 1} faces, got {len(tri)}; use float64"

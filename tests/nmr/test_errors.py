@@ -341,7 +341,7 @@ VALUES = [
     ("colors must have one row per face .80", lambda: rgb(nmr.FaceColors(V))),
     ("image must be .* got 3", lambda: rgb(nmr.UVTexture(IMAGE.expand(3, -1, -1, -1), UV))),
     ("uv_faces must have one row per face .80", lambda: rgb(nmr.UVTexture(IMAGE, UV, F[:3]))),
-    ("corners refer to", lambda: rgb(nmr.UVTexture(IMAGE, UV[:5], F))),
+    ("uv_faces refer to row 41, but uv has 5 rows", lambda: nmr.UVTexture(IMAGE, UV[:5], F)),
     (
         "colors must have one size, as the meshes do",
         lambda: rgb(nmr.VertexColors([V, V[:5]]), BATCH),

@@ -170,6 +170,7 @@ def test_texture(mode):
         sample(uv_da, bias, filter_mode=f"linear-mipmap-{name}") for name in ("linear", "nearest")
     )
     assert torch.equal(sample(uv_da, bias), smooth)
+    assert mode != "wrap" or torch.allclose(dr.texture(tex, uv + 2**22), plain, atol=1e-7)
     for at in itertools.product(*map(range, uv.shape[:3])):
         u, v = uv[at].tolist()
         samples = [slow_texture(level[at[0]], u, v, mode) for level in levels]
@@ -360,7 +361,7 @@ def antialias(topology_hash):
             "must lie within the 1 faces",
         ),
         (lambda: raster(tri=TRI[None]), r"tri must have shape \[F, 3\]"),
-        (lambda: raster(tri=TRI + 3), "refer to vertex 3, but a mesh has 3 vertices"),
+        (lambda: raster(tri=TRI + 3), "tri refer to row 3, but pos has 3 rows"),
         (
             lambda: dr.DepthPeeler(CONTEXT, POS, TRI, (4, 4)).rasterize_next_layer(),
             "inside of `with DepthPeeler",

@@ -227,28 +227,6 @@ def test_colours_have_true_derivatives(kind):
     )
 
 
-@pytest.mark.parametrize("filter", ["bilinear", "mipmap"])
-@pytest.mark.parametrize("kind", ["whole", "turned", "retained", "slice"])
-def test_an_image_that_was_expanded_over_the_batch_counts_once(kind, filter):
-    """The picture and the gradient are those of copies; only plain expansions are not copied."""
-    image = uniform(*((2,) if kind == "slice" else ()), 6, 6, 3).requires_grad_()
-    view = {"turned": lambda: image.transpose(0, 1), "slice": lambda: image[1]}
-    expanded = view.get(kind, lambda: image)().expand(4, -1, -1, -1)
-    if kind == "retained":
-        expanded.retain_grad()
-    mesh = TILTED[0].expand(4, -1, -1), TILTED[1]
-    grads, pictures = [], []
-    for each in (expanded, expanded.clone()):
-        rgb = draw(nmr.UVTexture(each, CORNERS, filter=filter), mesh)
-        weight = uniform(*rgb.shape, seed=1)
-        grads += torch.autograd.grad((weight * rgb).sum(), image, retain_graph=True)
-        pictures.append(rgb)
-    assert torch.equal(*pictures)
-    assert_close(*grads)
-    assert len(nmr.textures._once(expanded)) == (1 if kind == "whole" else 4)
-    assert len(nmr.textures._once(expanded.detach())) == 1
-
-
 def test_write_your_own():
     class Stripes:
         def sample(self, fragments):

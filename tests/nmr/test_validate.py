@@ -1,6 +1,5 @@
 """Checks and conversions of arguments that all public functions share: dtypes, depth range, default device."""
 
-import functools
 
 import numpy as np
 import pytest
@@ -94,72 +93,6 @@ def test_parameters_of_cameras_are_copies_of_arrays(dtype):
     before = [x.transform(SPHERE) for x in made]
     eye[2], matrix[0, 0] = -9.0, 1.0
     assert same_bits([x.transform(SPHERE) for x in made], before)
-
-
-class Own:
-    """A camera that is not one of nmr's."""
-
-    def transform(self, vertices):
-        return vertices + torch.tensor([0.0, 0.0, 3.0], device="cpu")
-
-
-EDGES = nmr.edge_table(FACES)
-LOSSES_OF_EDGES = (
-    nmr.losses.smoothness_loss,
-    nmr.losses.laplacian_loss,
-    nmr.losses.edge_length_loss,
-    nmr.losses.normal_consistency_loss,
-)
-LOSSES_OF_FACES = nmr.losses.inflation_loss, nmr.losses.volume_loss, nmr.losses.area_loss
-DRAWN = {
-    "silhouette": silhouette,
-    "cut": lambda: silhouette(camera=nmr.LookAt([0.0, 0.0, -0.5])),
-    "list": lambda: silhouette([SPHERE, SPHERE[:12]], [FACES, FACES[:0]]),
-    "local": lambda: silhouette(gradient="local"),
-    "wide": lambda: CAMERA.for_image(8, 16).transform(SPHERE),
-    "depth": lambda: nmr.render_depth(SPHERE, FACES, CAMERA, **SIZE),
-    "normals": lambda: nmr.render_normals(SPHERE, FACES, CAMERA, smooth=True, **SIZE),
-    "normals of a list": lambda: nmr.render_normals(
-        [SPHERE, SPHERE], [FACES, FACES[1:]], CAMERA, **SIZE
-    ),
-    "face index": lambda: nmr.render_face_index(SPHERE, FACES, CAMERA, **SIZE),
-    "rgb": lambda: rgb(SPHERE),
-    "normals by a camera of one's own": lambda: nmr.render_normals(SPHERE, FACES, Own(), **SIZE),
-    "lit": lambda: rgb(SPHERE, lights=nmr.Lights(direction=[0.0, 1.0, -1.0])),
-    "background": lambda: nmr.render_rgb(SPHERE, FACES, CAMERA, background=[0.1, 0.2, 0.3], **SIZE),
-    "voxels": lambda: nmr.voxelize(0.3 * SPHERE + 0.5, FACES, 8),
-    "edge_table": lambda: nmr.edge_table(FACES),
-    "unique_edges": lambda: nmr.unique_edges(FACES),
-    "vertex_normals": lambda: nmr.vertex_normals(SPHERE, FACES),
-    "soft_iou": lambda: nmr.losses.soft_iou_loss(COLORS, COLORS.round()),
-    **{loss.__name__: functools.partial(loss, SPHERE, EDGES) for loss in LOSSES_OF_EDGES},
-    **{loss.__name__: functools.partial(loss, SPHERE, FACES) for loss in LOSSES_OF_FACES},
-    "look_at": lambda: nmr.LookAt.from_angles(2.0, 30.0, [0.0, 90.0]),
-    "look": lambda: nmr.Look([0.0, 0.0, -3.0], half_fov_deg=torch.tensor(20.0, device="cpu")),
-    "orthographic": lambda: nmr.Orthographic([0.0, 0.0, -2.0], scale=0.5),
-    "pinhole": lambda: nmr.Pinhole(INTRINSICS, np.eye(3), T, orig_size=480),
-    "from_opencv": lambda: opencv(0.1, 0.0, 0.0, 0.0),
-    "to_opencv": lambda: cameras.to_opencv(PINHOLE, height=480, width=640)[0],
-    "from_opengl": lambda: cameras.from_opengl(*MATRICES),
-    "to_opengl": lambda: torch.stack(cameras.to_opengl(PINHOLE, near=0.1, far=10.0)),
-    "from_pytorch3d": lambda: cameras.from_pytorch3d(np.eye(3), T),
-    "from_pytorch3d_fov": lambda: cameras.from_pytorch3d_fov(np.eye(3), T, 40.0),
-    "to_pytorch3d": lambda: cameras.to_pytorch3d(CAMERA, image_size=(64, 64))["focal_length"],
-}
-
-
-@pytest.mark.parametrize("function", DRAWN.values(), ids=DRAWN)
-def test_the_default_device_does_not_matter(function):
-    """Results are on the device of the arguments; the device "meta" has no values, so that any use of it fails."""
-
-    def result():
-        made = function()
-        return made if isinstance(made, torch.Tensor) else made.transform(SPHERE)
-
-    wanted = result()
-    with torch.device("meta"):
-        got = result()
-    assert got.device.type == "cpu" and torch.equal(got, wanted)
 
 
 def test_spheres_are_made_on_the_default_device():
