@@ -1,6 +1,5 @@
 """Checks and conversions of arguments that all public functions share: dtypes, depth range, default device."""
 
-
 import numpy as np
 import pytest
 import torch
