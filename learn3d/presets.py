@@ -133,7 +133,7 @@ _NAMED = {
         augment=("crop", "channels"),
     ),
     # Published code of Kato et al. 2018: 64 pairs of views, and the iterations of airplanes, trained alone.
-    # docs/methods/vanilla-ae.md has the other categories.
+    # docs/methods/many-views.md has the other categories.
     "multi-view-kato": replace(
         _KATO,
         label="Vanilla-AE (multi-view)",
