@@ -1,6 +1,8 @@
 """Settings of the site, which `bash tools/site.sh` builds with Sphinx."""
 
+import contextlib
 import inspect
+import io
 import json
 import os
 import re
@@ -13,13 +15,33 @@ from sphinx import addnodes
 from sphinx.application import Sphinx
 
 import nmr
+from learn3d.commands import COMMANDS, main
 
 project = "nmr + learn3d"
 author = "the authors of nmr and learn3d"
 release = nmr.__version__
 html_title = f"nmr + learn3d {release}"
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "numpydoc", "sphinx_copybutton"]
+#: OWNER/NAME on GitHub, which names it to its own builds; elsewhere the site has no links to the repository.
+repository = os.environ.get("GITHUB_REPOSITORY")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.intersphinx",
+    "numpydoc",
+    "sphinx_copybutton",
+]
+# read from the internet, so not in a build without it
+intersphinx_mapping = (
+    {
+        "python": ("https://docs.python.org/3", None),
+        "torch": ("https://docs.pytorch.org/docs/stable", None),
+        "numpy": ("https://numpy.org/doc/stable", None),
+    }
+    if os.environ.get("GITHUB_ACTIONS")
+    else {}
+)
 # show_gallery has the gallery; logs are downloads
 exclude_patterns = [
     "_build",
@@ -49,6 +71,12 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_show_copyright = False
 html_show_sphinx = False
+if repository:
+    html_theme_options = {
+        "source_repository": f"https://github.com/{repository}",
+        "source_branch": "main",
+        "source_directory": "docs/",
+    }
 
 
 def show_gallery(app: Sphinx, page: str, text: list[str]) -> None:
@@ -68,7 +96,6 @@ def show_gallery(app: Sphinx, page: str, text: list[str]) -> None:
 
 def offer_colab(app: Sphinx, page: str, text: list[str]) -> None:
     """Put a link to Google Colab above each notebook, if the site is built by GitHub, which names the repository."""
-    repository = os.environ.get("GITHUB_REPOSITORY")
     if repository and Path(app.env.doc2path(page)).suffix == ".ipynb":
         address = (
             f"https://colab.research.google.com/github/{repository}/blob/main/docs/{page}.ipynb"
@@ -89,18 +116,50 @@ def offer_colab(app: Sphinx, page: str, text: list[str]) -> None:
         text[0] = json.dumps(notebook)
 
 
-def hand_out_files(app: Sphinx, doctree: nodes.document) -> None:
-    """Links to Markdown files that are no pages become downloads. MyST does the same with links to all other files."""
+def show_commands(app: Sphinx, page: str, text: list[str]) -> None:
+    """Put the help of each command on the page of commands."""
+    if page == "commands":
+        blocks = []
+        for name, (_, _, purpose) in COMMANDS.items():
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+                main(name, "--help")
+            blocks.append(f"## {name}\n\nTo {purpose}.\n\n```text\n{printed.getvalue()}```\n")
+        text[0] = text[0].replace("<!-- help of all commands -->", "\n".join(blocks))
+
+
+def show_names(app: Sphinx, page: str, text: list[str]) -> None:
+    """Put a table of all public names of nmr on its page."""
+    if page == "api/nmr":
+        names = "\n".join(
+            f"   nmr.{name}" for name in nmr.__all__ if not inspect.ismodule(getattr(nmr, name))
+        )
+        text[0] += f"\n.. autosummary::\n\n{names}\n"
+
+
+def link_sources(app: Sphinx, doctree: nodes.document) -> None:
+    """Links to files that are no pages lead to the repository; without one they are text, not downloads."""
+    folder = Path(app.env.doc2path(app.env.docname)).parent
+    for link in list(doctree.findall(addnodes.download_reference)):
+        _link(link, folder / link["reftarget"])
     for link in list(doctree.findall(addnodes.pending_xref)):
-        if link.get("refdomain") != "doc" or link["reftarget"] in app.env.found_docs:
-            continue
-        # outside of docs, the target is absolute
+        # a Markdown file; outside of docs, the target is absolute
         target = Path(app.srcdir) / f"{link['reftarget']}.md"
-        if target.is_file():
-            relative = os.path.relpath(target, Path(app.env.doc2path(link["refdoc"])).parent)
-            link.replace_self(
-                addnodes.download_reference("", "", *link.children, reftarget=relative)
-            )
+        if (
+            link.get("refdomain") == "doc"
+            and link["reftarget"] not in app.env.found_docs
+            and target.is_file()
+        ):
+            _link(link, target)
+
+
+def _link(link: nodes.Element, file: Path) -> None:
+    path = file.resolve().relative_to(Path(__file__).resolve().parent.parent).as_posix()
+    if repository:
+        address = f"https://github.com/{repository}/blob/main/{path}"
+        link.replace_self(nodes.reference("", "", *link.children, refuri=address))
+    else:
+        link.replace_self(nodes.inline("", "", *link.children))
 
 
 def parameter_texts(function: Any) -> dict[str, Parameter]:
@@ -141,5 +200,7 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", explain_all_parameters, priority=400)
     app.connect("source-read", show_gallery)
     app.connect("source-read", offer_colab)
+    app.connect("source-read", show_commands)
+    app.connect("source-read", show_names)
     # before Sphinx collects the downloads
-    app.connect("doctree-read", hand_out_files, priority=400)
+    app.connect("doctree-read", link_sources, priority=400)

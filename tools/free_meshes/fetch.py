@@ -4,7 +4,7 @@ python tools/free_meshes/fetch.py --output models
 
 It writes OUTPUT/CATEGORY/NAME.ply: welded, y up, front +z, box centred at the origin, of length 1.
 OUTPUT/index.csv has the source and licence of each mesh, OUTPUT/licences the packages' copyright
-files. The same packages give the same bytes. It runs on Debian; docs/real-meshes.md has more.
+files. The same packages give the same bytes. It runs on Debian; README.md beside it has more.
 """
 
 import csv
