@@ -43,7 +43,7 @@ def studio_lights(
 def photograph(
     vertices: torch.Tensor | np.ndarray,
     faces: torch.Tensor | np.ndarray,
-    colors: np.ndarray | Sequence[float] | nmr.UVTexture,
+    colors: np.ndarray | Sequence[float] | nmr.VertexColors,
     cameras: nmr.cameras.Camera,
     *,
     image_size: int,
@@ -53,14 +53,14 @@ def photograph(
     """One mesh in B views on white, without gradients. Both sides of its faces are lit alike.
 
     vertices float [V, 3] in the object frame, faces integer [F, 3], a camera of nmr with B poses.
-    colors: a texture, or colours of the faces, float [F, 3] or [3] in [0, 1]. supersample:
+    colors: those of the vertices, or of the faces, float [F, 3] or [3] in [0, 1]. supersample:
     subpixels per pixel and axis, an even number; 2 covers exactly the pixels that
     `nmr.render_silhouette` covers. Returns rgb uint8 [B, S, S, 3], row 0 = top, and alpha uint8
     [B, S, S], 255 * the covered share of each pixel. Raises TypeError and ValueError as
     `nmr.render` does.
     """
     faces = torch.as_tensor(faces).cpu()
-    if not isinstance(colors, nmr.UVTexture):
+    if not isinstance(colors, nmr.VertexColors):
         colors = nmr.FaceColors(
             torch.as_tensor(np.float32(colors)).clamp(0.0, 1.0).expand(len(faces), 3)
         )
@@ -90,20 +90,12 @@ _FAR = 5.0  # distance of orthographic cameras, outside of any object: faces beh
 Cameras = Sequence[nmr.LookAt | nmr.Orthographic]  # each of one view
 
 
-class Texture(NamedTuple):
-    """An image on the faces of a surface."""
-
-    image: Tensor  # float32 [H, W, 3] in [0, 1], row 0 = top
-    uv: Tensor  # float32 [F, 3, 2]: place of each corner of each face; (0, 0) is the image's bottom left corner
-
-
 class Surface(NamedTuple):
     """One shape as triangles, on the CPU."""
 
     vertices: Tensor  # float32 [V, 3], object frame
     faces: Tensor  # int64 [F, 3]; F = 0 is an empty shape
     colors: Tensor | None = None  # float32 [V, 3] in [0, 1], R, G, B of each vertex; None: clay
-    texture: Texture | None = None  # it is shown instead of the colours
 
 
 def grid_surface(grid: Tensor, *, level: float = 0.5, box: float = 1.0) -> Surface:
@@ -169,11 +161,7 @@ def draw_surface(surface: Surface, cameras: Cameras, *, image_size: int) -> np.n
     if len(surface.faces) == 0:
         return np.full((len(cameras), image_size, image_size, 3), 255, np.uint8)
     colored = surface.colors is not None  # colours of a photograph have its light: shade them less
-    if surface.texture is not None:
-        image, uv = surface.texture
-        colors = nmr.UVTexture(image, uv.flatten(0, 1), torch.arange(3 * len(uv)).view(-1, 3))
-    else:
-        colors = surface.colors.detach()[surface.faces].mean(dim=1).numpy() if colored else CLAY
+    colors = nmr.VertexColors(surface.colors.detach()) if colored else CLAY
     pictures = []
     for camera in cameras:  # one at a time, to save memory
         direction = torch.tensor(_LIGHT, dtype=torch.float64) @ camera.projection().matrix[0, :, :3]

@@ -179,8 +179,7 @@ class Reconstruct(OnDataset):
     """Fit the predicted shapes to the masks. The cameras are those of the data set; for image files
     cameras and colours are estimated. If not given: yes for image files, no for --data."""
     format: Literal["glb", "obj", "ply"] = "glb"
-    """Format of the mesh files. All have colours: glb in a texture image where there is one, obj
-    and ply at the vertices."""
+    """Format of the mesh files: one welded mesh with smooth normals and colours at the vertices."""
 
     def run(self) -> None:
         if bool(self.images) == (self.data is not None):

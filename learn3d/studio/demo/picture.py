@@ -17,9 +17,9 @@ from learn3d.studio.picture_to_mesh.cutting import Box, Outline, correct, find_o
 from learn3d.studio.picture_to_mesh.reconstruction import (
     Model,
     Reconstruction,
-    mesh_bytes,
     reconstruct_guesses,
 )
+from learn3d.studio.picture_to_mesh.write import mesh_bytes
 from learn3d.studio.shapes import make_shape
 
 SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224

@@ -1,7 +1,6 @@
-"""Colours for a mesh from the picture to which it was fitted, at its vertices and in a texture image.
+"""Colours for the vertices of a mesh from the picture to which it was fitted.
 
-Hidden parts get blurred colours of their neighbours. Each face has a triangle of its own in the
-texture image.
+Hidden parts get blurred colours of their neighbours.
 """
 
 from collections.abc import Callable
@@ -16,9 +15,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 import nmr
-from learn3d.pictures import Surface, Texture
+from learn3d.pictures import Surface
 from learn3d.studio.picture_to_mesh.fit import View
-from learn3d.studio.picture_to_mesh.smoothing import joined, sharpen
+from learn3d.studio.picture_to_mesh.smoothing import divide, joined
 
 DEPTH_SIZE = 256  # side of the depth map that decides which vertices are visible
 BEHIND = 0.02  # distance behind the depth map from which a vertex is hidden, in units of the object frame
@@ -26,10 +25,9 @@ GRAZING = 0.25  # cosine between normal and line of sight below which a colour i
 EQUAL = 0.06  # two parts are equal if the sizes of their boxes and their heights above the ground differ by less
 BORDER = 2  # width in pixels of the border inside the outline that may have the background's colours; its inner
 # pixels count half, as thin legs have no others
-WIDTH = 1024  # texels; the height of a texture depends on the mesh
-TEXELS = 250.0  # per unit of the object frame
-SIDES = (2, 4, 8, 16, 24, 32)  # sides that a triangle in the image can have, in texels
-_SURE = 0.02  # squared reliability of a colour that counts as much as the colours of the vertices
+COARSE = 0.1  # longest edge of the mesh on which the colours of hidden parts are found
+FINE = 0.025  # longest edge of the coloured mesh, in units of the object frame
+_SURE = 0.02  # squared reliability of a colour that counts as much as those of the neighbours
 
 #: Colours [N, 3] in [0, 1] at points [N, 3] of a surface with normals [N, 3], and their reliability [N] in [0, 1].
 LookUp = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -40,16 +38,18 @@ def color_mesh(
     view: View,
     picture: np.ndarray,
     mirror: Tensor | None = None,
-    textured: bool = False,
+    fine: bool = False,
 ) -> Surface:
     """A surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if these are
     hidden, too, blurred colours of their neighbours.
 
     mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the picture's camera.
     picture: R, G, B and mask, uint8 [4, S, S], framed as in `fitting.fit`. mirror: float32
-    [3, 3], the reflection that maps the shape to itself, None without symmetry. textured: double
-    the vertices along sharp edges, and add a texture image.
+    [3, 3], the reflection that maps the shape to itself, None without symmetry. fine: divide edges
+    longer than `FINE`, so that the vertices show the picture.
     """
+    if fine:
+        mesh = divide(*mesh, COARSE)
     look_up_seen = _seen(*mesh, view, picture)
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,8 +62,15 @@ def color_mesh(
         mixed = weight[:, None] * seen + its_weight[:, None] * other
         return mixed / both.clamp(min=1e-6)[:, None], both
 
-    surface = Surface(*mesh, _spread(*look_up(mesh[0], nmr.vertex_normals(*mesh)), *mesh))
-    return paint(sharpen(surface), look_up) if textured else surface
+    vertices, faces = mesh
+    colors = _spread(*look_up(vertices, nmr.vertex_normals(*mesh)), *mesh)
+    if fine:
+        with_colors, faces = divide(torch.cat([vertices, colors], 1), faces, FINE)
+        vertices, plain = with_colors.split(3, 1)
+        found, reliable = look_up(vertices, nmr.vertex_normals(vertices, faces))
+        share = (reliable.square() / (reliable.square() + _SURE))[:, None]
+        colors = (share * found + (1 - share) * plain).clamp(0, 1)
+    return Surface(vertices, faces, colors)
 
 
 def _seen(vertices: Tensor, faces: Tensor, view: View, picture: np.ndarray) -> LookUp:
@@ -132,63 +139,3 @@ def _nearest_clear(points: np.ndarray, clear: np.ndarray, neighbours: coo_array)
             moved = points[here] + (low[other] + high[other] - low[hidden] - high[hidden]) / 2
             nearest[here] = there[cKDTree(points[there]).query(moved)[1]]
     return nearest
-
-
-def paint(surface: Surface, look_up: LookUp) -> Surface:
-    """The surface with a texture image. It needs colours of its vertices, which texels of low reliability get."""
-    height, uv, place, corners, shares = _lay_out(surface.vertices[surface.faces].numpy())
-    corners = surface.faces.flatten()[corners]
-    normals = nmr.vertex_normals(surface.vertices, surface.faces)
-    values = (surface.vertices, normals, surface.colors)
-    points, normals, plain = ((v[corners] * shares[..., None]).sum(1) for v in values)
-    found, reliable = look_up(points, F.normalize(normals, dim=1))
-    share = (reliable.square() / (reliable.square() + _SURE))[:, None]
-    image = torch.ones(height, WIDTH, 3)
-    image.view(-1, 3)[place] = (share * found + (1 - share) * plain).clamp(0, 1)
-    uv = uv / torch.tensor([WIDTH, -height]) + torch.tensor([0.0, 1.0])
-    return surface._replace(texture=Texture(image, uv))
-
-
-def _lay_out(triangles: np.ndarray) -> tuple[int, Tensor, Tensor, Tensor, Tensor]:
-    """Lay triangles [F, 3, 3] out in an image.
-
-    Each rectangular cell of the image holds two triangles of the same size. Around a triangle one
-    more texel continues its colours, so that interpolation at its sides does not read another
-    triangle. Returns the image's height; places of all corners in texels, x right and y down,
-    float32 [F, 3, 2]; and for each of N used texels its index, int64 [N], three of the 3 F
-    corners, int64 [N, 3], and their barycentric shares, float32 [N, 3].
-    """
-    edges = np.linalg.norm(triangles - np.roll(triangles, 1, 1), axis=2)
-    order = (
-        edges.argmin(1)[:, None] + np.arange(3)
-    ) % 3  # the shortest edge goes down from the first corner
-    kinds = np.searchsorted(SIDES[:-1], TEXELS * np.stack([edges.max(1), edges.min(1)], 1))
-    corners, texels, top = np.empty((len(triangles), 3, 2), np.float32), [], 0
-    for kind in np.unique(kinds, axis=0):
-        faces, sides = np.flatnonzero((kinds == kind).all(1)), np.take(SIDES, kind)
-        width, height = sides + 4
-        cells, across = -(-len(faces) // 2), WIDTH // width
-        left, low = np.arange(cells) % across * width, top + np.arange(cells) // across * height
-        top = low[-1] + height
-        first = 1 + sides * np.array([(0, 0), (1, 0), (0, 1)])
-        for k, own in enumerate((first, sides + 4 - first)):
-            own = own + np.stack([left, low], 1)[: len(faces[k::2]), None]
-            corners[faces[k::2, None], order[faces[k::2]]] = own
-        y, x = np.indices((height, width))
-        b, c = (x - 0.5) / sides[0], (y - 0.5) / sides[1]
-        shares = np.stack([1 - b - c, b, c], -1)
-        others = shares[::-1, ::-1]  # the second triangle is the first one, turned by 180 degrees
-        is_second = shares[..., 0] < others[..., 0]
-        shares = np.where(is_second[..., None], others, shares)
-        pairs = np.resize(faces, (cells, 2))[:, :, None, None]
-        face = np.where(is_second, pairs[:, 1], pairs[:, 0])
-        place = (low[:, None, None] + y) * WIDTH + left[:, None, None] + x
-        of_cells = (
-            3 * face[..., None] + order[face],
-            np.broadcast_to(np.float32(shares), (*face.shape, 3)),
-        )
-        texels.append((place.ravel(), *(each.reshape(-1, 3) for each in of_cells)))
-    place, corner, shares = (
-        torch.from_numpy(np.concatenate(each)) for each in zip(*texels, strict=True)
-    )
-    return top, torch.from_numpy(corners), place, corner, shares

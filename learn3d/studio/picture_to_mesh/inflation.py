@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from learn3d.pictures import Surface, Texture, grid_surface
+from learn3d.pictures import Surface, grid_surface
 from learn3d.studio.picture_to_mesh.fit import HALF_FOV_DEG, View
 from learn3d.studio.picture_to_mesh.smoothing import smooth
 
@@ -48,8 +48,7 @@ def inflate(picture: np.ndarray) -> tuple[Surface, View]:
     image = _spread(picture)
     size = image.shape[0]
     column, row = ((value * size).long().clamp(0, size - 1) for value in ((1 + x) / 2, (1 - y) / 2))
-    texture = Texture(image, torch.stack([(1 + x) / 2, (1 + y) / 2], 1)[faces])
-    return Surface(vertices, faces, image[row, column], texture), view
+    return Surface(vertices, faces, image[row, column]), view
 
 
 def _solve(inside: np.ndarray) -> np.ndarray:

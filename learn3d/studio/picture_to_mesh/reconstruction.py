@@ -3,24 +3,21 @@
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import torch
-import trimesh
 from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
 from learn3d.config import TrainConfig
-from learn3d.data.conventions import mesh_to_object
 from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import MEAN_OBJECT_SIZE, frame, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.data.poses import Poses
-from learn3d.files import writing
 from learn3d.files.images import resample
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Method
@@ -28,12 +25,6 @@ from learn3d.networks.encoders import CENTRED_SIZE, centre
 from learn3d.pictures import (
     Surface,
     azimuths_deg,
-    draw_around,
-    natural_colors,
-    save_gif,
-    save_png,
-    tile,
-    turntable,
 )
 from learn3d.runs import checkpoint
 from learn3d.settings import split_names
@@ -43,19 +34,15 @@ from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
 from learn3d.studio.picture_to_mesh.fit import Progress, find_view, fit, predict
 from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.refinement import refine
-from learn3d.studio.picture_to_mesh.smoothing import divide, outer_surface
+from learn3d.studio.picture_to_mesh.smoothing import outer_surface
 from learn3d.studio.picture_to_mesh.templates import MIRROR, TEMPLATES, Templates, fit_template
+from learn3d.studio.picture_to_mesh.write import MeshFormat, Reconstruction, save
 from learn3d.terminal import note
 
-MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
-
 SMALL_MODEL = Path(__file__).with_name("small.safetensors")  # the model in the package
-STRIP_SIZE = 192  # side of each picture in a strip, in pixels
 # side in pixels to which a photograph is reduced before its object is searched
 _SEARCHED_SIDE = 1024
 _COLORED = 256  # side in pixels of the picture that gives the colours
-# longest edge of a coloured template, since hidden parts have the colours of its vertices
-_LONGEST_EDGE = 0.1
 _INK = 16  # brightness up to which a pixel is black
 _BLACK = 0.7  # share of a drawing's pixels that are black
 _GAP = 0.015  # half of the widest gap in a line, as a share of the drawing
@@ -145,13 +132,8 @@ def reconstruct_files(
             note(f"warning: {name}: {made[0].warning}")
         elif made[0].kind:
             note(f"{name}: category {', '.join(each.kind for each in made)}")
-        paths += save(
-            folder,
-            [name, *(f"{name}-{k}" for k in range(2, len(made) + 1))],
-            made,
-            model,
-            mesh_format,
-        )
+        names = [name, *(f"{name}-{k}" for k in range(2, len(made) + 1))]
+        paths += save(folder, names, made, model.config.layout, mesh_format)
     for error in faults[1:]:
         note(f"error: {error}")
     if faults:
@@ -213,9 +195,8 @@ def reconstruct_dataset(
     else:
         azimuths = azimuths_deg(batch.poses).tolist()
     names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
-    return save(
-        folder, names, list(map(Reconstruction, surfaces, stored, azimuths)), model, mesh_format
-    )
+    made = list(map(Reconstruction, surfaces, stored, azimuths))
+    return save(folder, names, made, model.config.layout, mesh_format)
 
 
 @torch.no_grad()
@@ -298,19 +279,6 @@ def prepare_image(
     return frame(colors, mask, size, object_size=object_size, inverted=LAYOUTS[layout].inverted)
 
 
-class Reconstruction(NamedTuple):
-    """The shape of a picture, and how it was found."""
-
-    surface: Surface  # object frame; with the picture's colours if it was fitted
-    stored: np.ndarray  # uint8 [4, S, S]: the input of the network
-    azimuth_deg: float  # estimated azimuth of the picture's camera
-    # IoU of the fitted shape's silhouette and the mask; None without a fit
-    silhouette_iou: float | None = None
-    # predicted category; None without a fit, or without templates if the model has only one
-    kind: str | None = None
-    warning: str | None = None  # a reason to doubt the shape; None without a fit
-
-
 def reconstruct_picture(
     model: Model,
     colors: np.ndarray,
@@ -385,9 +353,9 @@ def reconstruct_guesses(
     for fitted, kind in fit_template(
         templates, model.categories, predicted, framed, mask, progress, **options
     ):
-        mesh = divide(fitted.vertices, fitted.faces, _LONGEST_EDGE)
         progress("colours", 0.9)
-        surface = color_mesh(mesh, fitted.view, framed, MIRROR, textured=True)
+        mesh = fitted.vertices, fitted.faces
+        surface = color_mesh(mesh, fitted.view, framed, MIRROR, fine=True)
         yield Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind)
 
 
@@ -461,96 +429,3 @@ def input_azimuth_deg(
         return 0.0
     target = centre(reduce_mask(mask)[None, None])[0, 0]
     return float(find_view(surface.vertices, surface.faces, target, probabilities)[0].azimuth_deg)
-
-
-def export_mesh(path: Path, surface: Surface) -> None:
-    """Write a mesh of the object frame as OBJ, GLB or PLY (by the file's ending): see `mesh_bytes`."""
-    writing.write_bytes(path, mesh_bytes(surface, path.suffix.lower().lstrip("."), path.stem))
-
-
-def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
-    """A file of the kind "obj", "glb" or "ply" with a mesh of the object frame, y up, right-handed, normals outwards.
-
-    The object frame is left-handed, so the mesh is reflected and the order of each face reversed.
-    A GLB has the texture or else the vertex colours, OBJ and PLY only the vertex colours. `name`
-    is the node's in a GLB, whose material is double-sided: learnt surfaces cross themselves, and
-    viewers would hide the faces that are seen from behind.
-    """
-    points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
-    mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
-    if kind == "glb" and surface.texture is not None:
-        mesh = _with_texture(mesh, *surface.texture)
-    elif surface.colors is not None:
-        colors = surface.colors.detach().cpu().clamp(0, 1)
-        colors = colors**2.2 if kind == "glb" else colors  # colours of vertices in a GLB are linear
-        mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
-    if kind == "glb":
-        options = {"include_normals": True, "tree_postprocessor": _finish_materials}
-        content = trimesh.Scene({name: mesh}).export(file_type=kind, **options)
-    else:
-        content = mesh.export(file_type=kind)
-    return content.encode() if isinstance(content, str) else content
-
-
-def _with_texture(mesh: trimesh.Trimesh, image: Tensor, uv: Tensor) -> trimesh.Trimesh:
-    """The mesh with a texture; uv: float [F, 3, 2], the corners of each face before its order was reversed."""
-    corners = mesh.faces.ravel()
-    texture = Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=texture)
-    visual = trimesh.visual.TextureVisuals(uv.flip(1).flatten(0, 1).numpy(), material)
-    faces, normals = np.arange(len(corners)).reshape(-1, 3), mesh.vertex_normals[corners]
-    return trimesh.Trimesh(
-        mesh.vertices[corners], faces, vertex_normals=normals, visual=visual, process=False
-    )
-
-
-def _finish_materials(tree: dict) -> None:
-    """Make the materials of a glTF tree matt and double-sided, without mipmaps, whose texels would mix faces."""
-    materials = tree.setdefault("materials", [{}])
-    for material in materials:
-        material.setdefault("pbrMetallicRoughness", {}).update(
-            metallicFactor=0.0, roughnessFactor=1.0
-        )
-        material["doubleSided"] = True
-    for texture in tree.get("textures", ()):
-        texture["sampler"] = 0
-        # linear, clamped
-        tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]
-    for mesh in tree.get("meshes", ()):  # an empty shape has none
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
-
-
-def save(
-    folder: Path,
-    names: Sequence[str],
-    made: Sequence[Reconstruction],
-    model: Model,
-    mesh_format: MeshFormat,
-) -> list[Path]:
-    """Write <name>.<format>, <name>.gif (turntable) and <name>.png (input, mask, six views) of each shape.
-
-    Returns three paths for each name.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    titles = [
-        "input",
-        "mask",
-        "from the input's side",
-        *(f"turned by {60 * k}°" for k in range(1, 6)),
-    ]
-    paths = []
-    for name, (surface, stored, azimuth_deg, *_) in zip(names, made, strict=True):
-        mesh, animation, strip = (
-            folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")
-        )
-        export_mesh(mesh, surface)
-        save_gif(animation, turntable(surface))
-        colors = natural_colors(stored, inverted=LAYOUTS[model.config.layout].inverted)
-        views = draw_around(
-            surface, [azimuth_deg - 60 * k for k in range(6)], image_size=STRIP_SIZE
-        )
-        shown = [colors, np.repeat(stored[3][..., None], 3, axis=2), *views]
-        save_png(strip, tile([shown], titles, tile_size=STRIP_SIZE))
-        paths += [mesh, animation, strip]
-    return paths

@@ -1,6 +1,4 @@
-"""Finer, smoother meshes: divided edges, sharp edges, and the outer surface of meshes that cross themselves."""
-
-import math
+"""Finer, smoother meshes: divided edges, and the outer surface of meshes that cross themselves."""
 
 import numpy as np
 import torch
@@ -12,7 +10,7 @@ from torch import Tensor
 from trimesh.smoothing import filter_taubin
 
 import nmr
-from learn3d.pictures import Surface, grid_surface
+from learn3d.pictures import grid_surface
 
 CELLS = 128  # cells along each side of the grid of `outer_surface`
 _LEVEL = 0.15  # share of a cell that is filled at the surface
@@ -53,6 +51,8 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Tensor]:
     """Divide a mesh [V, 3], [F, 3] until no edge is longer than `longest`. Closed meshes stay closed.
 
+    Vertices [V, 3 + C] have C further values, which are interpolated.
+
     An edge is halved, and with it all its faces, if it is the longest of each of them (Rivara
     1984).
     """
@@ -61,7 +61,7 @@ def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Ten
         low, high = (f(triangles, np.roll(triangles, -1, 1)) for f in (np.minimum, np.maximum))
         keys, edge = np.unique(low * len(points) + high, return_inverse=True)
         edges, edge = np.stack(np.divmod(keys, len(points)), 1), edge.reshape(-1, 3)
-        length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+        length = np.linalg.norm((points[edges[:, 0]] - points[edges[:, 1]])[:, :3], axis=1)
         rank = np.argsort(np.argsort(length, kind="stable"), kind="stable")  # no two are equal
         side = rank[edge].argmax(1)
         chosen = np.take_along_axis(edge, side[:, None], 1)[:, 0]
@@ -77,18 +77,6 @@ def divide(vertices: Tensor, faces: Tensor, longest: float) -> tuple[Tensor, Ten
         m = middle[chosen[rows]]
         triangles = np.delete(triangles, rows, 0)
         triangles = np.concatenate([triangles, np.stack([a, m, c], 1), np.stack([m, b, c], 1)])
-
-
-def sharpen(surface: Surface, angle_deg: float = 40.0) -> Surface:
-    """The surface with vertices doubled along edges of larger angles, so that normals there are not averaged."""
-    mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
-    smooth = mesh.face_adjacency[mesh.face_adjacency_angles < math.radians(angle_deg)]
-    patch = trimesh.graph.connected_component_labels(smooth, len(mesh.faces))
-    corners = np.stack([mesh.faces.ravel(), np.repeat(patch, 3)], 1)
-    kept, faces = np.unique(corners, axis=0, return_inverse=True)
-    rows = torch.from_numpy(kept[:, 0].astype(np.int64))
-    faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64))
-    return Surface(surface.vertices[rows], faces, surface.colors[rows])
 
 
 def joined(faces: np.ndarray, count: int) -> coo_array:

@@ -19,7 +19,6 @@ from learn3d.pictures import Surface
 from learn3d.studio.demo.picture import example
 from learn3d.studio.picture_to_mesh.reconstruction import (
     _read,
-    export_mesh,
     input_azimuth_deg,
     load_model,
     prepare_image,
@@ -28,12 +27,13 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     reconstruct_files,
     reconstruct_picture,
 )
+from learn3d.studio.picture_to_mesh.write import export_mesh
 
 
 @pytest.fixture
 def short_turntables(monkeypatch) -> None:
     monkeypatch.setattr(
-        "learn3d.studio.picture_to_mesh.reconstruction.turntable",
+        "learn3d.studio.picture_to_mesh.write.turntable",
         lambda _: np.zeros((2, 32, 32, 3), np.uint8),
     )
 

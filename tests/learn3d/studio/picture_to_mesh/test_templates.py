@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
 
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 import trimesh
 
 import nmr
-from learn3d.data.conventions import mesh_to_object
 from learn3d.data.layouts import load_dataset
 from learn3d.pictures import Surface, photograph
 from learn3d.studio.make_data.render import DatasetConfig, make_shards
-from learn3d.studio.picture_to_mesh.coloring import paint
 from learn3d.studio.picture_to_mesh.fit import frame_view
 from learn3d.studio.picture_to_mesh.reconstruction import (
     Model,
     load_model,
-    mesh_bytes,
     reconstruct_guesses,
     reconstruct_picture,
 )
-from learn3d.studio.picture_to_mesh.smoothing import divide, sharpen, smooth
+from learn3d.studio.picture_to_mesh.smoothing import divide, smooth
 from learn3d.studio.picture_to_mesh.templates import compare_lines, learn_templates, template
+from learn3d.studio.picture_to_mesh.write import mesh_bytes
 
 
 @pytest.fixture(scope="module")
@@ -122,68 +120,33 @@ def test_generated_shapes_of_a_training_set_become_templates(model: Model, tmp_p
     assert learn_templates(model.method, others) is None
 
 
-def test_long_edges_are_divided_and_sharp_ones_stay_sharp() -> None:
+def test_long_edges_are_divided_with_the_values_at_their_ends() -> None:
     box = trimesh.creation.box((1.0, 0.6, 0.02))
-    vertices, faces = divide(torch.tensor(box.vertices).float(), torch.tensor(box.faces), 0.1)
+    places = torch.tensor(box.vertices).float()
+    values, faces = divide(torch.cat([places, 5 - places], 1), torch.tensor(box.faces), 0.1)
+    vertices, further = values.split(3, 1)
     mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False)
     assert mesh.is_watertight and mesh.volume == pytest.approx(box.volume, rel=1e-4)
     assert mesh.edges_unique_length.max() <= 0.1
-    sharp = sharpen(Surface(vertices, faces, vertices.abs()))
-    normals = nmr.vertex_normals(sharp.vertices, sharp.faces)
-    assert torch.allclose(normals.abs().amax(1), torch.ones(len(normals)), atol=1e-4), (
-        "along the axes"
-    )
-    assert torch.equal(sharp.colors, sharp.vertices.abs()) and torch.equal(
-        sharp.vertices[sharp.faces], vertices[faces]
-    )
+    assert torch.allclose(further, 5 - vertices, atol=1e-5)
 
 
-def painted() -> Surface:
-    """A sphere and a thin box with a texture: the colour 0.5 + p at the point p. The vertices are black."""
-    mesh = trimesh.util.concatenate(
-        [trimesh.creation.box((0.9, 0.02, 0.1)), trimesh.creation.icosphere(2, 0.4)]
-    )
-    vertices, faces = divide(torch.tensor(mesh.vertices).float(), torch.tensor(mesh.faces), 0.1)
-    return paint(
-        Surface(vertices, faces, 0 * vertices),
-        lambda points, _: (0.5 + points, torch.full((len(points),), 1e3)),
-    )
-
-
-def test_every_place_of_a_texture_has_the_colour_of_its_point() -> None:
-    surface = painted()
-    image, uv = surface.texture
-    shares = torch.from_numpy(
-        np.random.default_rng(0).dirichlet([0.3, 0.3, 0.3], (len(uv), 9))
-    ).float()
-    grid = (shares @ uv * 2 - 1) * torch.tensor([1.0, -1.0])
-    found = F.grid_sample(image.movedim(2, 0)[None], grid[None], align_corners=False)[0].movedim(
-        0, 2
-    )
-    wanted = 0.5 + shares @ surface.vertices[surface.faces]
-    assert (found - wanted).abs().max() < 1e-4
-    plain = surface._replace(colors=torch.full_like(surface.vertices, 0.3))
-    image = paint(plain, lambda points, _: (points, torch.zeros(len(points)))).texture.image
-    assert torch.minimum((image - 0.3).abs(), 1 - image).max() < 1e-5, (
-        "the vertices', and unused texels"
-    )
-
-
-def test_a_glb_shows_the_texture() -> None:
-    surface = painted()
-    mesh = trimesh.load(
-        io.BytesIO(mesh_bytes(surface, "glb", "box")), file_type="glb", force="mesh", process=False
-    )
-    texture = np.asarray(mesh.visual.material.baseColorTexture)
-    u, v = mesh.visual.uv[mesh.faces].mean(1).T
-    found = (
-        texture[((1 - v) * len(texture)).astype(int), (u * texture.shape[1]).astype(int), :3] / 255
-    )
-    assert np.abs(found - 0.5 - mesh.triangles_center @ mesh_to_object().T).max() < 0.02
-    assert mesh.volume > 0 and mesh.visual.material.doubleSided
-    assert (mesh.vertex_normals[mesh.faces] * mesh.face_normals[:, None]).sum(2).min() > 0.5, (
-        "the surface's, outwards"
-    )
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_a_painted_mesh_is_welded_smooth_and_names_its_program(model: Model, kind: str) -> None:
+    made = reconstruct_picture(model, *picture("table", int(model.templates.numbers[5, 8])))
+    content = mesh_bytes(made.surface, kind, "desk")
+    assert b"learn3d" in content[:2000] and b"trimesh" not in content
+    mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh", process=False)
+    # a closed mesh with V - 2 = F / 2 for each of its parts: no vertex is there twice
+    assert mesh.is_watertight and mesh.euler_number == 2 * mesh.body_count
+    assert mesh.edges_unique_length.max() < 0.026
+    normals = mesh.vertex_normals[mesh.faces]
+    assert np.allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-3)
+    assert np.mean((normals * mesh.face_normals[:, None]).sum(2) > 0) > 0.99, "outwards"
+    if kind == "glb":
+        tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+        assert tree["meshes"][0]["name"] == "desk"
+        assert {view["target"] for view in tree["bufferViews"]} == {34962, 34963}
 
 
 def test_edges_are_rounded_and_flat_parts_stay() -> None:
