@@ -1,5 +1,6 @@
 """Voxel and silhouette IoU, surface distances and MMD of a trained method on a split."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ from torch import Tensor
 import nmr
 from learn3d.data.conventions import view_poses
 from learn3d.data.dataset import MASK_SIZE, Batch, ViewDataset
+from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.losses import mmd
 from learn3d.methods.method import Grids, Meshes, Method
 from learn3d.pictures import TILE, Surface, draw_surface, grid_surface, natural_colors, orbit, tile
@@ -25,6 +27,9 @@ Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
 F_SCORE_DISTANCE = 0.05  # units of the object frame: objects are 1 long (Pascal3D+: up to 2)
+#: Angles between the azimuths of two images at which silhouettes are compared.
+ANGLE_STEP_DEG = 15
+ANGLES_DEG = range(0, 181, ANGLE_STEP_DEG)
 
 #: Metrics of each image; learn3d.runs.measurement.MEASURES defines them. IoUs are NaN if both shapes are empty,
 #: chamfer_l1 if one is. f_score is 0 if only the prediction is empty. precision, recall and voxel_iou are kato18's.
@@ -32,6 +37,7 @@ F_SCORE_DISTANCE = 0.05  # units of the object frame: objects are 1 long (Pascal
 MEASURED = (
     "voxel_iou",
     "voxel_iou_kato19",
+    "voxel_iou_unclamped",
     "precision",
     "recall",
     "hollow",
@@ -50,8 +56,10 @@ class Evaluation:
     view_ids: Tensor  # int64 [M]
     # float64 [M] by the names of `MEASURED`; NaN if undefined or not asked for
     values: dict[str, Tensor]
-    # means without NaN, and "mmd", "mmd_paper"; undefined ones are left out
+    # means without NaN, and "mmd", "mmd_paper", "mmd_floor"; undefined ones are left out
     means: dict[str, float]
+    # mean IoU of silhouettes by the angle of `ANGLES_DEG` from the input's view; {} if not asked for
+    angle_ious: dict[int, float] = dataclasses.field(default_factory=dict)
 
     @property
     def voxel_iou(self) -> float | None:
@@ -84,9 +92,10 @@ def evaluate(
     training is measured with its EMA weights.
 
     max_images: use only that many images, always the same ones (see `spread_samples`).
-    detailed: add the voxel IoU with kato19, the MMD as the paper prints it, and Chamfer-L1 and
-    F-score between 2,000 points on each surface. If the data set has no points, the truth is the
-    surface of its voxels, which limits distances to about 1/32.
+    detailed: add the voxel IoU with kato19, that without the clamp, the MMD as the paper prints it
+    and its floor (`shuffle_views`), the IoU of silhouettes by angle (`images_by_angle`), and
+    Chamfer-L1 and F-score between 2,000 points on each surface. If the data set has no points, the
+    truth is the surface of its voxels, which limits distances to about 1/32.
     align: turns or moves the predicted shapes of a batch before they are compared.
     """
     samples = spread_samples(
@@ -96,24 +105,40 @@ def evaluate(
     novel_views = bool((others != torch.arange(len(others))).any())
     generator = torch.Generator().manual_seed(0)
     surfaces = _true_surfaces(dataset, generator) if detailed else []
+    at_angles = None
+    if detailed and novel_views and isinstance(dataset.poses, LookAtPoses):
+        at_angles = images_by_angle(dataset.object_ids, dataset.poses.azimuth_deg)
     codes = []
     values = []
+    turned = []  # IoUs of silhouettes [B, angles] of each batch
     with method.in_use():
         for chosen in samples.split(batch_size):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
+            unclamped = shapes.without_clamp() if isinstance(shapes, Meshes) else None
             if align is not None:
                 shapes = align(shapes, batch, dataset)
+                unclamped = unclamped and align(unclamped, batch, dataset)
             measured = (
                 {} if dataset.voxels is None else _compare_voxels(shapes, batch, dataset, detailed)
             )
+            if detailed and measured:
+                measured["voxel_iou_unclamped"] = measured["voxel_iou"]
+                if unclamped is not None:
+                    grid = dataset.convention.voxelize(unclamped.vertices, unclamped.faces)
+                    measured["voxel_iou_unclamped"] = nmr.metrics.voxel_iou(grid, batch.voxels)
             if (
                 (novel_views or not measured)
                 and dataset.poses is not None
                 and isinstance(shapes, Meshes)
             ):
-                measured |= _compare_silhouettes(shapes, dataset.batch(others[chosen]))
+                measured["silhouette_iou"] = _compare_silhouettes(shapes, dataset, others[chosen])
+            if at_angles is not None and isinstance(shapes, Meshes):
+                samples_at = at_angles[:, chosen]
+                turned.append(
+                    torch.stack([_compare_silhouettes(shapes, dataset, s) for s in samples_at])
+                )
             if surfaces:
                 measured |= _compare_surfaces(
                     shapes, [surfaces[k] for k in batch.object_ids.tolist()], generator
@@ -128,10 +153,19 @@ def evaluate(
     )
     figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
     means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
-    mmds = mean_mmd(
-        torch.cat(codes).double(), view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",)
-    )
-    return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds)
+    all_codes = torch.cat(codes).double()
+    mmds = mean_mmd(all_codes, view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))
+    if detailed and mmds:
+        mmds["mmd_floor"] = mean_mmd(all_codes, shuffle_views(object_ids, view_ids))["mmd"]
+    angle_ious = {}
+    if turned:
+        by_angle = torch.cat(turned, dim=1).double().nanmean(1).tolist()
+        angle_ious = {
+            angle: iou
+            for angle, iou in zip(ANGLES_DEG, by_angle, strict=True)
+            if not math.isnan(iou)
+        }
+    return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds, angle_ious)
 
 
 def _compare_voxels(
@@ -158,17 +192,26 @@ def _compare_voxels(
     return found | {"precision": precision, "recall": recall, "hollow": hollow}
 
 
-def _compare_silhouettes(shapes: Meshes, batch: Batch) -> dict[str, Tensor]:
-    """IoU of masks and silhouettes: sum of minima over sum of maxima (NaN: both empty)."""
-    size = batch.masks.shape[-1]
-    silhouettes = nmr.render_silhouette(
-        shapes.vertices, shapes.faces, batch.cameras, image_size=size
-    ).flatten(1)
-    masks = batch.masks.flatten(1)
-    return {
-        "silhouette_iou": torch.minimum(silhouettes, masks).sum(1)
-        / torch.maximum(silhouettes, masks).sum(1)
-    }
+def _compare_silhouettes(shapes: Meshes, dataset: ViewDataset, samples: Tensor) -> Tensor:
+    """IoU of the silhouette of each shape at the camera of a sample with the sample's mask:
+    float32 [B], sum of minima over sum of maxima.
+
+    NaN if both are empty, or if the sample is -1.
+    """
+    ious = torch.full((len(samples),), math.nan)
+    known = samples >= 0
+    if known.any():
+        samples = samples[known]
+        masks = torch.from_numpy(dataset.read_masks(samples.numpy())) / 255
+        silhouettes = nmr.render_silhouette(
+            shapes.vertices[known],
+            shapes.faces,
+            dataset.poses[samples].cameras(),
+            image_size=MASK_SIZE,
+        )
+        both = torch.minimum(silhouettes, masks).sum((1, 2))
+        ious[known] = both / torch.maximum(silhouettes, masks).sum((1, 2))
+    return ious
 
 
 def _compare_surfaces(
@@ -213,17 +256,54 @@ def _sample(surface: Surface, generator: torch.Generator) -> Tensor:
     ).points
 
 
+def _images_of_objects(object_ids: np.ndarray) -> list[np.ndarray]:
+    """The samples of each object, int64 [V], in their order."""
+    order = np.argsort(object_ids, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(object_ids[order])) + 1)
+
+
 def _other_images(object_ids: np.ndarray) -> Tensor:
     """For each sample another of its object, int64 [M]: a quarter of its images further on.
 
     If views go around the object, that is a quarter turn. Half a turn would show the same
     outline, mirrored.
     """
-    order = np.argsort(object_ids, kind="stable")
-    others = np.empty_like(order)
-    for group in np.split(order, np.flatnonzero(np.diff(object_ids[order])) + 1):
+    others = np.empty(len(object_ids), np.int64)
+    for group in _images_of_objects(object_ids):
         others[group] = np.roll(group, -max(1, len(group) // 4))
     return torch.from_numpy(others)
+
+
+def images_by_angle(object_ids: np.ndarray, azimuth_deg: Tensor) -> Tensor:
+    """For each angle of `ANGLES_DEG` and each sample, an image of the same object whose azimuth
+    differs by that angle, to the nearest of them: int64 [angles, M], -1 if there is none.
+
+    Of several images the next one after the sample is taken, so 0 is the sample itself.
+    """
+    found = torch.full((len(ANGLES_DEG), len(object_ids)), -1)
+    for group in map(torch.from_numpy, _images_of_objects(object_ids)):
+        count = len(group)
+        azimuths = azimuth_deg[group]
+        steps = (wrap_deg(azimuths[None] - azimuths[:, None]).abs() / ANGLE_STEP_DEG).round()
+        places = torch.arange(count)
+        after = (places[None] - places[:, None]) % count
+        for step in range(len(ANGLES_DEG)):
+            nearest = torch.where(steps == step, after, count).min(dim=1)
+            found[step, group] = torch.where(nearest.values < count, group[nearest.indices], -1)
+    return found
+
+
+def shuffle_views(object_ids: Tensor, view_ids: Tensor) -> Tensor:
+    """The view classes of samples, permuted at random within each object; always the same way.
+
+    The MMD between such classes is the value that codes without pose would have with as many
+    images: a floor that comes from the number of objects alone.
+    """
+    rng = np.random.default_rng(0)
+    shuffled = view_ids.clone()
+    for group in _images_of_objects(object_ids.numpy()):
+        shuffled[group] = view_ids[rng.permutation(group)]
+    return shuffled
 
 
 def spread_samples(object_ids: np.ndarray, view_ids: np.ndarray, count: int) -> Tensor:

@@ -14,6 +14,7 @@ from learn3d.config import TrainConfig
 from learn3d.distributed import join_ranks, rank
 from learn3d.files.writing import check_target, write_json
 from learn3d.presets import DEFAULT_PRESET, PLACES, PRESETS, SHORT_NAMES, full_name, load_config
+from learn3d.runs.baselines import baselines_of_runs
 from learn3d.runs.measurement import MEASURES, class_means, evaluate_runs, format_table
 from learn3d.terminal import INTERRUPTED, align, say
 from learn3d.training import train
@@ -100,6 +101,9 @@ class Evaluate(OnDataset):
     """Arrangement of the files of the data set. If not given: from the run."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
+    baselines: bool = False
+    """Also measure the mean shape and the nearest of the training objects, as the answer to every
+    image."""
     json: Path | None = None
     """JSON file for the results, with protocol and versions."""
 
@@ -113,10 +117,12 @@ class Evaluate(OnDataset):
         if self.json is not None:
             check_target(self.json, "--json")
         results = evaluate_runs(self.runs, **self.pick("layout", "device"))
-        say(format_table(results))
+        baselines = baselines_of_runs(self.runs, **self.pick("layout")) if self.baselines else []
+        say(format_table(results, baselines))
         if self.json is not None:
             protocol = {"split": self.split, "checkpoint": self.which}
             values = [result.model_dump() for result in results]
-            write_json(
-                self.json, {"protocol": protocol, "results": values, "means": class_means(results)}
-            )
+            content = {"protocol": protocol, "results": values, "means": class_means(results)}
+            if self.baselines:
+                content["baselines"] = [baseline.model_dump() for baseline in baselines]
+            write_json(self.json, content)

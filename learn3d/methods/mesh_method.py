@@ -150,7 +150,7 @@ class MeshMethod(Method):
             vertices = self.generator(codes).cpu()
         if self.settings.clamp_to_cube and self.info.cube_side is not None:
             limit = CLAMP_LIMIT * self.info.cube_side
-            vertices = vertices.clamp(-limit, limit)
+            return Meshes(vertices.clamp(-limit, limit), self.faces, unclamped=vertices)
         return Meshes(vertices, self.faces)
 
     def predict(self, images: Tensor) -> tuple[Tensor, Tensor]:

@@ -66,6 +66,11 @@ class Meshes:
 
     vertices: Tensor  # float32 [B, V, 3], object frame
     faces: Tensor  # int64 [F, 3]
+    unclamped: Tensor | None = None  # the vertices before a clamp to the cube; None without one
+
+    def without_clamp(self) -> Meshes | None:
+        """The same surfaces before the clamp; None if there was none."""
+        return None if self.unclamped is None else Meshes(self.unclamped, self.faces)
 
     def surfaces(self) -> list[Surface]:
         """The shapes one by one."""

@@ -36,6 +36,10 @@ MEASURES = {
         "IoU (kato19)",
         "voxelizer of Kato and Harada 2019; not comparable with the voxel IoU",
     ),
+    "voxel_iou_unclamped": (
+        "unclamped IoU",
+        "voxel IoU (kato18) without the clamp to the cube, as the published code measures it",
+    ),
     "precision": (
         "precision",
         "part of the predicted voxels that is true: low if shapes are too full",
@@ -58,6 +62,10 @@ MEASURES = {
     "mmd_paper": (
         "printed MMD",
         "the same by the formula that the paper prints: one kernel, square root",
+    ),
+    "mmd_floor": (
+        "shuffled MMD",
+        "MMD after the views of each object were shuffled: its value for codes without pose, from as many images",
     ),
 }
 HEADERS = [header for header, _ in MEASURES.values()]
@@ -84,6 +92,13 @@ class CurvePoint(NamedTuple):
     mmd: Number
 
 
+class AngleMean(NamedTuple):
+    """Mean IoU of the silhouettes of predicted shapes at an angle from the input's view."""
+
+    degrees: Amount  # difference of the azimuths
+    silhouette_iou: Number
+
+
 class Result(BaseModel, strict=True):
     """Measures of one checkpoint on one category and split; None if a measure has no value."""
 
@@ -102,6 +117,7 @@ class Result(BaseModel, strict=True):
     hollow: Number  # share of meshes that reach beyond the voxel grid
     voxel_iou: Number
     voxel_iou_kato19: Number
+    voxel_iou_unclamped: Number = None
     precision: Number
     recall: Number
     chamfer_l1: Number
@@ -109,10 +125,14 @@ class Result(BaseModel, strict=True):
     silhouette_iou: Number
     mmd: Number
     mmd_paper: Number
+    mmd_floor: Number = None
     objects: list[ObjectMeans]  # [] for data without voxels
-    curve: list[
-        CurvePoint
-    ] = []  # the validations of the training, from an experiment; [] from `evaluate_runs`
+    # by the angle from the input's view; [] if azimuths are unknown or no object has two images
+    angles: list[AngleMean] = []
+    # Fields that an experiment adds:
+    curve: list[CurvePoint] = []  # the validations of the training
+    # the other checkpoint, last or best on the validation images; None if it is the same step
+    other: "Result | None" = None
 
     @property
     def commit(self) -> str:
@@ -121,6 +141,20 @@ class Result(BaseModel, strict=True):
         """
         commit = self.versions.get("commit") or "-"
         return commit[:9] + "-dirty" * commit.endswith("-dirty")
+
+
+class Baseline(BaseModel, strict=True):
+    """Voxel IoU of one answer to all images of a split.
+
+    Truth and answer are voxels of the data set, so the IoU does not depend on a voxelizer.
+    """
+
+    name: str  # one of `baselines.BASELINES`
+    category: str
+    data: str
+    voxel_iou: Number
+    voxel_iou_kato19: Number  # the same number
+    objects: list[ObjectMeans]
 
 
 def evaluate_runs(
@@ -175,6 +209,7 @@ def evaluate_runs(
                     versions=metadata.versions,
                     images=len(evaluation.view_ids),
                     objects=[] if dataset.voxels is None else _means_by_object(evaluation, dataset),
+                    angles=[AngleMean(*pair) for pair in evaluation.angle_ious.items()],
                     **means,
                 )
             )
@@ -200,8 +235,8 @@ def _means_by_object(evaluation: Evaluation, dataset: ViewDataset) -> list[Objec
     return objects
 
 
-def format_table(results: Sequence[Result]) -> str:
-    """The results as a text table, then the mean over categories of each method."""
+def format_table(results: Sequence[Result], baselines: Sequence[Baseline] = ()) -> str:
+    """The results as a text table, then the mean over categories of each method, then baselines."""
     rows = [("class", "method", "seed", "iterations", "images", *HEADERS)]
     for r in results:
         about = (r.category, f"{r.method} ({r.preset})", str(r.seed), str(r.step), str(r.images))
@@ -211,6 +246,10 @@ def format_table(results: Sequence[Result]) -> str:
         rows.append(
             ("mean", f"{m['method']} ({m['preset']})", "", "", classes, *format_measures(m))
         )
+    for b in baselines:
+        images = str(sum(o.images for o in b.objects))
+        values = dict.fromkeys(MEASURES) | {"voxel_iou": b.voxel_iou}
+        rows.append((b.category, b.name, "", "", images, *format_measures(values)))
     return align(rows)
 
 

@@ -17,7 +17,15 @@ import nmr
 from learn3d import evaluation
 from learn3d.data.conventions import KAR, KATO, PASCAL3D
 from learn3d.data.dataset import Batch, ViewDataset
-from learn3d.evaluation import NO_MMD, evaluate, mean_mmd, spread_samples
+from learn3d.evaluation import (
+    ANGLES_DEG,
+    NO_MMD,
+    evaluate,
+    images_by_angle,
+    mean_mmd,
+    shuffle_views,
+    spread_samples,
+)
 from learn3d.methods.method import Grids, Meshes
 from learn3d.runs.measurement import class_means, evaluate_runs, format_table
 from nmr.metrics import voxel_iou
@@ -118,7 +126,7 @@ def test_without_voxels_silhouettes_at_other_cameras_are_compared(tiny_set) -> N
     images[:, 3] = (255 * masks).round()
     photographs = dataclasses.replace(tiny_set, images=images, voxels=None)
     result = evaluate(Constant(shape), photographs, detailed=True)
-    assert result.means.keys() == {"silhouette_iou", "mmd", "mmd_paper"}
+    assert result.means.keys() == {"silhouette_iou", "mmd", "mmd_paper", "mmd_floor"}
     assert result.selection_metric == "silhouette_iou"
     assert result.means["silhouette_iou"] == pytest.approx(1, abs=0.01)
     flat = Constant(egg(flat=0.1))  # the same from views 0 and 12
@@ -129,6 +137,128 @@ def test_without_voxels_silhouettes_at_other_cameras_are_compared(tiny_set) -> N
     assert evaluate(flat, single).means["silhouette_iou"] > 0.9, "or by itself if there is no other"
     nothing = evaluate(Constant(Grids(torch.zeros(1, 64, 64, 64))), photographs)
     assert (nothing.selection_metric, nothing.voxel_iou) == ("voxel_iou", None)
+
+
+def test_images_by_angle_follow_the_definition() -> None:
+    rng = np.random.default_rng(0)
+    object_ids = rng.integers(0, 6, 70)
+    azimuths = torch.from_numpy(rng.uniform(-400, 400, 70)).float()
+    found = images_by_angle(object_ids, azimuths)
+    assert found.shape == (13, 70) and (found < 0).any()
+    for row, angle in enumerate(ANGLES_DEG):
+        for sample in range(70):
+            own = np.flatnonzero(object_ids == object_ids[sample]).tolist()
+            place = own.index(sample)
+            for other in own[place:] + own[:place]:
+                apart = abs(float(azimuths[other] - azimuths[sample])) % 360
+                if abs(min(apart, 360 - apart) - angle) < 7.5:
+                    break
+            else:
+                other = -1
+            assert found[row, sample] == other
+    assert found[0].tolist() == list(range(70)), "at 0 degrees the image itself"
+
+
+def test_silhouettes_by_angle_are_those_of_a_loop_over_images(tiny_set) -> None:
+    """Each image has an egg of its own size; the truth is one egg, flat along the optical axis of view 0."""
+
+    class Sizes(Constant):
+        def decode(self, codes: torch.Tensor) -> Meshes:
+            scale = 0.6 + 3 * codes[:, 0] / 255
+            return Meshes(self.shape.vertices * scale[:, None, None], self.shape.faces)
+
+    flat = egg(flat=0.3)
+    images = tiny_set.images.copy()
+    masks = nmr.render_silhouette(
+        flat.vertices, flat.faces, tiny_set.poses.cameras(), image_size=64
+    )
+    images[:, 3] = (255 * masks).round()
+    dataset = dataclasses.replace(tiny_set, images=images)
+    method = Sizes(flat)
+    found = evaluate(method, dataset, detailed=True, batch_size=7).angle_ious
+    shapes = method.decode(method.encode(torch.from_numpy(images)))
+    wanted = {angle: [] for angle in ANGLES_DEG}
+    for sample in range(len(dataset)):
+        for angle in ANGLES_DEG:
+            other = sample // 24 * 24 + (sample + angle // 15) % 24
+            camera = dataset.poses[torch.tensor([other])].cameras()
+            drawn = nmr.render_silhouette(
+                shapes.vertices[sample][None], shapes.faces, camera, image_size=64
+            )[0]
+            mask = torch.from_numpy(images[other, 3]) / 255
+            wanted[angle].append(
+                float(torch.minimum(drawn, mask).sum() / torch.maximum(drawn, mask).sum())
+            )
+    assert found == pytest.approx(
+        {angle: np.mean(ious) for angle, ious in wanted.items()}, abs=1e-6
+    )
+    alone = dataset.select(np.flatnonzero(dataset.view_ids == 0))
+    assert evaluate(method, alone, detailed=True).angle_ious == {}, "no object has a second image"
+
+
+def test_a_shape_that_fits_its_own_view_alone_falls_with_the_angle(tiny_set) -> None:
+    """Every image gets a sphere of the width of its own outline, as entangled codes would have it."""
+    flat, (sphere, faces) = egg(flat=0.2), nmr.icosphere(3)
+    images = tiny_set.images.copy()
+    masks = nmr.render_silhouette(
+        flat.vertices, flat.faces, tiny_set.poses.cameras(), image_size=64
+    )
+    images[:, 3] = (255 * masks).round()
+    dataset = dataclasses.replace(tiny_set, images=images)
+
+    class Outline(Constant):
+        def encode(self, stored: torch.Tensor) -> torch.Tensor:
+            return (stored[:, 3] > 127).any(1).sum(1, keepdim=True) / 64.0
+
+        def decode(self, codes: torch.Tensor) -> Meshes:
+            size = codes[:, :, None] * 0.7
+            return Meshes(sphere * size * torch.tensor([1.0, 0.4, 1.0]), faces)
+
+    entangled = evaluate(Outline(flat), dataset, detailed=True).angle_ious
+    right = evaluate(Constant(flat), dataset, detailed=True).angle_ious
+    assert entangled[0] > entangled[90] + 0.1, "a quarter turn away the outline is another"
+    assert min(right.values()) > 0.99
+
+
+def test_the_clamp_counts_in_one_of_two_ious(tiny_set) -> None:
+    beyond = egg(shift=(0.1, 0.0, 0.0))
+    clamped = Meshes(beyond.vertices.clamp(-0.499, 0.499), beyond.faces, beyond.vertices)
+
+    class Clamped(Constant):
+        def decode(self, codes: torch.Tensor) -> Meshes:
+            many = (len(codes), -1, -1)
+            return Meshes(clamped.vertices.expand(many), beyond.faces, beyond.vertices.expand(many))
+
+    dataset = with_truth(tiny_set, egg())
+    both = evaluate(Clamped(clamped), dataset, detailed=True).means
+    without = evaluate(Constant(beyond), dataset, detailed=True).means
+    assert both["voxel_iou_unclamped"] == without["voxel_iou"] == without["voxel_iou_unclamped"]
+    assert both["voxel_iou"] > both["voxel_iou_unclamped"] + 0.1, "an open shape has no inside"
+
+    def align(shapes: Meshes, *_: object) -> Meshes:
+        return dataclasses.replace(shapes, vertices=shapes.vertices - torch.tensor([0.1, 0, 0]))
+
+    aligned = evaluate(Clamped(clamped), dataset, detailed=True, align=align).means
+    assert aligned["voxel_iou_unclamped"] == 1, "both shapes are aligned"
+
+
+def test_views_are_shuffled_within_objects() -> None:
+    generator = torch.Generator().manual_seed(1)
+    object_ids, view_ids = torch.arange(240) // 12, torch.arange(240) % 12
+    order = torch.randperm(240, generator=generator)
+    object_ids, view_ids = object_ids[order], view_ids[order]
+    shuffled = shuffle_views(object_ids, view_ids)
+    assert not torch.equal(shuffled, view_ids)
+    assert torch.equal(shuffled, shuffle_views(object_ids, view_ids)), "the same in every run"
+    for number in range(20):
+        own = object_ids == number
+        assert shuffled[own].sort().values.tolist() == list(range(12))
+    shapes = torch.randn(20, 8, generator=generator)[object_ids]
+    noise = 0.3 * torch.randn(240, 8, generator=generator)
+    posed = shapes + torch.randn(12, 8, generator=generator)[view_ids]
+    floor, high = (mean_mmd(codes + noise, shuffled)["mmd"] for codes in (shapes, posed))
+    assert mean_mmd(shapes + noise, view_ids)["mmd"] == pytest.approx(floor, rel=0.1)
+    assert mean_mmd(posed + noise, view_ids)["mmd"] > 2 * high
 
 
 def test_novel_views_select_networks_even_if_voxels_are_known(tiny_set) -> None:

@@ -13,22 +13,41 @@ from scipy import stats
 
 from learn3d.config import TrainConfig
 from learn3d.data.conventions import SYNSETS
+from learn3d.evaluation import ANGLES_DEG
 from learn3d.files import limits
 from learn3d.files.reading import read_json
 from learn3d.presets import command_line
-from learn3d.runs.measurement import HEADERS, Result, format_measures
+from learn3d.runs.baselines import BASELINES
+from learn3d.runs.measurement import (
+    HEADERS,
+    MEASURES,
+    Baseline,
+    ObjectMeans,
+    Result,
+    format_measures,
+)
 from learn3d.studio.tables.plan import Request, name_run, select_rows, variant_of
 from learn3d.studio.tables.tables import MEAN, TABLES, Row, Table
 
 RESAMPLES = 2000
 Cells = list[list[str]]
-Side = list[dict[int, Result]]  # results of one method for each category of a column, by seed
+# results of one method for each category of a column, by seed; a baseline's seed is None
+Side = list[dict[int | None, Result | Baseline]]
 MeasuredRuns = Sequence[tuple[TrainConfig, Result]]
+
+# measures that results of earlier versions lack
+_LATER_MEASURES = {"voxel_iou_unclamped", "mmd_floor"}
+# measures of the accuracy of a shape, and whether more is better
+_ACCURACY = {"voxel_iou": True, "chamfer_l1": False, "f_score": True}
 
 NOTES = (
     "Measured on the test split. Brackets: 95 % intervals over test objects (bootstrap; objects, not images, are drawn "
     "again). ±: 95 % intervals over seeds (Student's t).\n\nThe paper's figures are for reference: they are on its own "
     "data, with its own length of training. In parentheses: its mean over other categories than those here."
+)
+ABOUT_BASELINES = (
+    "Mean shape: the cells that most training objects share, as the answer to every image. Nearest training "
+    "object: the one with the highest IoU, which only an oracle finds. Random training object: the mean over all."
 )
 _POSE_ERRORS = {  # fields of the JSON file beside a table of poses, and the columns
     "accuracy": "Acc@30",
@@ -67,31 +86,46 @@ def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
 
 
 def make_report(
-    request: Request, runs: Sequence[TrainConfig], results: Mapping[Path, Result]
+    request: Request,
+    runs: Sequence[TrainConfig],
+    results: Mapping[Path, Result],
+    baselines: Sequence[Baseline] = (),
 ) -> tuple[dict[str, Cells], str]:
-    """The tables "main", "differences", "runs", "curves", perhaps "poses"; and their Markdown.
+    """The tables "main", "differences", "runs", "angles", "curves", perhaps "poses"; and their
+    Markdown.
 
-    "curves" has the validations of each run. The Markdown leaves them out.
-    results: by folder. Commands have DATA and OUTPUT in place of folders, so that the report has
-    no path of a machine.
+    "runs" has both checkpoints of a run, if they differ. "curves" has the validations of each run.
+    The Markdown leaves them out. results: by folder. baselines: those of all categories. Commands
+    have DATA and OUTPUT in place of folders, so that the report has no path of a machine.
     """
     table = TABLES[request.table]
     done = [(run, results[run.output]) for run in runs if run.output in results]
-    main, differences = _compare_methods(table, select_rows(request), runs, done)
+    rows = select_rows(request)
+    main, differences = _compare_methods(table, rows, runs, done, baselines)
     trained = _run_rows(done)
+    angles = _angle_rows(done)
     tables = {
         "main": main,
         "differences": differences,
         "runs": trained,
+        "angles": angles,
         "curves": _curve_rows(done),
     }
     parts = [f"## {table.title}", _markdown(main), NOTES]
+    if baselines:
+        parts.append(ABOUT_BASELINES)
     if missing := [name_run(run) for run in runs if run.output not in results]:
         parts.append(f"Missing: {', '.join(missing)}.")
     parts += [
         f"Differences to {table.baseline}, paired by seed and by object:",
         _markdown(differences),
+        *_disagreements(table, rows, runs, done),
     ]
+    if len(angles) > 1:
+        parts += [
+            "IoU of silhouettes by the angle between the azimuths of the input and of the camera, in degrees:",
+            _markdown(angles),
+        ]
     if len(poses := _pose_rows(runs, results)) > 1:
         tables["poses"] = poses
         parts += [
@@ -103,23 +137,35 @@ def make_report(
     return tables, "\n\n".join(parts) + "\n"
 
 
-def _compare_methods(
-    table: Table, rows: Mapping[str, Row], runs: Sequence[TrainConfig], done: MeasuredRuns
-) -> tuple[Cells, Cells]:
-    """Printed and measured values of each row by category, and differences to the baseline."""
+def _by_method(done: MeasuredRuns) -> dict[tuple[str, str], dict[int, Result]]:
+    """Results by variant and category, then by seed."""
     measured: dict[tuple[str, str], dict[int, Result]] = {}
     for run, result in done:
         measured.setdefault((variant_of(run), run.category), {})[run.seed] = result
+    return measured
+
+
+def _compare_methods(
+    table: Table,
+    rows: Mapping[str, Row],
+    runs: Sequence[TrainConfig],
+    done: MeasuredRuns,
+    baselines: Sequence[Baseline],
+) -> tuple[Cells, Cells]:
+    """Printed and measured values of each row by category, and differences to the baseline."""
+    measured = _by_method(done)
+    without_network = {(b.name, b.category): {None: b} for b in baselines}
     categories = list(dict.fromkeys(run.category for run in runs))
     columns = {name: [name] for name in categories} | {MEAN: categories}
 
-    def results_of(variant: str) -> list[Side]:
+    def results_of(name: str, found: Mapping[tuple[str, str], dict] = measured) -> list[Side]:
         """The results of a variant for each column."""
-        return [[measured.get((variant, name), {}) for name in names] for names in columns.values()]
+        return [[found.get((name, category), {}) for category in c] for c in columns.values()]
 
     measures = {"voxel_iou": "kato18", "voxel_iou_kato19": "kato19"}
+    measures["voxel_iou_unclamped"] = "kato18, without clamp"
     if table.measure == "mmd":
-        measures = {"mmd": "mmd"}
+        measures = {"mmd": "mmd", "mmd_floor": "mmd, views shuffled"}
     baseline = table.rows[table.baseline].variant
     main = [["method", "", *columns]]
     differences = [["method", *columns]]
@@ -131,27 +177,72 @@ def _compare_methods(
             continue
         ours = results_of(row.variant)
         for measure, name in measures.items():
-            main.append([label, f"here ({name})", *(_compare(measure, side) for side in ours)])
+            cells = [_compare(measure, side) for side in ours]
+            if measure not in _LATER_MEASURES or set(cells) != {"-"}:
+                main.append([label, f"here ({name})", *cells])
         if row.variant != baseline:
             pairs = zip(ours, results_of(baseline), strict=True)
             differences.append([label, *(_compare(table.measure, *pair) for pair in pairs)])
+    if baselines:
+        for name in BASELINES:
+            ours = results_of(name, without_network)
+            main.append([name, "here (voxels)", *(_compare("voxel_iou", side) for side in ours)])
+            pairs = zip(ours, results_of(baseline), strict=True)
+            differences.append([name, *(_compare("voxel_iou", *pair) for pair in pairs)])
     return main, differences
 
 
+def _disagreements(
+    table: Table, rows: Mapping[str, Row], runs: Sequence[TrainConfig], done: MeasuredRuns
+) -> list[str]:
+    """A sentence for each method and category on which measures of accuracy disagree about it and
+    the baseline.
+    """
+    measured = _by_method(done)
+    found = []
+    for category in dict.fromkeys(run.category for run in runs):
+        theirs = measured.get((table.rows[table.baseline].variant, category), {})
+        for label, row in rows.items():
+            ours = measured.get((row.variant, category), {})
+            prefer: dict[str, list[str]] = {}
+            for name, more_is_better in _ACCURACY.items():
+                values = [[getattr(r, name) for r in side.values()] for side in (ours, theirs)]
+                if all(side and None not in side for side in values):
+                    difference = np.mean(values[0]) - np.mean(values[1])
+                    if difference:
+                        better = label if (difference > 0) == more_is_better else table.baseline
+                        prefer.setdefault(better, []).append(MEASURES[name][0])
+            if len(prefer) == 2:
+                sides = (f"{' and '.join(names)} for {who}" for who, names in prefer.items())
+                found.append(f"Measures disagree on {category}: {', '.join(sides)}.")
+    return found
+
+
 def _run_rows(done: MeasuredRuns) -> Cells:
-    """A header, and the measures of each run."""
+    """A header, and the measures of each run; a second row has its other checkpoint."""
     rows = [["run", "networks", "iterations", "batch", "images", *HEADERS, "minutes", "commit"]]
     for run, result in done:
-        counts = [
-            f"step {result.step}",
-            str(result.iterations),
-            str(run.batch_size),
-            str(result.images),
-        ]
-        minutes = "-" if result.seconds is None else f"{result.seconds / 60:.1f}"
-        rows.append(
-            [name_run(run), *counts, *format_measures(vars(result)), minutes, result.commit]
-        )
+        for measured in filter(None, (result, result.other)):
+            which = Path(measured.checkpoint).stem
+            counts = [
+                f"step {measured.step}" + (f" ({which})" if result.other else ""),
+                str(measured.iterations),
+                str(run.batch_size),
+                str(measured.images),
+            ]
+            minutes = "-" if measured.seconds is None else f"{measured.seconds / 60:.1f}"
+            values = format_measures(vars(measured))
+            rows.append([name_run(run), *counts, *values, minutes, measured.commit])
+    return rows
+
+
+def _angle_rows(done: MeasuredRuns) -> Cells:
+    """A header of angles in degrees, and the IoU of silhouettes of each run that has them."""
+    rows = [["run", *map(str, ANGLES_DEG)]]
+    for run, result in done:
+        if known := dict(result.angles):
+            values = [known.get(angle) for angle in ANGLES_DEG]
+            rows.append([name_run(run), *("-" if v is None else f"{v:.4f}" for v in values)])
     return rows
 
 
@@ -209,7 +300,7 @@ def _compare(measure: str, *sides: Side) -> str:
     if len(seeds) > 1 and all(list(by_seed) == seeds for side in sides for by_seed in side):
         ours, *theirs = (np.mean(side, axis=0) for side in values)
         text += f" ±{stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(ours - sum(theirs)):.3f}"
-    if measure == "mmd":
+    if measure not in ObjectMeans._fields:
         return text + (f" (x {means[0] / means[1]:.2f})" if len(means) == 2 else "")
     for of_category in zip(*sides, strict=True):
         if (

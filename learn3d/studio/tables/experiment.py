@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from pydantic import TypeAdapter
 
 from learn3d.config import TrainConfig, differences
-from learn3d.data.layouts import load_dataset
+from learn3d.data.layouts import Layout, load_dataset
 from learn3d.data.poses import wrap_deg
 from learn3d.device import resolve_precision
 from learn3d.files import limits, writing
@@ -16,7 +17,8 @@ from learn3d.files.reading import read_bytes
 from learn3d.presets import load_config
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
-from learn3d.runs.measurement import Result, evaluate_runs, read_curve
+from learn3d.runs.baselines import measure_baselines
+from learn3d.runs.measurement import Baseline, Result, evaluate_runs, read_curve
 from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import NEAR_DEG, PoseOptions
 from learn3d.studio.poses.views import CameraOptions, estimate_views, load_views
@@ -81,8 +83,14 @@ def train_and_test(config: TrainConfig) -> bool:
     if config.poses is not None:
         _measure_updated_poses(config)
     which = VARIANTS[variant_of(config)].checkpoint
-    (result,) = evaluate_runs([config.output], which=which, data=config.data, device=config.device)
+    measure = functools.partial(
+        evaluate_runs, [config.output], data=config.data, device=config.device
+    )
+    (result,) = measure(which=which)
     result.curve = read_curve(config.output)
+    other = checkpoint.find(config.output, "best" if which == "last" else "last")
+    if other.is_file() and checkpoint.load_metadata(other).progress.step != result.step:
+        (result.other,) = measure(which=other.stem)
     writing.write_json(config.output / RESULT_FILE, result.model_dump())
     print(f"tested: voxel IoU {result.voxel_iou:.4f} (kato18)", flush=True)
     return True
@@ -112,7 +120,11 @@ def run_experiment(
         tasks = [Task(name_run(run), work, (run,), run.output / LOG_FILE) for run in missing]
         failed = run_tasks(tasks, request.workers)
         results = read_results(runs)
-    tables, text = make_report(request, runs, results)
+    baselines = []
+    if TABLES[request.table].measure == "voxel_iou":
+        for category in dict.fromkeys(run.category for run in runs):
+            baselines += find_baselines(request.output, runs[0].layout, runs[0].data, category)
+    tables, text = make_report(request, runs, results, baselines)
     path = request.output / f"{request.table}.md"
     path.parent.mkdir(parents=True, exist_ok=True)
     writing.write_bytes(path, text.encode())
@@ -155,6 +167,33 @@ def read_results(runs: Sequence[TrainConfig]) -> dict[Path, Result]:
             if (result.iterations, result.data) == (run.iterations, str(run.data.resolve())):
                 results[run.output] = result
     return results
+
+
+def find_baselines(output: Path, layout: Layout, data: Path, category: str) -> list[Baseline]:
+    """The baselines of a category: those in the output folder, or measured and stored there.
+
+    Without the data set there are none, and a note says so. Raises ValueError for a damaged file.
+    """
+    path = output / "baselines" / f"{category}.json"
+    if path.is_file():
+        content = read_bytes(path, limits.JSON_BYTES, "the baselines of a data set as JSON")
+        try:
+            stored = TypeAdapter(list[Baseline]).validate_json(content)
+        except ValueError as error:
+            reason = " ".join(str(error).splitlines()[1:3])
+            raise ValueError(
+                f"{path} has no baselines ({reason}); remove it, and it is made again"
+            ) from None
+        if {baseline.data for baseline in stored} == {str(data.resolve())}:
+            return stored
+    if not data.is_dir():
+        note(f"no rows for the mean shape of {category}: the data set {data} is not here")
+        return []
+    note(f"{category}: mean shape and nearest training object of {data}")
+    baselines = measure_baselines(layout, data, category)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writing.write_json(path, [baseline.model_dump() for baseline in baselines])
+    return baselines
 
 
 def find_conflict(run: TrainConfig) -> str:

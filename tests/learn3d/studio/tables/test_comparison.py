@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -11,8 +12,13 @@ import pytest
 import stub_work
 
 from learn3d.presets import PRESETS
-from learn3d.studio.tables import comparison
-from learn3d.studio.tables.comparison import percentile_interval, resampled_means
+from learn3d.runs.baselines import measure_baselines
+from learn3d.studio.tables import comparison, experiment
+from learn3d.studio.tables.comparison import (
+    ABOUT_BASELINES,
+    percentile_interval,
+    resampled_means,
+)
 from learn3d.studio.tables.experiment import describe_tables, run_experiment
 from learn3d.studio.tables.plan import plan_runs
 from learn3d.studio.tables.tables import MEAN, TABLES, VARIANTS
@@ -80,6 +86,66 @@ def test_the_page_shows_our_figures_beside_the_papers(
     assert all(
         row[start - 2 : start] == "  " and row[start] != " " for row in rows for start in starts[1:]
     )
+
+
+def test_baselines_stand_below_the_methods(
+    tiny_folder, make, request_for, read_report, tmp_path, monkeypatch, capsys
+) -> None:
+    """They are measured once for a data set, and left out with a note if it is not here."""
+    given = dataclasses.replace(request_for(), data=tiny_folder)
+    assert make(given) == 0
+    text, tables = read_report(), json.loads((tmp_path / "out/kato.json").read_text())
+    for baseline in measure_baselines("kato", tiny_folder, "airplane"):
+        (cells,) = [row for row in tables["main"] if row[0] == baseline.name]
+        assert cells[1] == "here (voxels)" and cells[2].startswith(f"{baseline.voxel_iou:.3f} [")
+        (difference,) = [row for row in tables["differences"] if row[0] == baseline.name]
+        assert difference[1].startswith(f"{baseline.voxel_iou - 0.34:+.3f}")
+    assert ABOUT_BASELINES in text
+    monkeypatch.setattr(experiment, "measure_baselines", None)
+    assert make(dataclasses.replace(given, seeds=2)) == 0
+    assert "| Mean shape | here (voxels) |" in read_report(), "read from the output folder"
+    path = tmp_path / "out/baselines/airplane.json"
+    path.write_text(path.read_text().replace('"voxel_iou"', '"iou"'))
+    with pytest.raises(ValueError, match=r"airplane.json has no baselines .* remove it"):
+        make(given)
+    path.unlink()
+    make(request_for(report_only=True))
+    assert "Mean shape" not in read_report()
+    assert "no rows for the mean shape of airplane" in capsys.readouterr().err
+    make(dataclasses.replace(given, table="mmd"))
+    assert "Mean shape" not in read_report("mmd"), "that table compares codes"
+
+
+def test_measures_that_disagree_are_named(tmp_path, make, request_for, read_report) -> None:
+    make(request_for())
+    assert "disagree" not in read_report(), "Chamfer-L1 and F-score are equal"
+    path = tmp_path / "out/runs/airplane/proposed-seed0/test.json"
+    changed = json.loads(path.read_text()) | {"chamfer_l1": 0.2, "f_score": 0.7}
+    path.write_text(json.dumps(changed))
+    make(request_for(report_only=True))
+    wanted = (
+        "Measures disagree on airplane: voxel IoU and F-score for Proposed, Chamfer-L1 for "
+        "Vanilla-AE."
+    )
+    assert wanted in read_report()
+
+
+def test_both_checkpoints_the_angles_and_the_unclamped_iou_are_reported(
+    tmp_path, make, request_for, read_report
+) -> None:
+    make(request_for())
+    path = tmp_path / "out/runs/airplane/proposed-seed0/test.json"
+    changed = json.loads(path.read_text())
+    best = changed | {"checkpoint": "run/best.safetensors", "step": 3, "voxel_iou": 0.5}
+    changed |= {"other": best, "angles": [[0, 0.9], [180, 0.7]], "voxel_iou_unclamped": 0.3}
+    path.write_text(json.dumps(changed))
+    make(request_for(report_only=True))
+    tables = json.loads((tmp_path / "out/kato.json").read_text())
+    networks = [row[1] for row in tables["runs"] if row[0] == "airplane/proposed-seed0"]
+    assert networks == ["step 6 (last)", "step 3 (best)"]
+    assert tables["angles"][1] == ["airplane/proposed-seed0", "0.9000", *["-"] * 11, "0.7000"]
+    assert "| Proposed | here (kato18, without clamp) | 0.300 | 0.300 |" in read_report()
+    assert "| Vanilla-AE | here (kato18, without clamp)" not in read_report(), "not known"
 
 
 def test_a_mean_over_other_categories_is_in_parentheses(make, request_for, read_report) -> None:

@@ -21,7 +21,9 @@ from learn3d.config import config_to_dict
 from learn3d.device import resolve_precision
 from learn3d.files.writing import write_json
 from learn3d.presets import PRESETS, command_line
+from learn3d.runs import checkpoint
 from learn3d.runs.checkpoint import Progress
+from learn3d.runs.measurement import evaluate_runs
 from learn3d.runs.run import Summary
 from learn3d.studio.poses.estimate import PoseOptions
 from learn3d.studio.tables import experiment
@@ -238,6 +240,21 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, read_report) 
     assert train_and_test(run)
     assert json.loads((folder / "test.json").read_text())["voxel_iou"] == result["voxel_iou"]
     assert (folder / "log.txt").read_text().count("training: ") == 1, "only measured again"
+    assert result["other"] is None, "the last step was the best"
+
+    weights, metadata = checkpoint.load(folder / "best.safetensors")
+    earlier = dataclasses.replace(metadata.progress, step=1)
+    weights = {
+        name: value * 0.9 if value.is_floating_point() else value for name, value in weights.items()
+    }
+    checkpoint.save(
+        folder / "best.safetensors", weights, dataclasses.replace(metadata, progress=earlier)
+    )
+    assert train_and_test(run)
+    result = json.loads((folder / "test.json").read_text())
+    assert (result["step"], result["other"]["step"]) == (2, 1)
+    (best,) = evaluate_runs([folder], which="best")
+    assert result["other"]["voxel_iou"] == best.voxel_iou != result["voxel_iou"]
 
     np.savez(tmp_path / "02691156_train_images.npz", np.full((3, 24, 4, 64, 64), 200, np.uint8))
     for name in ("train_voxels", "val_images", "val_voxels"):

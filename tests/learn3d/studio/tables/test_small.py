@@ -20,6 +20,7 @@ import pytest
 import stub_work
 
 from learn3d import commands
+from learn3d.runs.baselines import BASELINES
 from learn3d.runs.checkpoint import load_metadata
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
 from learn3d.studio.tables import experiment
@@ -120,6 +121,11 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
             assert [point[1] for point in result["curve"]] == [result["iterations"]], (
                 "the last step is validated"
             )
+            assert result["mmd_floor"] > 0
+            assert 0 <= result["voxel_iou_unclamped"] <= result["voxel_iou"] + 0.5
+            angles = dict(result["angles"])
+            assert table.layout == "pascal3d" or angles[0] > 0
+            assert all(0 <= iou <= 1 for iou in angles.values())
         mean = sum(result[table.measure] for result in results) / len(results)
         cell, mean_cell = cells["here (mmd)" if name == "mmd" else "here (kato18)"]
         assert cell == mean_cell and cell.startswith(f"{mean:.3f}"), label
@@ -131,6 +137,14 @@ def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> 
             line[1]: line[2:] for line in lines if line[0] == f"airplane/{row.variant}-seed0"
         }
         assert f"{results[0]['chamfer_l1']:.4f}" in in_list[f"step {results[0]['step']}"]
+
+
+@pytest.mark.parametrize("name", [name for name in TABLES if TABLES[name].measure == "voxel_iou"])
+def test_tables_of_voxel_iou_have_the_baselines(folder: Path, name: str) -> None:
+    rows = {row[0]: row for row in json.loads((folder / f"out/{name}.json").read_text())["main"]}
+    ious = [float(rows[baseline][2].split()[0]) for baseline in BASELINES]
+    assert 0 < ious[2] < ious[1] <= 1, "the nearest training object is above a random one"
+    assert ious[2] < ious[0] < 1, "so is the mean shape"
 
 
 def test_settings_of_rows_reach_their_runs(folder: Path) -> None:
