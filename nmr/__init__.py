@@ -17,7 +17,8 @@ sample_texture      the colours of an image at uv coordinates of your own
 Lights              ambient, directional and point lights, spherical harmonics; NormalMap: normals from an image
 LookAt, Look, Pinhole, Orthographic, Camera   cameras: world space -> renderer space; ``nmr.cameras`` converts them
 voxelize            meshes -> filled occupancy grids (kato18 or kato19, the published voxel IoU)
-load_obj            an OBJ file -> vertices, faces, texture coordinates, materials, vertex colours
+load_obj, load_gltf  a mesh file -> vertices, faces, texture coordinates, materials, vertex colours; save_obj
+Materials           colours of such a mesh: an image or a colour for each material
 icosphere, edge_table, unique_edges, losses   a sphere to deform, its edges, loss functions
 metrics             points on surfaces, Chamfer distance, F-score, IoU of grids
 face_normals, vertex_normals    unit normals, differentiable
@@ -38,7 +39,9 @@ from .fragments import Fragments
 from .images import Images
 from .layers import render_soft, render_transparent
 from .lights import Lights
-from .mesh import edge_table, face_normals, icosphere, load_obj, unique_edges, vertex_normals
+from .materials import Materials
+from .mesh import edge_table, face_normals, icosphere, unique_edges, vertex_normals
+from .mesh_files import load_gltf, load_obj, save_obj
 from .render import (
     render,
     render_depth,
@@ -71,6 +74,7 @@ __all__ = [
     "Lights",
     "Look",
     "LookAt",
+    "Materials",
     "NormalMap",
     "Orthographic",
     "Pinhole",
@@ -81,6 +85,7 @@ __all__ = [
     "edge_table",
     "face_normals",
     "icosphere",
+    "load_gltf",
     "load_obj",
     "losses",
     "metrics",
@@ -95,6 +100,7 @@ __all__ = [
     "render_soft_silhouette",
     "render_transparent",
     "sample_texture",
+    "save_obj",
     "unique_edges",
     "vertex_normals",
     "voxelize",

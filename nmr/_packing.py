@@ -157,6 +157,11 @@ def pack_meshes(vertices: object, faces: object) -> MeshBatch:
     """Meshes given as lists, checked and laid end to end; a list of one becomes the batch
     ``[1, V, 3]``.
     """
+    if hasattr(vertices, "face_material"):
+        raise TypeError(
+            "vertices must be tensors, got a mesh file; write (mesh.vertices, mesh.faces, camera, "
+            "colors=nmr.Materials.from_mesh(mesh))"
+        )
     if is_list(vertices):
         vertices = [cast_under_autocast(part) for part in vertices]
         for part in vertices:

@@ -1,17 +1,11 @@
-"""Meshes: spheres, OBJ files, tables of edges, normals."""
+"""Meshes: spheres, tables of edges, normals."""
 
 from __future__ import annotations
 
-import os
-import warnings
-from typing import NamedTuple
-
-import numpy as np
 import torch
 from torch import Tensor
 
 from ._validate import check_faces, check_indices, check_vertices, describe
-from .obj import find_image, find_libraries, load, match_materials, read_mtl
 
 
 def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
@@ -67,102 +61,6 @@ def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
         faces = torch.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], dim=1).view(-1, 3)
     device = torch.empty(0).device
     return vertices.to(device, torch.float32), faces.to(device)
-
-
-class Material(NamedTuple):
-    """A material of an MTL file."""
-
-    name: str
-    color: tuple[float, float, float] | None  # `Kd`
-    image: str | None  # path of the image `map_Kd`
-
-
-class ObjMesh(NamedTuple):
-    """An OBJ file as :func:`load_obj` returns it."""
-
-    vertices: Tensor  # [V, 3]
-    faces: Tensor  # int64 [F, 3]
-    uv: Tensor  # [T, 2]
-    uv_faces: Tensor  # int64 [F, 3], -1 at faces without texture coordinates
-    face_material: Tensor  # int64 [F], index in `materials`; -1 without a material
-    materials: tuple[Material, ...]
-    colors: Tensor | None  # [V, 3] in [0, 1]
-
-
-def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) -> ObjMesh:
-    """Read a Wavefront OBJ file.
-
-    Polygons are cut into triangles; concave ones keep their outline. Relative numbers count from
-    their line. Groups, points, lines and normals are skipped, and so are the texture coordinates
-    of a face that has them at some corners only.
-
-    Parameters
-    ----------
-    filename : str or path
-    dtype : torch.float32 or torch.float64
-        Type of the floating-point tensors. For coordinates as large as UTM's take float64,
-        subtract the middle, then call ``.float()``.
-
-    Returns
-    -------
-    ObjMesh
-        A named tuple of tensors on the default device. ``faces[f]`` and ``uv_faces[f]`` are the
-        rows of ``vertices [V, 3]`` and ``uv [T, 2]`` at the corners of face f, in the order of
-        the file; (0, 0) of ``uv`` is the lower left corner of an image.
-        ``materials[face_material[f]]`` has name, colour and image path of its material. Read the
-        image with a library of your own, and draw with :class:`UVTexture`. ``colors [V, 3]`` are
-        those of the lines ``v x y z r g b``, None if there are none. Values above 1 count as
-        0..255; vertices without a colour are grey (0.5).
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file is missing. A missing MTL file is a warning, and so are faces without a known
-        material.
-    ValueError
-        If the file has no vertices or no faces, or if a line cannot be read or refers to a
-        missing element: the message has the number of the line.
-
-    Examples
-    --------
-    >>> mesh = nmr.load_obj("chair.obj")
-    >>> image = nmr.render_silhouette(mesh.vertices, mesh.faces, nmr.LookAt.from_angles(2.732, 30.0, 45.0))
-    """
-    filename = os.fspath(filename)
-    vertices, colors, uv, faces, uv_faces, face_material, names, libraries = load(filename)
-    materials, folder = {}, os.path.dirname(filename)
-    for library in find_libraries(folder, libraries):
-        if not os.path.isfile(library):
-            warnings.warn(
-                f"{filename} names the materials {library}, which is missing", stacklevel=2
-            )
-            continue
-        kd, map_kd = read_mtl(library)
-        for name in {**kd, **map_kd}:
-            image = find_image(folder, map_kd[name]) if name in map_kd else None
-            materials[name] = Material(
-                name, tuple(kd[name].tolist()) if name in kd else None, image
-            )
-    numbers = {name: number for number, name in enumerate(materials)}
-    matched = (
-        match_materials(names, face_material, materials, filename)
-        if libraries
-        else [""] * len(names)
-    )
-    face_material = torch.tensor([numbers.get(name, -1) for name in matched])[
-        torch.from_numpy(face_material)
-    ]
-    if colors is not None:
-        colors = np.where(np.isfinite(colors).all(axis=1, keepdims=True), colors, np.nan)
-        colors = np.nan_to_num(
-            colors / (255 if np.nanmax(colors, initial=0) > 1 else 1), nan=0.5
-        ).clip(0, 1)
-        colors = torch.tensor(colors, dtype=dtype)
-    # Each array is freed as soon as its tensor exists.
-    vertices, uv = torch.tensor(vertices, dtype=dtype), torch.tensor(uv, dtype=dtype)
-    faces = torch.tensor(faces, dtype=torch.int64)
-    uv_faces = torch.tensor(uv_faces, dtype=torch.int64)
-    return ObjMesh(vertices, faces, uv, uv_faces, face_material, tuple(materials.values()), colors)
 
 
 def unique_edges(faces: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from ._validate import (
     check_indices,
     check_values,
     describe,
+    holds_for_all,
 )
 from .cameras.projection import has_perspective
 from .mesh import _unit
@@ -245,6 +246,10 @@ class UVTexture:
                 check_faces(faces, batch, torch.device("cpu"), "uv_faces")
             if len(_each(self.uv)) == len(_each(self.uv_faces)):  # else refused when drawn
                 for faces, uv in zip(_each(self.uv_faces), _each(self.uv), strict=True):
+                    if not holds_for_all(faces != -1):
+                        raise ValueError(
+                            "uv_faces is -1 at faces without texture coordinates; nmr.Materials draws them in a colour"
+                        )
                     check_indices(faces, uv.shape[-2], "uv_faces", "row", "uv", "rows")
         check_choice(self.wrap, "wrap", ops.WRAPS)
         check_choice(self.filter, "filter", ("bilinear", "mipmap"))

@@ -75,9 +75,10 @@ def _triangles(path: Path, file: BinaryIO) -> tuple[np.ndarray, np.ndarray]:
         mesh = read_obj(file, with_uv=False)
         return mesh.vertices, mesh.faces
     if kind in (".glb", ".gltf"):
-        from learn3d.files.gltf import read_gltf
+        from nmr.gltf import read_gltf
 
-        return read_gltf(file.read(), lambda name: _file_below(path.parent, name))
+        mesh = read_gltf(file.read(), lambda name: _file_below(path.parent, name))
+        return mesh.vertices, mesh.faces
     from learn3d.files.meshes import read_off, read_ply, read_stl
 
     return {".off": read_off, ".ply": read_ply, ".stl": read_stl}[kind](file.read())

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmr.neural_renderer._images import read_image
+from nmr._images import read_image
 from nmr.obj import Obj, find_image, find_libraries, load, match_materials, read_mtl
 
 texture_wrapping_dict = {

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 
 import numpy as np
+import torch
 from torch import Tensor
 
+import nmr
 from nmr._validate import describe
 from nmr.neural_renderer._convert import check_textures
-from nmr.neural_renderer._images import write_png
 
 _EPS = 1e-5  # keeps texture coordinates below the last texel
 
@@ -122,41 +123,13 @@ def save_obj(
 
     >>> nr.save_obj("out.obj", vertices[0], faces[0], textures[0])
     """
-    base, ending = os.path.splitext(os.fspath(filename))
-    if ending.lower() != ".obj":
-        raise ValueError(f"filename must end in .obj, got {os.fspath(filename)!r}")
-    for name, tensor in (("vertices", vertices), ("faces", faces)):
-        if not isinstance(tensor, Tensor) or tensor.ndim != 2 or tensor.shape[1] != 3:
-            raise ValueError(
-                f"{name} must be those of one mesh, a tensor [N, 3], got {describe(tensor)}; take [0]"
-            )
-    points, corners = vertices.detach().cpu().numpy(), (faces.detach().cpu().long() + 1).numpy()
-    name = os.path.basename(base)
-    lines = []
+    colors = None
     if textures is not None:
-        if len(_one_mesh(textures)) != len(corners):
+        if len(_one_mesh(textures)) != len(faces):
             raise ValueError(
-                f"textures must be one per face, {len(corners)}, got {describe(textures)}"
+                f"textures must be one per face, {len(faces)}, got {describe(textures)}"
             )
-        image, uv = create_texture_image(textures)
-        write_png(f"{base}.png", image)
-        _write_text(f"{base}.mtl", ["newmtl material_1", f"map_Kd {name}.png"])
-        lines.append(f"mtllib {name}.mtl")
-    lines += ["v {:.9g} {:.9g} {:.9g}".format(*point) for point in points.tolist()]
-    if textures is None:
-        lines += ["f {} {} {}".format(*face) for face in corners.tolist()]
-    else:
-        lines += ["vt {:.9g} {:.9g}".format(*point) for point in uv.reshape(-1, 2).tolist()]
-        lines.append("usemtl material_1")
-        lines += [
-            f"f {a}/{3 * i + 1} {b}/{3 * i + 2} {c}/{3 * i + 3}"
-            for i, (a, b, c) in enumerate(corners.tolist())
-        ]
-    _write_text(f"{base}{ending}", lines)
-
-
-def _write_text(filename: str, lines: list[str]) -> None:
-    partial = f"{filename}.part"
-    with open(partial, "w", encoding="utf-8", newline="\n") as file:
-        file.write("\n".join(lines) + "\n")
-    os.replace(partial, filename)
+        image, uv = (torch.from_numpy(x.copy()) for x in create_texture_image(textures))
+        corners = torch.arange(3 * len(faces)).view(-1, 3)
+        colors = nmr.UVTexture(image, uv.reshape(-1, 2), corners)
+    nmr.save_obj(filename, vertices, faces, colors)

@@ -9,7 +9,7 @@ import struct
 import numpy as np
 
 COMPONENTS = {"f4": 5126, "i2": 5122, "u2": 5123, "u1": 5121}
-WIDTHS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+WIDTHS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 
 
 class Arrays:
@@ -49,3 +49,36 @@ def glb(tree: dict[str, object], content: bytes) -> bytes:
         data = data.ljust(-(-len(data) // 4) * 4, filler)
         chunks += struct.pack("<I4s", len(data), kind) + data
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+SQUARE = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+
+def square_glb(picture: bytes | None = None, factor: tuple = (1, 1, 1, 1), **use: object) -> bytes:
+    """A square: triangle 0 with a picture and texture coordinates, 1 in a colour, 2 without a material.
+
+    use: how material 0 uses the picture.
+    """
+    arrays = Arrays()
+    position, uv = arrays.add(SQUARE), arrays.add(SQUARE[:, :2].copy())
+    colors = arrays.add(
+        np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [0, 0, 0]]), normalized=True
+    )
+    looks = [
+        {"attributes": {"POSITION": position, "TEXCOORD_0": uv}, "material": 0},
+        {"attributes": {"POSITION": position, "TEXCOORD_0": uv}, "material": 1},
+        {"attributes": {"POSITION": position, "COLOR_0": colors}},
+    ]
+    corners = [np.uint16(row).reshape(3, 1) for row in ([0, 1, 2], [0, 2, 3], [1, 2, 3])]
+    for look, rows in zip(looks, corners, strict=True):
+        look["indices"] = arrays.add(rows)
+    materials = [
+        {"name": "a", "pbrMetallicRoughness": {"baseColorFactor": factor}},
+        {"name": "b", "pbrMetallicRoughness": {"baseColorFactor": [0, 0.5, 1, 1]}},
+    ]
+    tree = {"asset": {"version": "2.0"}, "nodes": [{"mesh": 0}], "meshes": [{"primitives": looks}]}
+    if picture is not None:
+        materials[0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0} | use
+        tree |= {"textures": [{"source": 0}], "images": [{"bufferView": len(arrays.views)}]}
+        arrays.add(np.frombuffer(picture, np.uint8))
+    return glb(tree | {"materials": materials} | arrays.tree(embedded=False), arrays.content)

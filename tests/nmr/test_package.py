@@ -7,9 +7,11 @@ import importlib
 import importlib.metadata
 import importlib.resources
 import pkgutil
+from pathlib import Path
 
 import pytest
 import torch
+from gltf_files import square_glb
 
 import nmr
 import nmr.neural_renderer as nr
@@ -46,8 +48,10 @@ def test_example(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     vertices, faces = nmr.icosphere(1)
     example.globs.update(torch=torch, nmr=nmr, nr=nr, dr=dr)
-    if example.name.endswith("mesh.load_obj"):
-        nr.save_obj("chair.obj", vertices, faces)
+    if "load_gltf" in example.name:
+        Path("chair.glb").write_bytes(square_glb())
+    elif example.name.startswith("nmr.m"):
+        nmr.save_obj("chair.obj", vertices, faces)
     if "neural_renderer" in example.name:
         textures = torch.rand(1, len(faces), 4, 4, 4, 3)
         if "load_obj" in example.name:

@@ -2,7 +2,9 @@
 
 import functools
 import multiprocessing
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import NamedTuple
 
 import pytest
@@ -125,6 +127,23 @@ def texture(mode, filter_mode, tensors):
     return Call(lambda **given: dr.texture(**given, **how), tensors)
 
 
+def materials(colors, image, uv, uv_faces):
+    """Of the picture, and of a colour."""
+    return nmr.Materials(colors, [image, None], FACES[:, 0] % 3 - 1, uv, uv_faces)
+
+
+def written(save):
+    """The bytes of the files that a function writes."""
+
+    def contents(**given):
+        with tempfile.TemporaryDirectory() as folder:
+            save(f"{folder}/a.obj", **given)
+            content = b"".join(path.read_bytes() for path in sorted(Path(folder).iterdir()))
+        return torch.tensor(list(content), device="cpu")
+
+    return contents
+
+
 def mipmap(tex):
     """Of both ways in which a texture is given its mipmaps."""
     made = dr.texture_construct_mip(tex)
@@ -230,6 +249,7 @@ CALLS = {
     "nmr.TextureCubes": colored(nmr.TextureCubes, {"textures": CUBES}),
     "nmr.UVTexture": colored(nmr.UVTexture, UV),
     "nmr.UVTexture mipmap": colored(functools.partial(nmr.UVTexture, filter="mipmap"), UV),
+    "nmr.Materials": colored(materials, {"colors": noise(2, 3)[0], **{k: UV[k][0] for k in UV}}),
     "nmr.NormalMap": Call(lambda **uv: lit(normals=nmr.NormalMap(**uv)), UV),
     "nmr.Lights": Call(lit, LIGHTS),
     "nmr.sample_texture": Call(nmr.sample_texture, {"image": UV["image"], "uv": UV2}),
@@ -246,6 +266,14 @@ CALLS = {
     ),
     "nmr.face_normals": Call(nmr.face_normals, MESH),
     "nmr.vertex_normals": Call(nmr.vertex_normals, MESH),
+    "nmr.save_obj": Call(
+        written(
+            lambda path, vertices, faces, **given: nmr.save_obj(
+                path, vertices, faces, materials(**given)
+            )
+        ),
+        {"vertices": SPHERE, "faces": FACES, "colors": noise(2, 3)[0]} | {k: UV[k][0] for k in UV},
+    ),
     "nmr.edge_table": Call(nmr.edge_table, {"faces": FACES}),
     "nmr.unique_edges": Call(nmr.unique_edges, {"faces": FACES}),
     "nmr.voxelize": Call(
@@ -351,6 +379,9 @@ CALLS = {
         lambda faces, textures, direction: nr.lighting(faces, textures, direction=direction),
         {"faces": CORNERS, "textures": CUBES, "direction": torch.tensor([[0.1, 1.0, -1.0]] * 2)},
     ),
+    "nr.save_obj": Call(
+        written(nr.save_obj), {"vertices": SPHERE, "faces": FACES, "textures": CUBES[0]}
+    ),
     "nr.look": Call(
         lambda vertices, eye: nr.look(vertices, eye, (0, 0.1, 1)),
         {"vertices": MESH["vertices"], **EYE},
@@ -366,11 +397,11 @@ CALLS = {
     "nr.get_points_from_angles": Call(lambda d, e, a: nr.get_points_from_angles(d, e, a), ANGLES),
 }
 WITHOUT_TENSORS = {
-    *("nmr.Camera", "nmr.Colors", "nmr.Images", "nmr.icosphere", "nmr.load_obj"),
+    *("nmr.Camera", "nmr.Colors", "nmr.Images", "nmr.icosphere"),
+    *("nmr.load_gltf", "nmr.load_obj"),
     *("cameras.Camera", "cameras.ProjectingCamera", "metrics.SurfacePoints"),
     *("dr.RasterizeCudaContext", "dr.RasterizeGLContext", "dr.get_log_level", "dr.set_log_level"),
     *("nr.install_as", "nr.load_obj"),
-    "nr.save_obj",  # nothing but numbers comes out: test_obj.py
 }
 EACH = pytest.mark.parametrize("name", CALLS)
 

@@ -13,7 +13,7 @@ from vectors import load_vector, vector_names
 
 import nmr
 import nmr.neural_renderer as nr
-from nmr.neural_renderer._images import read_image
+from nmr._images import read_image
 from nmr.neural_renderer.load_obj import (
     bake_textures,
     load_mtl,
@@ -186,7 +186,7 @@ def test_hostile_materials_and_images(tmp_path, monkeypatch):
     write(tmp_path, t_png="no image")
     refused(r"the image .*t\.png cannot be read")
     image_module.new("RGB", (9, 9)).save(tmp_path / "t.png")
-    monkeypatch.setattr("nmr.neural_renderer._images._MOST_PIXELS", 80)
+    monkeypatch.setattr("nmr._images._MOST_PIXELS", 80)
     refused("9x9 pixels, at most 80 are read")
     (tmp_path / "t.png").unlink()
     refused("t.png", FileNotFoundError)

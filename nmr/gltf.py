@@ -1,17 +1,16 @@
-"""Reads glTF 2.0, as JSON (.gltf) or binary (.glb): the triangles of the default scene, not
-animated.
+"""glTF 2.0, as JSON (.gltf) or binary (.glb): the triangles of the default scene, not animated.
+Does not import torch, for processes without it.
 """
 
 import base64
+import json
 import re
 import struct
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
-
-from learn3d.files.reading import parse_json
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -22,18 +21,44 @@ _HARMLESS = re.compile(
 _REFUSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
 
 
-def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices float64 [V, 3] and faces int64 [F, 3] of all meshes of a scene.
+class GltfMaterial(NamedTuple):
+    """The base colour of a material."""
 
-    Points and lines are skipped. read_other: content of a file by its name. Raises EOFError if
-    the file is cut short, and ValueError if it needs an extension that is not supported.
+    name: str
+    factor: tuple[float, float, float]
+    image: bytes | None  # an encoded image, which the factor multiplies
+
+
+class Gltf(NamedTuple):
+    """All meshes of a scene as one."""
+
+    vertices: np.ndarray  # float64 [V, 3]
+    faces: np.ndarray  # int64 [F, 3]
+    # [V, 2] of the image of the material, (0, 0) at its lower left corner; NaN without
+    uv: np.ndarray
+    colors: np.ndarray  # [V, 3], NaN without
+    face_material: np.ndarray  # int64 [F], index in `materials`; -1 without
+    materials: list[GltfMaterial]
+
+
+def read_gltf(
+    content: bytes, read_other: Callable[[str], bytes], with_materials: bool = False
+) -> Gltf:
+    """The triangles of a scene.
+
+    Points and lines are skipped. read_other: content of a file by its name. with_materials: False
+    leaves out texture coordinates, colours and materials. Raises EOFError if the file is cut
+    short, and ValueError if it needs an extension that is not supported.
     """
     text, binary = _chunks(content) if content[:4] == b"glTF" else (content, None)
     if not text.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         raise ValueError("it begins with neither glTF nor {")
     if not text.rstrip().endswith(b"}"):
         raise EOFError("its JSON does not end")
-    tree = parse_json(text)
+    try:
+        tree = json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
     version = tree.get("asset", {}).get("version", "without a version")
     if not str(version).startswith("2"):
         raise ValueError(f"it is glTF {version}; version 2 is read")
@@ -44,6 +69,7 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
             )
     accessors = _Accessors(tree, binary, read_other)
     vertices, faces, total = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
+    uv, colors, face_material = [np.empty((0, 2))], [np.empty((0, 3))], [np.empty(0, np.int64)]
     places = _places(tree)
     for node, place in [(tree["nodes"][number], place) for number, place in places.items()]:
         mesh = tree["meshes"][_index(node["mesh"])] if "mesh" in node else {"primitives": []}
@@ -73,7 +99,19 @@ def read_gltf(content: bytes, read_other: Callable[[str], bytes]) -> tuple[np.nd
             faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
             vertices.append(points[used])
             total += len(used)
-    return np.concatenate(vertices), np.concatenate(faces)
+            number = primitive.get("material", -1) if with_materials else -1
+            face_material.append(np.full(len(faces[-1]), number))
+            source = accessors.color_texture(number) if number >= 0 else None
+            given = primitive["attributes"] if with_materials else {}
+            uv.append(accessors.texture_coordinates(source, given, len(points))[used])
+            colors.append(np.full((len(used), 3), np.nan))
+            if "COLOR_0" in given:
+                colors[-1] = accessors.read(given["COLOR_0"])[used, :3]
+    materials = range(len(tree.get("materials", []))) if with_materials else ()
+    return Gltf(
+        *(np.concatenate(parts) for parts in (vertices, faces, uv, colors, face_material)),
+        [accessors.material(number) for number in materials],
+    )
 
 
 def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
@@ -164,16 +202,62 @@ class _Accessors:
                 raise ValueError(f"buffer {number} has no data")
             if uri is None:
                 data = self.binary
-            elif uri.startswith("data:"):
-                data = base64.b64decode(uri.partition(",")[2])
             else:
-                data = self.read_other(unquote(uri))
+                data = self._content(uri)
             if len(data) < buffer["byteLength"]:
                 raise EOFError(
                     f"buffer {number} has {len(data)} bytes; {buffer['byteLength']} are promised"
                 )
             self.buffers[number] = data
         return self.buffers[number]
+
+    def _content(self, uri: str) -> bytes:
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition(",")[2])
+        return self.read_other(unquote(uri))
+
+    def material(self, number: int) -> GltfMaterial:
+        material = self.tree["materials"][number]
+        texture, image = self.color_texture(number), None
+        factor = _base(material).get("baseColorFactor", (1.0, 1.0, 1.0))[:3]
+        if texture is not None:
+            image = self._image(self.tree["textures"][_index(texture["index"])])
+        return GltfMaterial(material.get("name", ""), tuple(map(float, factor)), image)
+
+    def color_texture(self, number: int) -> dict[str, Any] | None:
+        """How a material uses the texture of its base colour, if it has one."""
+        return _base(self.tree["materials"][_index(number)]).get("baseColorTexture")
+
+    def _image(self, texture: dict[str, Any]) -> bytes:
+        webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
+        if "source" not in texture | webp:
+            raise ValueError("a texture has no image in the format PNG, JPEG or WebP")
+        image = self.tree["images"][_index((texture | webp)["source"])]
+        if "bufferView" in image:
+            view = self.tree["bufferViews"][_index(image["bufferView"])]
+            size = view["byteLength"]
+            return self._view(image["bufferView"], 0, "u1", (size, 1)).tobytes()
+        return self._content(image["uri"])
+
+    def texture_coordinates(
+        self, texture: dict[str, Any] | None, attributes: dict[str, int], count: int
+    ) -> np.ndarray:
+        """[count, 2] for a texture of a material, v upwards; NaN if there are none."""
+        name = f"TEXCOORD_{(texture or {}).get('texCoord', 0)}"
+        if texture is None or name not in attributes:
+            return np.full((count, 2), np.nan)
+        uv = self.read(attributes[name])[:, :2]
+        change = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        if f"TEXCOORD_{change.get('texCoord', '')}" in attributes:
+            uv = self.read(attributes[f"TEXCOORD_{change['texCoord']}"])[:, :2]
+        angle = change.get("rotation", 0.0)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        uv = uv * change.get("scale", (1, 1)) @ turn.T + change.get("offset", (0, 0))
+        return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
+
+
+def _base(material: dict[str, Any]) -> dict[str, Any]:
+    return material.get("pbrMetallicRoughness", {})
 
 
 def _index(number: int) -> int:

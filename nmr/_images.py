@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 
 import numpy as np
@@ -16,18 +17,21 @@ _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "TGA", "WEBP", "GIF", "PPM")
 _MOST_PIXELS = 2**26  # 8192 x 8192; reading takes about 30 bytes per pixel
 
 
-def read_image(filename: str) -> np.ndarray:
+def read_image(filename: str, content: bytes | None = None) -> np.ndarray:
     """Colours ``[H, W, 3]`` float32 in [0, 1], row 0 = top: grey becomes RGB, alpha is dropped,
     16 bits are kept.
+
+    content: that of the file, if it is part of another one.
     """
     try:
         from PIL import Image
     except ImportError as error:
         raise ImportError(_PILLOW) from error
-    if os.path.exists(filename) and not os.path.isfile(filename):
+    if content is None and os.path.exists(filename) and not os.path.isfile(filename):
         raise ValueError(f"the image {filename} is not a regular file")
     try:
-        with Image.open(filename, formats=_FORMATS) as image:
+        source = filename if content is None else io.BytesIO(content)
+        with Image.open(source, formats=_FORMATS) as image:
             if image.width * image.height > _MOST_PIXELS:
                 raise ValueError(
                     f"{image.width}x{image.height} pixels, at most {_MOST_PIXELS} are read"
