@@ -78,8 +78,7 @@ class TrainConfig:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     """Arithmetic of the networks. auto: bf16 where it is faster (CUDA, AMX, AMD), else fp32."""
     threads: MayDiffer[Annotated[int, Field(ge=1, le=4096)] | None] = None
-    """Number of CPU threads. If not given: one or all, whichever is faster;
-    measured at the start and when steps slow down."""
+    """Number of CPU threads. If not given: one or all, whichever is faster at the start."""
     log: MayDiffer[Literal["tensorboard", "wandb"]] = "tensorboard"
     """Second log besides metrics.jsonl; wandb sends the metrics to your account there (pip
     install wandb)."""

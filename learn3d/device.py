@@ -2,13 +2,12 @@
 
 Threads synchronise hundreds of times a step. If cores are oversubscribed, a step with all threads
 takes up to 14 times as long as with one; on an idle machine it takes a fraction. So both are
-measured.
+measured at the start.
 """
 
 import ctypes
 import os
 import statistics
-from collections import deque
 from pathlib import Path
 from typing import Literal
 
@@ -61,12 +60,10 @@ def keep_freed_memory() -> bool:
 
 
 WARM_UP, TRIAL = 1, 5  # steps at the start of a trial that are not timed, and all of its steps
-WINDOW = 20  # steps whose median is compared with the smallest median so far
-SLOWER = 3.0  # ratio of the two medians at which both numbers of threads are measured again
 
 
 class ThreadTuner:
-    """Chooses between one thread and all by the duration of training steps.
+    """Chooses between one thread and all by the duration of the first training steps.
 
     The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, if there is
     only one core, or if several ranks train together.
@@ -80,12 +77,8 @@ class ThreadTuner:
             or self.all == 1
             or world_size() > 1
         )
-        self._seconds: deque[float] = deque(maxlen=WINDOW)  # durations of the last steps
-        self._best = float("inf")  # smallest median of WINDOW steps
-        self._medians: dict[
-            int, float
-        ] = {}  # medians of the current trial, by the number of threads
         self._trying = not self.fixed
+        self._seconds: list[float] = []  # durations of a trial with all threads, then one with 1
         self._use(self.all)
 
     def resume(self, chosen: int | None) -> None:
@@ -112,33 +105,22 @@ class ThreadTuner:
 
         Returns a line for the log when a number is chosen, else "".
         """
+        if not self._trying:
+            return ""
         self._seconds.append(seconds)
-        if self.fixed or len(self._seconds) < (TRIAL if self._trying else WINDOW):
-            return ""
-        if self._trying:
-            return self._try()
-        median = statistics.median_low(self._seconds)
-        self._best = min(self._best, median)
-        if median > SLOWER * self._best:
-            self._trying = True
-            self._medians = {}
-            self._use(self.all)
-        return ""
-
-    def _try(self) -> str:
-        self._medians[self.threads] = statistics.median(list(self._seconds)[WARM_UP:])
-        if self.threads == self.all:
+        if len(self._seconds) == TRIAL:
             self._use(1)
+        if len(self._seconds) < 2 * TRIAL:
             return ""
+        trials = {self.all: self._seconds[:TRIAL], 1: self._seconds[TRIAL:]}
+        medians = {count: statistics.median(times[WARM_UP:]) for count, times in trials.items()}
+        faster, slower = sorted(medians, key=medians.__getitem__)
         self._trying = False
-        self._best = min(self._medians.values())
-        times = {count: f"{1000 * self._medians[count]:.0f} ms a step" for count in (1, self.all)}
-        self._use(min(self._medians, key=self._medians.__getitem__))
-        other = self.all if self.threads == 1 else 1
-        compared = f"{times[self.threads]}; with {other}: {times[other]}"
-        return f"threads: {self.threads} ({compared}); --threads fixes it"
+        self._use(faster)
+        times = {count: f"{1000 * median:.0f} ms a step" for count, median in medians.items()}
+        compared = f"{times[faster]}; with {slower}: {times[slower]}"
+        return f"threads: {faster} ({compared}); --threads fixes it"
 
     def _use(self, threads: int) -> None:
         self.threads = threads
-        self._seconds.clear()
         torch.set_num_threads(threads)

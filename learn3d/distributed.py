@@ -9,7 +9,6 @@ Without torchrun there is one rank.
 
 import contextlib
 import dataclasses
-import functools
 import os
 from collections.abc import Iterable, Iterator
 from datetime import timedelta
@@ -171,12 +170,24 @@ def all_gather(rows: Tensor) -> Tensor:
     )
 
 
-def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
-    """Let optimizers step on the sums of all ranks' gradients, and batch norms take the
-    statistics of all rows.
+def check_networks(networks: nn.Module) -> None:
+    """Raise ValueError if several ranks train networks with batch norms.
 
-    `nn.SyncBatchNorm` works on GPUs only, and DistributedDataParallel with one backward pass a
-    step.
+    Each rank would normalise by the statistics of its own rows, and `nn.SyncBatchNorm` works on
+    GPUs only.
+    """
+    norms = any(isinstance(m, nn.modules.batchnorm._BatchNorm) for m in networks.modules())
+    if norms and world_size() > 1:
+        raise ValueError(
+            "networks with batch norms (encoder resnet18, VPL, PrGAN) train in one process, got "
+            f"{world_size()} ranks; start learn3d train without torchrun"
+        )
+
+
+def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
+    """Let optimizers step on the sums of all ranks' gradients.
+
+    DistributedDataParallel works with one backward pass a step only.
     """
     if world_size() == 1:
         return
@@ -196,65 +207,6 @@ def synchronize(networks: nn.Module, optimizers: Iterable[torch.optim.Optimizer]
             parameter.register_post_accumulate_grad_hook(send)
     for optimizer in optimizers:
         optimizer.register_step_pre_hook(receive)
-    for module in networks.modules():
-        if isinstance(module, nn.modules.batchnorm._BatchNorm):
-            module.forward = functools.partial(_batch_norm, module)
-
-
-class _BatchNorm(torch.autograd.Function):
-    """Normalizes the channels of x [B, C, ...] with mean and variance [C] over the rows of all
-    ranks.
-
-    With y = w x' + b, x' = (x - mean) / s and N numbers of a channel in all ranks, the gradient
-    of the sum of the ranks' losses is dx = w / s (dy - sum(dy) / N - x' sum(dy x') / N), with
-    sums over the rows of all ranks.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, moments: tuple[Tensor, ...], eps: float
-    ) -> Tensor:
-        ctx.save_for_backward(x, weight, *moments)
-        ctx.eps = eps
-        return nn.functional.batch_norm(x, *moments, weight, bias, eps=eps)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        x, weight, mean, variance = ctx.saved_tensors
-        # as if mean and variance did not depend on x
-        statistics = (mean, variance, None, None, False, ctx.eps)
-        backward = torch.ops.aten.native_batch_norm_backward
-        grad_x, grad_weight, grad_bias = backward(grad, x, weight, *statistics, [True, True, True])
-        # what passes through mean and variance
-        count = world_size() * x.numel() / x.shape[1]
-        slope, offset = _all_reduce(torch.stack([grad_weight, grad_bias])) / count
-        scale = (variance + ctx.eps).rsqrt()
-        slope, offset = weight * scale.square() * slope, weight * scale * offset
-        shape = [1, -1] + [1] * (x.ndim - 2)
-        grad_x -= x * slope.view(shape) + (offset - mean * slope).view(shape)
-        return grad_x, grad_weight, grad_bias, None, None
-
-
-def _batch_norm(norm: nn.Module, x: Tensor) -> Tensor:
-    """A batch norm with mean and variance over the rows of all ranks, which have equally many."""
-    if not norm.training:
-        return type(norm).forward(norm, x)
-    with torch.no_grad():
-        # given so that the results are float32, too
-        running = (
-            norm.running_mean.clone(),
-            norm.running_var.clone(),
-        )
-        mean, variance = (
-            values.double() for values in torch.batch_norm_update_stats(x, *running, 0.0)
-        )
-        mean, square = _all_reduce(torch.stack([mean, variance + mean.square()])) / world_size()
-        variance = square - mean.square()
-        count = world_size() * x.numel() / x.shape[1]
-        norm.num_batches_tracked.add_(1)
-        norm.running_mean.lerp_(mean.float(), norm.momentum)
-        norm.running_var.lerp_((variance * count / max(1, count - 1)).float(), norm.momentum)
-    return _BatchNorm.apply(x, norm.weight, norm.bias, (mean.float(), variance.float()), norm.eps)
 
 
 def wait_for_writer() -> None:

@@ -53,6 +53,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
         method = run.method
         # the data and a batch are checked before `begin` removes an older run
         empty_masks = train_set.check_masks()
+        distributed.check_networks(method.networks)
         rows = distributed.own_rows(config.batch_size, VIEWS_OF_OBJECT[config.sampling])
         method.check_batch(next(batches(train_set, config, rows=rows)))
         progress, notes = run.begin(train_set, resume=resume, overwrite=overwrite)

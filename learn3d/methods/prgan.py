@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch
 from learn3d.data.poses import LookAtPoses, Poses, wrap_deg
-from learn3d.distributed import all_reduce_mean, rank, world_size
 from learn3d.methods.method import Grids, Losses, Method, MethodSettings
 from learn3d.methods.optimization import adam, frozen
 from learn3d.networks.encoders import network_input
@@ -150,7 +149,7 @@ class PrGAN(Method):
         learns from the discriminator's logits, and then from statistics of the discriminator's
         first layer. All three use the same z, as in the published code.
         """
-        z = self.sample_z(world_size() * len(batch)).chunk(world_size())[rank()]
+        z = self.sample_z(len(batch))
         if step >= self.settings.encoder_from_step:
             yield {"encoder": (1.0, self.encoder_loss(z))}, ("encoder",)
             return
@@ -193,8 +192,7 @@ class PrGAN(Method):
         with self.autocast():
             estimate = self.encoder(images)
         difference = estimate.float() - z.to(self.device, non_blocking=True)
-        # the sum over all ranks, whose losses are averaged
-        return world_size() * difference.square().sum()
+        return difference.square().sum()
 
     @torch.no_grad()
     def accuracy(self, real: Tensor, z: Tensor) -> Tensor:
@@ -202,17 +200,16 @@ class PrGAN(Method):
         self.networks.eval()
         with self.autocast():
             of_real, of_fake = self.discriminator(real), self.discriminator(self.generate(z))
-        accuracy = (of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2
-        return all_reduce_mean(accuracy)
+        return (of_real.float().sigmoid().mean() + 1 - of_fake.float().sigmoid().mean()) / 2
 
 
 def statistics_loss(of_real: Tensor, of_fake: Tensor) -> Tensor:
     """Sum over features [B, ...] of squared differences of batch means and variances."""
     means, variances = [], []  # torch.var takes ten times as long over the first axis
     for features in (of_real, of_fake):
-        mean = all_reduce_mean(features.mean(0))
+        mean = features.mean(0)
         means.append(mean)
-        variances.append(all_reduce_mean((features - mean).square().mean(0)))
+        variances.append((features - mean).square().mean(0))
     return torch.sub(*means).square().sum() + torch.sub(*variances).square().sum()
 
 

@@ -18,7 +18,7 @@ import torch
 
 from learn3d import training
 from learn3d.distributed import join_ranks, rank
-from learn3d.methods import mesh_method, prgan
+from learn3d.methods import mesh_method
 from learn3d.networks.encoders import ENCODERS
 from learn3d.presets import config_from_dict
 from learn3d.runs import checkpoint
@@ -54,7 +54,7 @@ def main() -> int:
         for task in json.loads(Path(sys.argv[1]).read_text()):
             training.take_step = functools.partial(step, take_step, task.get("kill"))
             rate = task.get("rate")
-            mesh_method.adam = prgan.adam = functools.partial(linear, rate) if rate else adam
+            mesh_method.adam = functools.partial(linear, rate) if rate else adam
             training.train(config_from_dict(task["config"]), resume=task.get("resume", False))
     return 0
 
