@@ -7,7 +7,6 @@ import dataclasses
 
 import pytest
 import torch
-import torch.nn.functional as F
 from steps import make_method
 from torch import Tensor, nn
 
@@ -16,7 +15,7 @@ from learn3d.data.conventions import KATO
 from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.data.poses import LookAtPoses, RotationPoses
 from learn3d.methods.prgan import PrGAN, PrGANSettings, statistics_loss
-from learn3d.networks.voxel_gan import SHAPE_CODE, TAU, DoublingConvolution
+from learn3d.networks.voxel_gan import SHAPE_CODE, TAU
 from learn3d.training import take_step
 
 VIEWS = 4
@@ -43,21 +42,6 @@ def changed(method: PrGAN, before: nn.ModuleDict) -> set[str]:
     now = dict(method.networks.named_parameters())
     changed = [name for name, p in before.named_parameters() if not torch.equal(p, now[name])]
     return {name.split(".")[0] for name in changed}
-
-
-@pytest.mark.parametrize("channels", [(1, 1), (5, 1), (3, 2)])
-def test_doubling_is_torchs_transposed_convolution(channels: tuple[int, int]) -> None:
-    torch.manual_seed(0)
-    layer = DoublingConvolution(*channels)
-    x = torch.randn(2, channels[0], 3, 3, 3).to(memory_format=torch.channels_last_3d)
-    x.requires_grad_()
-    grad = torch.randn(2, channels[1], 6, 6, 6)
-    torchs = F.conv_transpose3d(x, layer.weight, layer.bias, stride=2, padding=1)
-    results = [
-        [y, *torch.autograd.grad(y, (x, layer.weight, layer.bias), grad)]
-        for y in (layer(x), torchs)
-    ]
-    torch.testing.assert_close(*results)
 
 
 def test_every_view_is_drawn_from_an_equal_share_of_v() -> None:
