@@ -1,6 +1,7 @@
 """Loads and checks data sets by the name of their layout."""
 
 import contextlib
+import hashlib
 import importlib
 import shlex
 from collections.abc import Sequence
@@ -8,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
+
+import numpy as np
 
 from learn3d.data.conventions import (
     IMAGE_SIZE,
@@ -218,15 +221,24 @@ def check_folder(
         raise MissingFile(
             Path(folder), f"holds nothing of the layout {layout!r}; its files: docs/data-sets.md"
         )
-    return [
-        _check_split(layout, folder, category, split)
-        for category in categories or found
-        for split in splits or found.get(category) or found.get(synset_of(category)) or SPLITS
-    ]
+    reports = []
+    for category in categories or found:
+        seen: dict[bytes, tuple[str, str]] = {}
+        for split in splits or found.get(category) or found.get(synset_of(category)) or SPLITS:
+            reports.append(_check_split(layout, folder, category, split, seen))
+    return reports
 
 
-def _check_split(layout: Layout, folder: Path | str, category: str, split: str) -> SplitReport:
-    """Read all of a split, and collect what is wrong."""
+def _check_split(
+    layout: Layout,
+    folder: Path | str,
+    category: str,
+    split: str,
+    seen: dict[bytes, tuple[str, str]],
+) -> SplitReport:
+    """Read all of a split, and collect what is wrong. seen: what `_shared` has met in the splits
+    before.
+    """
     found: list[Exception] = []
     objects = 0
     try:
@@ -237,6 +249,8 @@ def _check_split(layout: Layout, folder: Path | str, category: str, split: str) 
         if dataset.poses is None:
             advice = f"learn3d estimate-poses --layout {layout} finds them from the masks"
             found.append(OddFile(Path(folder) / category, f"has no poses: {advice}"))
+        for message in _shared(dataset, seen):
+            found.append(OddFile(Path(folder) / category, message))
         if has_shards(folder, category, split):
             from learn3d.data import shards
 
@@ -254,3 +268,24 @@ def _check_split(layout: Layout, folder: Path | str, category: str, split: str) 
         for each in found
     ]
     return SplitReport(category, split, objects, tuple(dict.fromkeys(problems)))
+
+
+def _shared(dataset: ViewDataset, seen: dict[bytes, tuple[str, str]]) -> list[str]:
+    """A sentence for each earlier split that has the same voxels, or the same pictures if there
+    are no voxels. seen: split and object of each digest; those of the data set are added.
+    """
+    names, kind, parts = dataset.object_names, "voxels", dataset.voxels
+    if parts is None:
+        names = [dataset.object_names[number] for number in dataset.object_ids]
+        kind, parts = "pictures", dataset.images
+    shared: dict[str, list[str]] = {}
+    for number, name in enumerate(names):
+        part = np.ascontiguousarray(parts[number])
+        split, other = seen.setdefault(hashlib.sha1(part).digest(), (dataset.split, name))
+        if split != dataset.split and part.any():
+            shared.setdefault(split, []).append(f"{name} ({other} in {split})")
+    return [
+        f"{len(found)} of the {kind} of {dataset.split} are those of an object of {split}, such as "
+        f"{found[0]}; is an object in both splits?"
+        for split, found in shared.items()
+    ]

@@ -9,6 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from learn3d.files import limits, sandbox
+from learn3d.files.identity import measure
 from learn3d.files.reading import DamagedFile, faults_of, open_file, read_bytes, read_text
 
 EXTENSIONS = (".obj", ".off", ".ply", ".stl", ".glb", ".gltf")
@@ -33,6 +34,12 @@ def read_mesh(path: Path) -> RawMesh:
     """
     mesh = sandbox.read(_read, path, wanted="a mesh file")
     return RawMesh(mesh.vertices, mesh.faces.astype(np.int64))
+
+
+def measure_mesh(path: Path) -> np.ndarray:
+    """The measures of a mesh file by which equal geometries are found. Runs in the sandbox."""
+    mesh = _read(path)
+    return measure(mesh.vertices, mesh.faces)
 
 
 def _read(path: Path) -> RawMesh:

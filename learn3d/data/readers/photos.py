@@ -3,7 +3,7 @@
     mug/poses.csv      one row per photograph: file, azimuth_deg, elevation_deg, distance, fov_deg, and optionally
                        object, split
     mug/images/*.jpg   the photographs; PNG files with transparency need no mask
-    mug/masks/*.png    masks with a white object, named like the photographs
+    mug/masks/*.png    masks with a white object, named like the photographs, also in folders
 
 `docs/your-own-category.md` defines angles and distances with a drawing.
 """
@@ -12,7 +12,8 @@ import contextlib
 import csv
 import hashlib
 import math
-from collections.abc import Container, Iterator
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,7 +26,7 @@ from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.data.framing import Framed, read_framed
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.view_bins import view_classes
-from learn3d.files import limits
+from learn3d.files import identity, limits
 from learn3d.files.reading import (
     FAULTS,
     DamagedFile,
@@ -104,6 +105,7 @@ def load(
         )
     if unlisted := _unlisted(table, photos):
         on_fault(OddFile(table, unlisted))
+    _check_angles(table, photos, on_fault)
     pairs = list(_read_photos(chosen, image_size, category, on_fault))
     if not pairs:
         raise DamagedFile(table, f"no photograph for {split} is whole")
@@ -189,6 +191,22 @@ def _check_scales(table: Path, pairs: list[tuple[Photo, Framed]], on_fault: Faul
             on_fault(OddFile(photo.file, message))
 
 
+def _check_angles(table: Path, photos: list[Photo], on_fault: FaultHandler) -> None:
+    """Report azimuths that are all alike, and angles that are probably in radians."""
+    if len(photos) < 3 or photos[0].distance is None:
+        return
+    for name, turn in (("azimuth_deg", 2 * math.pi), ("elevation_deg", math.pi / 2)):
+        angles = [getattr(photo, name) for photo in photos]
+        found = (
+            f"{name} lies within {min(angles):.3g} .. {max(angles):.3g} in all {len(angles)} rows"
+        )
+        if max(map(abs, angles)) <= turn and min(angles) < max(angles):
+            on_fault(OddFile(table, f"{found}; is it in degrees, not in radians?"))
+    if len({photo.azimuth_deg % 360 for photo in photos}) == 1:
+        same = f"all {len(photos)} rows have the azimuth {photos[0].azimuth_deg:g}"
+        on_fault(OddFile(table, f"{same}; the back of the objects is not seen"))
+
+
 def read_photo_table(table: Path, on_fault: FaultHandler) -> list[Photo]:
     """The valid rows of a table; faults of the others are reported.
 
@@ -197,11 +215,9 @@ def read_photo_table(table: Path, on_fault: FaultHandler) -> list[Photo]:
     Raises MissingFile, and DamagedFile if the file is not a table of photographs.
     """
     if not table.exists() and (table.parent / "images").is_dir():
-        names = sorted(
-            path.name
-            for path in (table.parent / "images").iterdir()
-            if not path.name.startswith(".")
-        )
+        names, left_out = identity.find_files(table.parent / "images")
+        for line in identity.describe(left_out):
+            on_fault(OddFile(table.parent / "images", line))
         if not names:
             raise DamagedFile(
                 table.parent / "images", f"is empty; expected photographs, and {_WANTED} in {TABLE}"
@@ -221,22 +237,56 @@ def read_photo_table(table: Path, on_fault: FaultHandler) -> list[Photo]:
         or not set(names) <= {"file", *NUMBERS, *OPTIONAL}
     ):
         raise DamagedFile(table, f"has the columns {', '.join(names)[:200]}; expected {_WANTED}")
-    masks = {path.stem: path for path in sorted((table.parent / "masks").glob("*"))}
+    masks = _find_masks(table.parent / "masks", on_fault)
     photos: dict[Path, Photo] = {}
     with faults_of(table, _WANTED):  # csv.Error
-        for row in reader:
-            if photo := attempt(on_fault, _photo, table, reader.line_num, row, masks, photos):
+        rows = [(reader.line_num, row) for row in reader]
+        shared = Counter(identity.object_name(_image_name(row)) for _, row in rows)
+        for line, row in rows:
+            if photo := attempt(on_fault, _photo, table, line, row, masks, photos, shared):
                 photos[photo.file] = photo
+    if "object" not in names:
+        _check_names(table, [_image_name(row) for _, row in rows], shared, on_fault)
     return list(photos.values())
+
+
+def _image_name(row: Mapping[str | None, Any]) -> str:
+    """The name in `images` of a row of the table."""
+    return (row["file"] or "").strip().replace("\\", "/").removeprefix("images/")
+
+
+def _find_masks(folder: Path, on_fault: FaultHandler) -> dict[str, Path]:
+    """The mask of each photograph, by its name without ending; of several formats the PNG file."""
+    if not folder.is_dir():
+        return {}
+    paths, left_out = identity.find_files(folder)
+    kept, others = identity.one_format(sorted(paths, key=lambda name: not name.endswith(".png")))
+    for line in identity.describe(left_out | others):
+        on_fault(OddFile(folder, line))
+    return {identity.object_name(name): paths[name] for name in kept}
+
+
+def _check_names(
+    table: Path, names: Sequence[str], shared: Mapping[str, int], on_fault: FaultHandler
+) -> None:
+    """Report names by which photographs of one object may count as several objects."""
+    alike = [name for name in names if shared[identity.object_name(name)] > 1]
+    if alike:
+        found = f"{len(alike)} files share a name but for its ending, such as {alike[0]}"
+        on_fault(OddFile(table, f"{found}; each is an object of its own"))
+    if any("/" in name for name in names):
+        advice = "if a folder has photographs of one object, add a column object"
+        on_fault(OddFile(table, f"each photograph in a folder is an object of its own; {advice}"))
 
 
 def _unlisted(table: Path, photos: list[Photo]) -> str | None:
     """A sentence about images without a row in the table; None if there are none."""
     listed = {photo.file for photo in photos}
-    files = sorted(path for path in (table.parent / "images").glob("[!.]*") if path not in listed)
+    found, _ = identity.find_files(table.parent / "images")
+    files = [name for name, path in found.items() if path not in listed]
     if not files:
         return None
-    return f"images without a row, which are not used: {len(files)}, the first is {files[0].name}"
+    return f"images without a row, which are not used: {len(files)}, the first is {files[0]}"
 
 
 def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
@@ -268,7 +318,12 @@ def split_objects(table: Path, photos: list[Photo]) -> dict[str, str]:
 
 
 def _photo(
-    table: Path, line: int, row: dict[str, Any], masks: dict[str, Path], others: Container[Path]
+    table: Path,
+    line: int,
+    row: dict[str, Any],
+    masks: dict[str, Path],
+    others: Container[Path],
+    shared: Mapping[str, int],
 ) -> Photo:
     """Check one row of the table."""
     try:
@@ -276,17 +331,18 @@ def _photo(
         if None in row or None in row.values():
             raise ValueError("it has more or fewer values than there are columns")
         values = {name: value.strip() for name, value in row.items()}
-        name = Path(values["file"].removeprefix("images/"))
+        name = Path(_image_name(row))
         if not name.name or name.is_absolute() or ".." in name.parts or "\0" in str(name):
             raise ValueError(f"it must name a file in images/, got {values['file']!r:.80}")
         file = table.parent / "images" / name
         if file in others:
             raise ValueError(f"{file.name} is in two lines")
+        own = identity.object_name(name.as_posix())
         return Photo(
             line=line,
             file=file,
-            mask=masks.get(file.stem),
-            object=values.get("object") or file.stem,
+            mask=masks.get(own),
+            object=values.get("object") or (name.as_posix() if shared[own] > 1 else own),
             split=values.get("split") or None,
             **{name: values[name] for name in NUMBERS if name in values},
         )

@@ -10,16 +10,18 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
+from tqdm import tqdm
 from trimesh import Trimesh
 
 from learn3d.data import conventions
 from learn3d.data.conventions import SPLITS, synset_of
-from learn3d.files import npz
-from learn3d.files.formats import EXTENSIONS, RawMesh, read_mesh
+from learn3d.files import identity, npz, sandbox
+from learn3d.files.formats import EXTENSIONS, RawMesh, measure_mesh, read_mesh
 from learn3d.settings import Count, FilePath, Weight, checked
 from learn3d.studio.make_data.writers import WRITERS, WrittenLayout
 from learn3d.studio.shapes import CATEGORIES, numbered_shape
 from learn3d.tasks import ONE_WORKER, Workers
+from learn3d.terminal import is_watched
 
 MAX_FACES = 1_000_000
 _PACK = "an npz file with v0, f0, v1, f1, ... and no pickled objects"
@@ -131,8 +133,9 @@ class Item:
     copies: int  # objects that are made of it
 
 
-def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
-    """The meshes of each of the splits train, val and test.
+def split_items(config: DatasetConfig) -> tuple[dict[str, list[Item]], dict[str, str]]:
+    """The meshes of each of the splits train, val and test, and the files that are left out, with
+    the reason.
 
     Raises ValueError if there are none to train on.
     """
@@ -140,7 +143,7 @@ def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
         raise ValueError(
             f"the procedural generator makes {', '.join(CATEGORIES)}; got category {config.category!r}"
         )
-    sources = mesh_sources(config.source) if config.source else {}
+    sources, left_out = find_meshes(config.source) if config.source else ({}, {})
     augmented = len(sources) or config.procedural
     for i in range(config.procedural):
         sources[f"{config.category}_{i:05d}"] = partial(
@@ -153,7 +156,32 @@ def split_items(config: DatasetConfig) -> dict[str, list[Item]]:
         copies = 1 + config.augment if split == "train" and number < augmented else 1
         return Item(number, names[number], split, files[number], sources[files[number]], copies)
 
-    return {split: [item(number, split) for number in numbers[split].tolist()] for split in SPLITS}
+    items = {s: [item(number, s) for number in numbers[s].tolist()] for s in SPLITS}
+    return items, left_out
+
+
+def find_meshes(source: Path) -> tuple[dict[str, Callable[[], RawMesh]], dict[str, str]]:
+    """A reading function for each object of a folder (by relative path, sorted) or pack, see
+    `mesh_sources`, and the files that are left out: name -> reason.
+
+    A folder has each object once (`files.identity`): of several formats the first of `EXTENSIONS`
+    that can be read counts, of equal geometries the first name. A pack is used as it is.
+    """
+    sources, left_out = _sources(source)
+    if source.is_dir():
+        calls = ([sandbox.Call(measure_mesh, source / name)] for name in sources)
+        read = sandbox.read_all(calls)
+        bar = tqdm(read, "compare", len(sources), disable=not is_watched(), unit="mesh")
+        measures = {n: m for n, (m,) in zip(sources, bar, strict=True) if isinstance(m, np.ndarray)}
+        names, others = identity.one_format(
+            sorted(
+                sources, key=lambda n: (n not in measures, EXTENSIONS.index(Path(n).suffix.lower()))
+            )
+        )
+        equal = identity.find_equal({name: measures[name] for name in names if name in measures})
+        left_out |= others | dict.fromkeys(equal, "meshes with the geometry of another one")
+        sources = {name: sources[name] for name in names if name not in equal}
+    return sources, left_out
 
 
 def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
@@ -162,20 +190,22 @@ def mesh_sources(source: Path) -> dict[str, Callable[[], RawMesh]]:
     A pack is an npz file with v0 float [V, 3], f0 int [F, 3], v1, f1, ... Raises ValueError if
     there is no mesh.
     """
+    return _sources(source)[0]
+
+
+def _sources(source: Path) -> tuple[dict[str, Callable[[], RawMesh]], dict[str, str]]:
+    left_out: dict[str, str] = {}
     if source.suffix == ".npz" and source.is_file():
         count = sum(name[:1] == "v" and name[1:].isdigit() for name in npz.names(source, _PACK))
         found = {f"{i:0{len(str(count - 1))}d}": partial(_packed, source, i) for i in range(count)}
     else:
-        paths = {
-            p.relative_to(source).as_posix(): p
-            for p in source.rglob("*")
-            if p.suffix.lower() in EXTENSIONS
-        }
-        found = {name: partial(read_mesh, paths[name]) for name in sorted(paths)}
+        paths, left_out = identity.find_files(source, EXTENSIONS)
+        found = {name: partial(read_mesh, path) for name, path in paths.items()}
     if not found:
         wrong = f"there is no mesh in {source}" if source.exists() else f"{source} does not exist"
+        wrong = "; ".join([wrong, *identity.describe(left_out)])
         raise ValueError(f"{wrong}; give {_PACK}, or a folder of {', '.join(EXTENSIONS)}")
-    return found
+    return found, left_out
 
 
 def _packed(path: Path, number: int) -> RawMesh:

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from learn3d.data.conventions import SPLITS, mesh_to_object, synset_of, view_poses
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.files.formats import RawMesh
+from learn3d.files.identity import describe
 from learn3d.files.reading import MissingFile, read_json
 from learn3d.files.writing import publishing, write_json
 from learn3d.pictures import KEY_LIGHT, photograph, studio_lights
@@ -34,9 +35,14 @@ LIST = ".report.json"  # suffix of the list of a shard's meshes
 class DatasetReport:
     """The outcome of `make_dataset`. Raises ValueError if no mesh is left for training."""
 
-    def __init__(self, config: DatasetConfig, meshes: Sequence[dict]) -> None:
-        """meshes: each with name, split, and either objects (names, also of copies) or reason."""
-        self.config, self.skipped = config, [mesh for mesh in meshes if "reason" in mesh]
+    def __init__(
+        self, config: DatasetConfig, meshes: Sequence[dict], left_out: Mapping[str, str]
+    ) -> None:
+        """meshes: each with name, split, and either objects (names, also of copies) or reason.
+        left_out: files that were not split, with the reason.
+        """
+        self.config, self.left_out = config, left_out
+        self.skipped = [mesh for mesh in meshes if "reason" in mesh]
         self.used = [mesh for mesh in meshes if "objects" in mesh]
         names = {
             split: [n for m in self.used if m["split"] == split for n in m["objects"]]
@@ -58,6 +64,7 @@ class DatasetReport:
         lines.append(
             "objects: " + ", ".join(f"{split} {count}" for split, count in self.counts.items())
         )
+        lines += describe(self.left_out)
         lines += [
             f"skipped {mesh['name']} ({mesh['split']}): {mesh['reason']}"
             for mesh in self.skipped[:MAX_LISTED]
@@ -74,9 +81,8 @@ class DatasetReport:
             for split in self.counts
         }
         card, sheet = (folder / name for name in report_files(self.config.category))
-        write_json(
-            card, {"settings": self.config.to_dict(), "splits": splits, "skipped": self.skipped}
-        )
+        about = {"settings": self.config.to_dict(), "splits": splits, "skipped": self.skipped}
+        write_json(card, about | {"left_out": self.left_out})
         write_png(sheet, draw_sheet(rows, self.config.views))
 
 
@@ -95,7 +101,8 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
     Raises ValueError (no usable mesh), FileExistsError (the folder has files of the category and
     `overwrite` is False).
     """
-    items = [item for of_split in split_items(config).values() for item in of_split]
+    splits, left_out = split_items(config)
+    items = [item for of_split in splits.values() for item in of_split]
     writer = WRITERS[config.layout]
     paths = [*writer.paths(config.category), *report_files(config.category)]
     there = [path for path in paths if (config.output / path).exists()]
@@ -111,7 +118,7 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
     )
     with publishing(config.output, [*paths, *writer.shared]) as folder:
         writer.write(render_meshes(config, bar, made, rows), config.category, folder, config.output)
-        report = DatasetReport(config, made)
+        report = DatasetReport(config, made, left_out)
         report.write(folder, rows)
     return report
 
@@ -194,7 +201,8 @@ def make_shards(config: DatasetConfig) -> int:
     failed (the next call tries it again), 130 after a signal. Raises ValueError (no usable mesh,
     shards of other settings in the folder) and OSError.
     """
-    folder, splits = config.output / synset_of(config.category), split_items(config)
+    folder = config.output / synset_of(config.category)
+    splits, left_out = split_items(config)
     _check_settings(config, folder, splits)
     threads, tasks = config.workers.threads, {}
     for split, items in splits.items():
@@ -214,7 +222,7 @@ def make_shards(config: DatasetConfig) -> int:
     lists = [
         read_json(path.with_suffix(LIST), 2**28, "the list of a shard's meshes") for path in tasks
     ]
-    report = DatasetReport(config, [mesh for found in lists for mesh in found])
+    report = DatasetReport(config, [mesh for found in lists for mesh in found], left_out)
     rows = {split: [] for split in report.counts}
     for split in rows:
         count = sum(path.parent.name == split for path in tasks)

@@ -301,7 +301,7 @@ def test_meshes_without_faces_and_broken_files_are_skipped_and_listed(tmp_path: 
         "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no view shows"),
         "index.off": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", ""),
         "text.obj": ("this is no mesh\n", ""),
-        "cut.glb": (b"glTF\x02", ""),
+        "short.glb": (b"glTF\x02", ""),
         "cut.ply": (box[:120], ""),
         "huge.ply": (box.replace(b"vertex 8", b"vertex 9999999999"), ""),
     }
