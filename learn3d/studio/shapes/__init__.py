@@ -5,12 +5,14 @@ sofa) towards +z. Shapes are symmetric about x = 0, except L-shaped sofas, desks
 unit, and the like.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import trimesh
 
 from . import airplane, car, chair, lamp, sofa, table
 from .draw import Draw
-from .parts import assemble
+from .parts import Part, assemble
 
 # The recipes of each category, with the weights of a random choice.
 _RECIPES = {
@@ -32,10 +34,14 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
     >>> make_shape("chair", np.random.default_rng(7)).is_watertight
     True
     """
+    draw = Draw(rng.bit_generator)
+    return assemble(_pick_recipe(category, draw)(draw))
+
+
+def _pick_recipe(category: str, draw: Draw) -> Callable[[Draw], Part]:
     if category not in _RECIPES:
         raise ValueError(f"category must be one of {', '.join(CATEGORIES)}; got {category!r}")
-    draw = Draw(rng.bit_generator)
-    return assemble(draw.pick(_RECIPES[category])(draw))
+    return draw.pick(_RECIPES[category])
 
 
 def numbered_shape(category: str, seed: int, number: int) -> trimesh.Trimesh:
@@ -44,4 +50,13 @@ def numbered_shape(category: str, seed: int, number: int) -> trimesh.Trimesh:
     Exported models know shapes by their numbers (`picture_to_mesh.templates`): after a change of
     recipes, train and export the package's model again.
     """
-    return make_shape(category, np.random.default_rng([seed, 0, number]))
+    return make_shape(category, _rng(seed, number))
+
+
+def numbered_recipe(category: str, seed: int, number: int) -> Callable[[Draw], Part]:
+    """The recipe of a `numbered_shape`, a key of the category's `KINDS`."""
+    return _pick_recipe(category, Draw(_rng(seed, number).bit_generator))
+
+
+def _rng(seed: int, number: int) -> np.random.Generator:
+    return np.random.default_rng([seed, 0, number])

@@ -11,7 +11,6 @@ from .parts import Part, bar, box, ellipsoid, join, loft, revolve, strip, wing
 _STATIONS = {
     "straight": [],
     "kinked": [0.55, 0.95],
-    "gull": [0.09, 0.18, 0.26, 0.35, 0.97],
     "elliptic": np.sin(np.linspace(0, np.pi / 2, 8)).round(4).tolist(),
 }
 
@@ -29,7 +28,7 @@ class Planform:
     y: float  # height of the wing in the middle
     # share of the half span at which the trailing edge bends; 0 for a straight one
     kink: float = 0.0
-    # "straight", "elliptic", "kinked" (constant chord, then tapered) or "gull"
+    # "straight", "elliptic" or "kinked" (constant chord, then tapered)
     shape: str = "straight"
     thickness: float = 0.12  # thickness over chord
 
@@ -49,9 +48,6 @@ class Planform:
             z = z - 0.3 * (self.root - chord)
         elif self.shape == "kinked":
             chord = np.interp(share, [0, 0.55, 1], [self.root, self.root, self.tip])
-        elif self.shape == "gull":
-            bend = np.sin(min(share, 0.35) / 0.35 * np.pi)
-            y = self.y + self.half * (-0.05 * bend + 0.12 * max(share - 0.35, 0))
         return x, y, z, chord
 
     def wing(self) -> Part:
@@ -642,53 +638,6 @@ def glider(draw: Draw, *, radius) -> Part:
     return plane + (plan.winglets(draw) if draw.maybe(0.4) else Part())
 
 
-@recipe(radius=(0.058, 0.08), twin=0.35, radial=0.4, tall=(1.1, 1.3))
-def warbird(draw: Draw, *, radius, twin, radial, tall) -> Part:
-    """A propeller fighter or a twin-engined bomber of the 1940s."""
-    nose = 0.07 if radial and not twin else draw(0.12, 0.25)
-    nose_power = 3.0 if radial else 2.0
-    plane = fuselage(
-        radius,
-        tall=tall,
-        nose=nose,
-        nose_power=nose_power,
-        tail_start=draw(0.4, 0.5),
-        tail_radius=0.15,
-        upsweep=0.35,
-    )
-    size = draw.measures(
-        half=(0.5, 0.66),
-        root=(0.19, 0.25),
-        tip=(0.07, 0.12),
-        sweep_deg=(2, 9),
-        dihedral_deg=(3, 7),
-        z=(0.14, 0.2),
-        y=(-0.8, 0.2),
-        shape=["elliptic", "straight", "gull"],
-    )
-    size["y"] *= radius
-    plan = Planform(**size)
-    plane += plan.wing()
-    plane += canopy(
-        width=0.95 * radius,
-        height=1.2 * radius,
-        length=draw(0.16, 0.34),
-        y=1.05 * radius,
-        z=draw(-0.02, 0.1),
-    )
-    disc = draw(0.12, 0.16)
-    if twin:
-        x, y, z, chord = plan.at(0.32)
-        body = pod(0.04, chord + 0.15).moved(x, y, z - 0.5 * chord)
-        plane += (body + propeller(draw, disc, 3, hub=0.022).moved(x, y, z + 0.075)).both_sides()
-    else:
-        plane += propeller(draw, disc, draw.count(2, 4), hub=0.032).moved(z=0.495)
-    plane += tail(draw, "twin" if twin and draw.maybe(0.5) else "conventional", radius)
-    if draw.maybe(0.3):
-        plane += gear(0.8 * radius, radius + 0.1, main_x=0.16, main_z=0.2, other_z=-0.46)
-    return plane
-
-
 @recipe(radius=(0.06, 0.075), exponent=(2, 5), gap=(0.16, 0.22), stagger=(-0.03, 0.1), triplane=0.2)
 def biplane(draw: Draw, *, radius, exponent, gap, stagger, triplane) -> Part:
     """A biplane, or rarely a triplane, with struts and fixed gear."""
@@ -741,7 +690,6 @@ KINDS = {
     turboprop: 2.0,
     light_plane: 3.0,
     glider: 1.0,
-    fighter: 3.0,
-    warbird: 1.5,
+    fighter: 4.5,
     biplane: 0.8,
 }

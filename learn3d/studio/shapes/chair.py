@@ -1,4 +1,4 @@
-"""Procedural chairs, in metres: jointed chairs, moulded shells, barrel chairs, stools, benches."""
+"""Procedural chairs, in metres: jointed chairs, moulded shells, stools."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from .draw import (
     shares,
     spread,
 )
-from .parts import Part, X, bar, between, board, crossbar, join, post, sheet, slab, strip, tube
+from .parts import Part, X, bar, between, board, join, post, sheet, slab, strip, tube
 from .sofa import upholstered
 from .supports import cantilever, cross, disc, legs, loops, panels, rocker, star
 
@@ -25,6 +25,7 @@ from .supports import cantilever, cross, disc, legs, loops, panels, rocker, star
 class Family(NamedTuple):
     """Chairs for one use: what they do not share with `_MEASURES`."""
 
+    name: str
     measures: dict[str, Any]
     supports: dict[Any, float]
     padded: float  # probability of a padded back
@@ -75,10 +76,10 @@ _LOUNGE_SUPPORTS = {
     panels: 0.7,
     cross: 0.7,
 }
-DINING = Family({"throne": Perhaps(0.15, (0.65, 0.85))}, _DINING_SUPPORTS, 0.12, 0.3)
-LOUNGE = Family(_LOUNGE, _LOUNGE_SUPPORTS, 0.5, 0.6)
-OFFICE = Family(_OFFICE, {}, 0.8, 0.6)
-BAR = Family(_BAR, _STOOLS, 0.12, 0.1)
+DINING = Family("dining", {"throne": Perhaps(0.15, (0.65, 0.85))}, _DINING_SUPPORTS, 0.12, 0.3)
+LOUNGE = Family("lounge", _LOUNGE, _LOUNGE_SUPPORTS, 0.5, 0.6)
+OFFICE = Family("office", _OFFICE, {}, 0.8, 0.6)
+BAR = Family("bar", _BAR, _STOOLS, 0.12, 0.1)
 
 # Weights of the backs of chairs without padding.
 _BACKS = {
@@ -410,59 +411,6 @@ def shell_chair(
 
 
 @recipe(
-    radius=(0.26, 0.38),
-    height=(0.36, 0.47),
-    rise=(0.22, 0.5),
-    fall=(0.0, 0.8),
-    reach_deg=(80, 150),
-    thickness=[0.025, 0.04, 0.09],
-    thicker=(0.9, 1.2),
-    gap=Perhaps(0.4, (0.1, 0.22), None),
-    slant=(0.0, 0.12),
-    cushion=(0.06, 0.14),
-    exponent=[2.0, 2.0, 3.0],
-)
-def barrel_chair(
-    draw: Draw,
-    *,
-    radius,
-    height,
-    rise,
-    fall,
-    reach_deg,
-    thickness,
-    thicker,
-    gap,
-    slant,
-    cushion,
-    exponent,
-) -> Part:
-    """A round seat with a back that wraps around it, perhaps with a gap over the seat."""
-    reach = np.radians(reach_deg)
-    angle = np.linspace(-reach, reach, 25)
-    thickness *= thicker
-    top = rise * (1 - fall * (1 - np.cos(angle)) / (1 - np.cos(reach)))
-    bottom = -0.06 if gap is None else np.minimum(gap, 0.5 * top)
-    y = bottom + shares(4)[:, None] * (top - bottom)
-    r = radius - 0.3 * thickness + slant * np.maximum(y, 0.0)
-    part = sheet(points(r * np.sin(angle), y, -r * np.cos(angle)), thickness).moved(y=height)
-    under = height - cushion
-    part += slab(ellipse(2 * radius, 2 * radius, 28, exponent), cushion, y=under)
-    if gap is not None:
-        for a in np.linspace(-0.92 * reach, 0.92 * reach, draw.count(4, 11)):
-            x = radius * np.sin(a)
-            z = -radius * np.cos(a)
-            end = height + np.interp(a, angle, bottom) + 0.02
-            part += bar(
-                (0.93 * x, height - 0.5 * cushion, 0.93 * z), (0.99 * x, end, 0.99 * z), 0.022
-            )
-    if draw.maybe(0.2):  # a solid drum down to the floor
-        return part + slab(ellipse(1.9 * radius, 1.9 * radius, 28), under + 0.02, 0.02)
-    support = draw.pick({legs: 3, disc: 1, star: 0.7, loops: 0.7})
-    return part + support(draw, 0.66 * radius, 0.66 * radius, under)
-
-
-@recipe(
     width=(0.3, 0.45),
     height=(0.35, 0.78),
     thickness=(0.02, 0.12),
@@ -477,43 +425,12 @@ def stool(draw: Draw, *, width, height, thickness, ratio, exponent, support) -> 
     return seat + support(draw, 0.38 * width, 0.38 * depth, height - thickness + 0.005)
 
 
-@recipe(
-    width=(1.0, 1.7),
-    depth=(0.35, 0.5),
-    height=(0.4, 0.47),
-    boards=range(1, 7),
-    thick=(0.02, 0.06),
-    gap=(0.005, 0.03),
-    support={legs: 3, panels: 2, loops: 1},
-)
-def bench(draw: Draw, *, width, depth, height, boards, thick, gap, support) -> Part:
-    """A long seat of boards, half of them with a back of boards."""
-    step = depth / boards
-    part = support(draw, 0.44 * width, 0.38 * depth, height - 0.02)
-    part += board(0.46 * width, (height - 0.04, height), (-depth / 2, depth / 2))
-    for z in np.arange(boards) * step - depth / 2:
-        part += board(width / 2, (height - 0.01, height + thick), (z + gap, z + step - gap))
-    if draw.maybe(0.5):
-        lean = draw(0.05, 0.2)
-        top = draw(0.3, 0.45)
-        rear = 0.02 - depth / 2
-        for x in (-0.4 * width, 0.4 * width):
-            part += bar((x, height - 0.02, rear), (x, height + top, rear - lean), 0.05)
-        for t in np.linspace(0.35, 0.95, draw.count(1, 3)):
-            part += crossbar(
-                (-width / 2, height + t * top, rear - t * lean), 0.03, draw(0.06, 0.12)
-            )
-    return part
-
-
 KINDS = {
     partial(jointed_chair, family=DINING): 5,
     partial(jointed_chair, family=OFFICE): 1.5,
     shell_chair: 2,
     partial(upholstered, seats=1): 1.5,
     partial(jointed_chair, family=LOUNGE): 1.5,
-    partial(jointed_chair, family=BAR): 1,
-    barrel_chair: 1,
-    stool: 1.2,
-    bench: 0.7,
+    partial(jointed_chair, family=BAR): 2,
+    stool: 1.9,
 }

@@ -1,4 +1,4 @@
-"""Procedural sofas, in metres: upholstered blocks, corner sofas, framed settees, curved sofas."""
+"""Procedural sofas, in metres: upholstered blocks, corner sofas, framed settees."""
 
 from itertools import pairwise
 
@@ -146,36 +146,4 @@ def settee(draw: Draw, *, seats, half, depth, size, seat, high, rest, sink, supp
     return sofa
 
 
-@recipe(
-    half=(0.7, 1.25),
-    depth=(0.75, 0.95),
-    seat=(0.36, 0.44),
-    foot=(0.04, 0.14),
-    high=(0.66, 0.85),
-    thick=(0.1, 0.2),
-    turn_deg=(75, 92),
-    power=(0.5, 0.8),
-    fall=(0, 0.25),
-    bulge=(-0.1, 0.1),
-)
-def curved_sofa(
-    draw: Draw, *, half, depth, seat, foot, high, thick, turn_deg, power, fall, bulge
-) -> Part:
-    """A sofa on an arc, or a tub sofa: the back continues into the arms."""
-    turn = np.radians(turn_deg)
-    angle = np.linspace(-turn, turn, 31)
-    # 0 in the middle of the back, 1 at the ends of the arms
-    forward = (1 - np.cos(angle)) / (1 - np.cos(turn))
-    sine = np.sin(angle) / np.sin(turn)
-    x = (half - thick / 2) * np.sign(sine) * np.abs(sine) ** power  # flatter than a circle's arc
-    z = -depth / 2 + thick / 2 + (depth - thick) * forward
-    y = foot + shares(4)[:, None] * (high - fall * forward - foot)
-    wrap = sheet(points(x, y, z), thick)
-    edge = np.linspace(x[0], x[-1], 9)[1:-1]
-    front = np.c_[edge, z[0] + bulge * (1 - (edge / x[0]) ** 2)]
-    outline = np.r_[front, np.c_[x, z][::-1]][::-1]
-    cushion = slab(outline, seat - foot, 0.04, foot)
-    return wrap + cushion + feet(draw, 0.6 * half, 0.22 * depth, foot + 0.02)
-
-
-KINDS = {upholstered: 4.0, corner_sofa: 1.5, settee: 1.6, curved_sofa: 1.2}
+KINDS = {upholstered: 4.0, corner_sofa: 1.5, settee: 2.8}
