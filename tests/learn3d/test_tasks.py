@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -125,3 +126,57 @@ run_tasks([Task("a", stub_steps.steps, (folder, "a", 0.3), folder / "a.log")], O
         wait_for(lambda: begun(tmp_path, "a"), "the task")
         parent.kill()
     wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
+
+
+@pytest.mark.parametrize(
+    ("libc", "kernel", "before", "after"),
+    [
+        ("glibc", "always [madvise] never\n", None, "glibc.malloc.hugetlb=1"),
+        ("glibc", "always [madvise] never\n", "a.b=1", "a.b=1:glibc.malloc.hugetlb=1"),
+        ("glibc", "always [madvise] never\n", "glibc.malloc.hugetlb=0", "glibc.malloc.hugetlb=0"),
+        ("glibc", "[always] madvise never\n", None, None),
+        ("glibc", None, None, None),
+        ("", "always [madvise] never\n", None, None),
+    ],
+)
+def test_huge_pages_are_asked_for_where_that_helps(
+    libc, kernel, before, after, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(tasks.platform, "libc_ver", lambda: (libc, "2.36"))
+    monkeypatch.setattr(tasks, "HUGE_PAGES", tmp_path / "enabled")
+    if kernel is not None:
+        (tmp_path / "enabled").write_text(kernel)
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "65536")
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    if before is not None:
+        monkeypatch.setenv("GLIBC_TUNABLES", before)
+    environment = tasks.process_environment()
+    assert environment.get("GLIBC_TUNABLES") == after
+    assert "MALLOC_TRIM_THRESHOLD_" not in environment
+    monkeypatch.setattr(tasks.os, "environ", environment)
+    assert tasks.process_environment() == environment, "a second time changes nothing"
+
+
+def test_the_source_script_starts_again_with_that_environment(monkeypatch) -> None:
+    """Once: the second process has the environment, and trains."""
+    script = Path(__file__).parents[2] / "tools" / "train.py"
+    wanted = dict(os.environ) | {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
+    monkeypatch.setattr(tasks, "process_environment", lambda: wanted)
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-u", str(script), "--help"])
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
+
+    class Started(Exception):
+        pass
+
+    def execve(*given: object) -> None:
+        raise Started(given)
+
+    monkeypatch.setattr(os, "execve", execve)
+    with pytest.raises(Started) as started:
+        runpy.run_path(str(script), run_name="__main__")
+    command = [sys.executable, "-u", str(script), "--help"]
+    assert started.value.args[0] == (sys.executable, command, wanted)
+    monkeypatch.setattr(tasks, "process_environment", lambda: dict(os.environ))
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(script), run_name="__main__")
+    assert ended.value.code == 0
