@@ -3,15 +3,19 @@
 python docs/draw_curves.py --output results-curves.png kato-5000 ablation-5000=fp32
 
 The name of a file may be followed by a word for its data. Files with the same word are drawn together, and the longer
-curve of a run counts. Several seeds are drawn as their mean, in the band from the lowest to the highest.
+curve of a run counts. Several seeds are drawn as their mean, in the band from the lowest to the highest. If a file has
+the IoU of the mean shape (of the test objects), it is a dashed line. A third row has the IoU of silhouettes by the
+angle from the input's view, if a file has it.
 """
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).parent / "results"
@@ -23,49 +27,90 @@ METHODS = {
     "proposed": ("Proposed", "#00798c"),
     "plus": ("Plus", "#7a7a7a"),
 }
-# by panel, method and seed; rows of step, IoU and MMD
+Tables = dict[str, list[list[str]]]
+# rows of numbers by panel, method and seed
 Curves = dict[str, dict[str, dict[str, np.ndarray]]]
 
 
-def read_curves(files: list[str]) -> Curves:
-    """The curves of the methods of the figure."""
-    curves: Curves = {}
+def _read(files: list[str]) -> Iterator[tuple[str, Tables]]:
+    """The word for the data of each file, and its tables."""
     for file in files:
         name, _, kind = file.partition("=")
-        tables = json.loads((RESULTS / f"{name}.json").read_text())
+        yield kind, json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def _add_runs(curves: Curves, kind: str, points: dict[str, list[list[float]]]) -> None:
+    """Add runs <category>/<method>-seed<k>; the longer curve of a run counts."""
+    for run, rows in points.items():
+        category, _, method_seed = run.partition("/")
+        method, _, seed = method_seed.rpartition("-seed")
+        seeds = curves.setdefault(f"{kind} {category}".strip(), {}).setdefault(method, {})
+        if len(rows) > len(seeds.get(seed, ())):
+            seeds[seed] = np.array(rows)
+
+
+def read_curves(files: list[str]) -> Curves:
+    """The validations of the methods of the figure: rows of step, IoU and MMD."""
+    curves: Curves = {}
+    for kind, tables in _read(files):
         images = {run: int(batch) for run, _, _, batch, *_ in tables["runs"][1:]}
         points: dict[str, list[list[float]]] = {}
         for run, _, step, *values in tables["curves"][1:]:
             numbers = [np.nan if value == "-" else float(value) for value in values]
             points.setdefault(run, []).append([int(step) * images[run] / STEP_IMAGES, *numbers])
-        for run, rows in points.items():
-            category, _, method_seed = run.partition("/")
-            method, _, seed = method_seed.rpartition("-seed")
-            seeds = curves.setdefault(f"{kind} {category}".strip(), {}).setdefault(method, {})
-            if len(rows) > len(seeds.get(seed, ())):
-                seeds[seed] = np.array(rows)
+        _add_runs(curves, kind, points)
     return curves
 
 
-def draw(curves: Curves) -> Figure:
-    """IoU above, MMD below."""
-    figure = Figure(figsize=(max(2.6 * len(curves) + 0.4, 4.8), 4.6), layout="constrained")
-    axes = figure.subplots(2, len(curves), sharex="col", squeeze=False)
+def read_angles(files: list[str]) -> Curves:
+    """The IoU of silhouettes of the last networks: rows of angle and IoU."""
+    curves: Curves = {}
+    for kind, tables in _read(files):
+        (_, *angles), *runs = tables.get("angles", [[""]])
+        _add_runs(
+            curves,
+            kind,
+            {
+                run: [[int(a), float(v)] for a, v in zip(angles, row, strict=True) if v != "-"]
+                for run, *row in runs
+            },
+        )
+    return curves
+
+
+def read_mean_shapes(files: list[str]) -> dict[str, float]:
+    """The voxel IoU of the mean shape by panel."""
+    found = {}
+    for kind, tables in _read(files):
+        (_, _, *categories), *rows = tables.get("main", [["", ""]])
+        for label, _, *values in rows:
+            if label == "Mean shape":
+                for category, value in zip(categories, values, strict=True):
+                    found[f"{kind} {category}".strip()] = float(value.split()[0])
+    return found
+
+
+def draw(curves: Curves, mean_shapes: dict[str, float], angles: Curves) -> Figure:
+    """IoU above, MMD below it, then the IoU of silhouettes if there are angles."""
+    count = 2 + bool(angles)
+    size = (max(2.6 * len(curves) + 0.4, 4.8), 2.2 * count + 0.2)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(count, len(curves), sharex="row" if angles else "col", squeeze=False)
     for column, (title, methods) in enumerate(curves.items()):
         axes[0, column].set_title(title)
         axes[1, column].set_xlabel(f"steps of {STEP_IMAGES} images")
-        for method in [name for name in METHODS if name in methods]:
-            label, color = METHODS[method]
-            seeds = list(methods[method].values())
-            shared = np.stack([rows[: min(map(len, seeds))] for rows in seeds])
-            for row in (0, 1):
-                steps, values = shared[0, :, 0], shared[:, :, 1 + row]
-                axes[row, column].plot(steps, values.mean(0), color=color, label=label)
-                axes[row, column].fill_between(
-                    steps, values.min(0), values.max(0), color=color, alpha=0.2, lw=0
-                )
+        for row in range(2):
+            _draw_methods(axes[row, column], methods, 1 + row)
+        if title in mean_shapes:
+            style = {"color": "black", "ls": "--", "lw": 1, "label": "mean shape"}
+            axes[0, column].axhline(mean_shapes[title], **style)
+        if angles:
+            _draw_methods(axes[2, column], angles.get(title, {}), 1)
+            axes[2, column].set_xlabel("degrees from the input's view")
     axes[0, 0].set_ylabel("voxel IoU")
     axes[1, 0].set_ylabel("MMD: pose in the code")
+    if angles:
+        axes[2, 0].set_ylabel("IoU of silhouettes")
     for panel in axes[1]:
         panel.set_ylim(bottom=0)
     for panel in axes.flat:
@@ -78,8 +123,20 @@ def draw(curves: Curves) -> Figure:
     return figure
 
 
+def _draw_methods(axes: Axes, methods: dict[str, dict[str, np.ndarray]], place: int) -> None:
+    """Column `place` of the rows of each method above the first column."""
+    for method in [name for name in METHODS if name in methods]:
+        label, color = METHODS[method]
+        seeds = list(methods[method].values())
+        shared = np.stack([rows[: min(map(len, seeds))] for rows in seeds])
+        steps, values = shared[0, :, 0], shared[:, :, place]
+        axes.plot(steps, values.mean(0), color=color, label=label)
+        axes.fill_between(steps, values.min(0), values.max(0), color=color, alpha=0.2, lw=0)
+
+
 def main(files: Annotated[list[str], tyro.conf.Positional], output: Path) -> None:
-    draw(read_curves(files)).savefig(output, dpi=120)
+    figure = draw(read_curves(files), read_mean_shapes(files), read_angles(files))
+    figure.savefig(output, dpi=120)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,12 @@ python docs/make_results.py            # write the pages
 python docs/make_results.py --check    # end with status 1 if a page differs from the files
 
 A file holds tables as rows of cells, the header first: "main", "differences", "runs" with settings and commit of
-each run, and "curves" with its validations, which draw_curves.py draws. `learn3d experiment TABLE` writes such a file
-beside its report; copy it here.
+each run, "angles" with IoUs of silhouettes, and "curves" with its validations, which draw_curves.py draws.
+`learn3d experiment TABLE` writes such a file beside its report; copy it here. A block of a page names a file, a part
+of it (see `rows`), and further files with the rows of the mean shape and the nearest training object of the same data,
+for results that are older than these rows:
+
+<!-- results: kato-cars side baselines-cars -->
 """
 
 import json
@@ -16,17 +20,87 @@ from pathlib import Path
 
 DOCS = Path(__file__).parent
 PAGES = (DOCS / "results.md", DOCS / "short-trainings.md", DOCS / "methods" / "plus.md")
-BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+) -->\n)(?:\|.*\n)*")
+BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+)((?: [\w-]+)*) -->\n)(?:\|.*\n)*")
+VOXELS, NO_CLAMP = "here (voxels)", "here (kato18, without clamp)"  # sources of rows in "main"
+#: Methods by the names of their runs, for "measures".
+METHODS = {
+    "vanilla": "Vanilla-AE",
+    "without-adversarial": "w/o adversarial",
+    "without-prior": "w/o prior",
+    "proposed": "Proposed",
+    "plus": "Plus",
+    "kar-vanilla": "Vanilla-AE",
+    "bins-15x20": "Proposed",
+}
+_SHOWN = ("voxel IoU", "unclamped IoU", "Chamfer-L1", "F-score", "MMD", "shuffled MMD")
+
+
+def read(name: str) -> dict[str, list[list[str]]]:
+    """The tables of a file by name."""
+    return json.loads((DOCS / "results" / f"{name}.json").read_text())
+
+
+def measures(tables: dict[str, list[list[str]]]) -> list[list[str]]:
+    """The measures of each method and category, as means over seeds, and its best validation.
+
+    A second row of a run, its other checkpoint, is left out. "best" is the highest IoU of the
+    validations and its step, beside that of the last one.
+    """
+    header, *runs = tables["runs"]
+    kept = [name for name in _SHOWN if name in header]
+    validations: dict[str, list[tuple[float, int]]] = {}
+    for run, _, step, iou, *_ in tables["curves"][1:]:
+        validations.setdefault(run, []).append((float(iou), int(step)))
+    groups: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for row in runs:
+        category, _, folder = row[0].partition("/")
+        method, _, _ = folder.rpartition("-seed")
+        groups.setdefault((category, METHODS[method]), {}).setdefault(row[0], row)
+    lines = [["category", "method", *kept, "validation IoU: last", "best"]]
+    for names, by_run in groups.items():
+        cells = []
+        for measure in kept:
+            values = [float(row[header.index(measure)]) for row in by_run.values()]
+            cells.append(f"{sum(values) / len(values):.3f}")
+        curves = [validations[run] for run in by_run]
+        last = sum(curve[-1][0] for curve in curves) / len(curves)
+        best = [max(curve) for curve in curves]
+        steps = " and ".join(f"{step:,}" for step in sorted({step for _, step in best}))
+        best_iou = sum(iou for iou, _ in best) / len(best)
+        lines.append([*names, *cells, f"{last:.3f}", f"{best_iou:.3f} after {steps}"])
+    return lines
+
+
+def add_baselines(lines: list[list[str]], part: str, name: str) -> None:
+    """Append the rows of the mean shape and the other baselines of a file to a table.
+
+    Differences to the first method have no interval, as its objects are not in the file.
+    """
+    header, *found = read(name)["main"]
+    for label, source, *values in found:
+        if source != VOXELS:
+            continue
+        by_column = dict(zip(header[2:], values, strict=True))
+        if part == "side":
+            value = by_column["mean"]
+            ours = next(row[2] for row in lines[1:] if row[2] != "-")
+            difference = float(value.split()[0]) - float(ours.split()[0])
+            lines.append([label, "-", value, f"{difference:+.3f}", *[""] * (len(lines[0]) - 4)])
+        else:
+            cells = [by_column.get(column, "-") for column in lines[0][2:]]
+            lines.append([label, source, *cells])
 
 
 def rows(name: str, part: str) -> list[list[str]]:
     """The header and the rows of a table. The second voxelizer stays in the file.
 
-    part: a table of the file, or one made of "main" and "differences": "both" puts the difference under each method,
+    part: a table of the file, or one made of others: "both" puts the difference under each method,
     "side" puts paper, here and difference of a single category side by side, "seeds" adds the mean difference over
-    seeds as a last column, "means" leaves the means over seeds of "poses".
+    seeds as a last column, "means" leaves the means over seeds of "poses", "measures" is made by `measures`.
     """
-    tables = json.loads((DOCS / "results" / f"{name}.json").read_text())
+    tables = read(name)
+    if part == "measures":
+        return measures(tables)
     if part == "seeds":
         header, *main = tables["main"]
         (title, *_, spread), *rest = tables["differences"]
@@ -57,21 +131,26 @@ def rows(name: str, part: str) -> list[list[str]]:
             for group in groups
         ]
         return [header, *(row for group in named for row in group if len(row) == len(header))]
-    lines = [["method", "paper", "here", f"minus {baseline}"]]
+    unclamped = any(source == NO_CLAMP for _, source, *_ in main)
+    lines = [["method", "paper", "here", f"minus {baseline}", *["without clamp"] * unclamped]]
     for group in groups:
-        cells = {"paper": "-", "here": "-"}
+        cells = {"paper": "-", "here": "-", NO_CLAMP: ""}
         for _, source, value, mean in group:
             note = " (kato19)" if "kato19" in source else ""
-            cells[re.match(r"\w+", source)[0]] = (mean if value == "-" else value) + note
-        lines.append(
-            [group[0][0], cells["paper"], cells["here"], differences.get(group[0][0], [""])[0]]
-        )
+            place = source if source == NO_CLAMP else re.match(r"\w+", source)[0]
+            cells[place] = (mean if value == "-" else value) + note
+        difference = differences.get(group[0][0], [""])[0]
+        last = [cells[NO_CLAMP]] * unclamped
+        lines.append([group[0][0], cells["paper"], cells["here"], difference, *last])
     return lines
 
 
-def table(name: str, part: str) -> str:
+def table(name: str, part: str, baselines: list[str]) -> str:
     """One table as Markdown. Repeated names in the first column are shown once."""
-    header, *body = rows(name, part)
+    lines = rows(name, part)
+    for file in baselines:
+        add_baselines(lines, part, file)
+    header, *body = lines
     firsts = [body[0][0], *("" if a[0] == b[0] else b[0] for a, b in pairwise(body))]
     lines = [header, *([first, *row[1:]] for first, row in zip(firsts, body, strict=True))]
     title, *others = (f"| {' | '.join(line)} |\n" for line in lines)
@@ -80,7 +159,7 @@ def table(name: str, part: str) -> str:
 
 def filled(page: str) -> str:
     """The page with every table made anew."""
-    return BLOCK.sub(lambda block: block[1] + table(block[2], block[3]), page)
+    return BLOCK.sub(lambda block: block[1] + table(block[2], block[3], block[4].split()), page)
 
 
 if __name__ == "__main__":

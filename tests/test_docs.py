@@ -314,8 +314,76 @@ def test_curves_are_drawn_by_images_and_as_the_mean_of_seeds(
     assert curves["airplane"]["plus"]["0"][:, 0].tolist() == [125, 250, 375], (
         "steps of 32 images count a quarter"
     )
-    lines = draw_curves.draw(curves).axes[0].get_lines()
+    lines = draw_curves.draw(curves, {}, {}).axes[0].get_lines()
     assert {line.get_label(): line.get_ydata().tolist() for line in lines} == {
         "Vanilla-AE": [pytest.approx(0.15)] * 2,
         "Plus": [0.3, 0.3, 0.5],
     }
+
+
+def test_the_mean_shape_and_angles_are_drawn_with_the_curves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = "airplane/vanilla-seed0"
+    content = {
+        "main": [["method", "", "airplane", "mean"], ["Mean shape", "", "0.430 [0.4, 0.5]", "0.4"]],
+        "runs": [["run", "networks", "iterations", "batch"], [run, "step 9", "9", "128"]],
+        "curves": [["run", "split", "step", "IoU", "MMD"], [run, "val", "9", "0.5", "0.1"]],
+        "angles": [["run", "0", "15", "30"], [run, "0.9", "-", "0.7"]],
+    }
+    (tmp_path / "new.json").write_text(json.dumps(content))
+    monkeypatch.setattr(draw_curves, "RESULTS", tmp_path)
+    shapes, angles = draw_curves.read_mean_shapes(["new"]), draw_curves.read_angles(["new"])
+    figure = draw_curves.draw(draw_curves.read_curves(["new"]), shapes, angles)
+    above, _, below = [
+        {line.get_label(): line.get_xydata().tolist() for line in axes.get_lines()}
+        for axes in figure.axes
+    ]
+    assert above == {"Vanilla-AE": [[9, 0.5]], "mean shape": [[0, 0.43], [1, 0.43]]}
+    assert below == {"Vanilla-AE": [[0, 0.9], [30, 0.7]]}
+
+
+def test_rows_of_another_file_are_added_below_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "results").mkdir()
+    run = {"voxel IoU": "0.5", "MMD": "0.1", "F-score": "0.8", "printed MMD": "0.2"}
+    content = {
+        "main": [
+            ["method", "", "car", "mean"],
+            ["Vanilla-AE", "paper (kato18)", "0.5", "0.5"],
+            ["Vanilla-AE", "here (kato18)", "0.600 [0.5, 0.7]", "0.600 [0.5, 0.7]"],
+            ["Vanilla-AE", "here (kato18, without clamp)", "0.400", "0.400"],
+        ],
+        "differences": [["method", "car", "mean"]],
+        "runs": [
+            ["run", *run],
+            ["car/vanilla-seed0", *run.values()],
+            ["car/vanilla-seed0", "0.7", *list(run.values())[1:]],
+            ["car/vanilla-seed1", "0.6", *list(run.values())[1:]],
+        ],
+        "curves": [
+            ["run", "split", "step", "IoU", "MMD"],
+            *(
+                [f"car/vanilla-seed{seed}", "val", step, iou, "-"]
+                for seed, ious in enumerate((("0.2", "0.4"), ("0.8", "0.6")))
+                for step, iou in zip(("500", "1000"), ious, strict=True)
+            ),
+        ],
+    }
+    (tmp_path / "results" / "old.json").write_text(json.dumps(content))
+    baseline = ["Mean shape", "here (voxels)", "0.712 [0.7, 0.8]", "0.712 [0.7, 0.8]"]
+    content["main"] = [content["main"][0], baseline]
+    (tmp_path / "results" / "extra.json").write_text(json.dumps(content))
+    monkeypatch.setattr(make_results, "DOCS", tmp_path)
+    text = make_results.filled("<!-- results: old side extra -->\n")
+    assert "| Vanilla-AE | 0.5 | 0.600 [0.5, 0.7] |  | 0.400 |" in text
+    assert "| Mean shape | - | 0.712 [0.7, 0.8] | +0.112 |  |" in text
+    assert make_results.filled(text) == text, "a second time changes nothing"
+    text = make_results.filled("<!-- results: old main extra -->\n")
+    assert "| Mean shape | here (voxels) | 0.712 [0.7, 0.8] | 0.712 [0.7, 0.8] |" in text
+    (_, row) = make_results.rows("old", "measures")
+    assert row == [
+        *("car", "Vanilla-AE", "0.550", "0.800", "0.100"),
+        *("0.500", "0.600 after 500 and 1,000"),
+    ]
