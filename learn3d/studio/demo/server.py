@@ -49,12 +49,15 @@ VISITORS = 200
 OF_ADDRESS = 40  # pictures of one address among them
 CONNECTIONS = 400  # connections of one address; further ones are closed at once
 PATIENCE = 30  # seconds in which a picture must arrive
-SILENCE = 10  # seconds that a connection may be silent,
-CROWD, CROWD_SILENCE = 20, 1  # and if its address has so many silent ones already
-_PIECE = 2**16  # bytes of an answer that a visitor must take within `SILENCE`
+SILENCE = (
+    10  # seconds in which the header of a request must come, and in which an answer must be read
+)
+CROWD, CROWD_SILENCE = 20, 1  # seconds for the header if an address has so many silent connections
+_PIECE = 2**16  # bytes of an answer that are sent at once
 _TICK = 0.05  # seconds
-#: The browser loads nothing from other servers, and does not show the page in a frame of another page.
+#: Headers of each answer. The browser loads nothing from other servers, and no other page shows this one in a frame.
 _HEADERS = {
+    "Connection": "close",  # a visitor makes few requests, and no connection waits for a further one
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -64,14 +67,12 @@ _HEADERS = {
 
 
 class Connection(H11Protocol):
-    """A connection that is closed if it is silent for too long, or if it sends more than a picture.
+    """A connection that is closed if no request comes, or if its visitor does not read the answer.
 
-    It is silent until the header of a request has come, after an answer, and while it does not read
-    an answer. uvicorn alone waits for ever for the end of a header.
+    uvicorn alone waits for both for ever. `Gate` ends each connection with its first answer.
     """
 
-    _limit: asyncio.TimerHandle | None = None  # its end closes the connection; None if not silent
-    _received = 0  # bytes of this request
+    _limit: asyncio.TimerHandle | None = None  # its end closes the connection
 
     def connection_made(self, transport: asyncio.Transport) -> None:
         super().connection_made(transport)
@@ -80,63 +81,51 @@ class Connection(H11Protocol):
         if len(near) > CONNECTIONS:
             transport.abort()
             return
-        crowded = sum(each._limit is not None for each in near) >= CROWD
-        self._limit = self.loop.call_later(CROWD_SILENCE if crowded else SILENCE, transport.abort)
+        crowded = sum(each.cycle is None for each in near) > CROWD
+        self._close_in(CROWD_SILENCE if crowded else SILENCE)
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        if self._limit is not None:
-            self._limit.cancel()
-
-    def data_received(self, data: bytes) -> None:
-        self._received += len(data)
-        if self._received > MOST_BYTES + 2 * _PIECE:
-            self.transport.abort()
-        else:
-            super().data_received(data)
+        self._limit and self._limit.cancel()
 
     def handle_events(self) -> None:
-        super().handle_events()
-        self._watch()
-
-    def on_response_complete(self) -> None:
-        if self.conn.their_state is not h11.SEND_BODY:
-            self._received = 0
-        super().on_response_complete()
-        self._watch()
+        try:
+            super().handle_events()
+        except h11.LocalProtocolError:  # nonsense behind a request whose answer has begun
+            self.transport.abort()
+        if self.cycle is not None and not self.flow.write_paused:
+            self._limit.cancel()
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._watch()
+        self._close_in(SILENCE)
 
     def resume_writing(self) -> None:
         super().resume_writing()
-        self._watch()
+        self._limit.cancel()
 
-    def _watch(self) -> None:
-        is_at_work = self.cycle is not None and not self.cycle.response_complete
-        silent = self.flow.write_paused or not is_at_work
-        if silent and self._limit is None and not self.transport.is_closing():
-            self._limit = self.loop.call_later(SILENCE, self.transport.abort)
-        elif not silent and self._limit is not None:
-            self._limit.cancel()
-            self._limit = None
+    def _close_in(self, seconds: float) -> None:
+        self._limit and self._limit.cancel()
+        self._limit = self.loop.call_later(seconds, self.transport.abort)
 
 
 class JobQueue:
-    """Runs one job at a time, in the order of arrival, in a thread."""
+    """Runs one job at a time in a thread. Addresses take turns, each with its jobs in the order of arrival."""
 
     def __init__(self) -> None:
         self.closed: Callable[[], bool] = lambda: False  # whether the server stops
-        self._thread, self._line = ThreadPoolExecutor(1), deque()
+        self._thread = ThreadPoolExecutor(1)
+        self._line: list[tuple[str, object]] = []  # addresses, each with a ticket of its own
 
-    async def run(self, job: Callable[[Callable[[dict], None]], None]) -> AsyncIterator[bytes]:
+    async def run(
+        self, job: Callable[[Callable[[dict], None]], None], address: str
+    ) -> AsyncIterator[bytes]:
         """Run a job and yield the messages that it sends, each a line of JSON; before them {"place": jobs ahead of it}.
 
         If the iteration ends early, because the visitor has left, a waiting job is dropped, and one
         in work ends with the next message that it sends.
         """
-        messages, ticket, place = deque(), object(), 0
+        messages, ticket, place, work = deque(), (address, object()), 0, None
 
         def send(message: dict) -> None:
             if self.closed() or ticket not in self._line:
@@ -147,10 +136,9 @@ class JobQueue:
             with contextlib.suppress(asyncio.CancelledError):
                 job(send)
 
-        self._line.append(ticket)
-        work = asyncio.get_running_loop().run_in_executor(self._thread, run_job)
+        self._line.insert(self._turn(address), ticket)
         try:
-            while not (self.closed() or (work.done() and not messages)):
+            while not (self.closed() or (work and work.done() and not messages)):
                 ahead = self._line.index(ticket)
                 if ahead and ahead != place:
                     yield _json_line({"place": ahead})
@@ -159,12 +147,25 @@ class JobQueue:
                     line = _json_line(messages.popleft())
                     for start in range(0, len(line), _PIECE):
                         yield line[start : start + _PIECE]
-                await asyncio.wait([work], timeout=_TICK)
+                if not ahead and work is None:
+                    work = asyncio.get_running_loop().run_in_executor(self._thread, run_job)
+                await (asyncio.wait([work], timeout=_TICK) if work else asyncio.sleep(_TICK))
             if not self.closed():
                 await work  # raises the job's error
         finally:
             self._line.remove(ticket)
-            work.cancel()
+            if work:
+                work.cancel()
+
+    def _turn(self, address: str) -> int:
+        """The place for a further job of an address: its n-th job comes before the others' jobs after their n-th."""
+        seen: Counter[str] = Counter()
+        own = sum(other == address for other, _ in self._line)
+        for place, (other, _) in enumerate(self._line):
+            if seen[other] > own:
+                return place
+            seen[other] += 1
+        return len(self._line)
 
 
 def _json_line(message: dict) -> bytes:
@@ -177,10 +178,8 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
     kinds = [kind for model in models.values() for kind in model.categories]
 
     def about(_: Request) -> Response:
-        limits = {"side": SIDE, "most": 1}
-        return JSONResponse(
-            {"kinds": list(dict.fromkeys(kinds)), "examples": list(pictures), **limits}
-        )
+        kinds_once = list(dict.fromkeys(kinds))
+        return JSONResponse({"kinds": kinds_once, "examples": list(pictures), "side": SIDE})
 
     def show_example(request: Request) -> Response:
         if (png := pictures.get(request.path_params["category"])) is None:
@@ -188,15 +187,17 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
         return Response(png, media_type="image/png")
 
     async def mesh(request: Request) -> Response:
-        category = request.query_params.get("category") or None
+        category, smooth = map(request.query_params.get, ("category", "smooth"))
         try:
-            pictures = await asyncio.wait_for(_receive(request), PATIENCE)
+            picture = await asyncio.wait_for(_receive(request), PATIENCE)
         except (ValueError, KeyError) as error:
             raise HTTPException(400, f"this is no picture as the page sends it: {error}") from None
         except (asyncio.TimeoutError, ClientDisconnect):
             raise HTTPException(408, "the picture did not arrive in time") from None
-        work = partial(make_meshes, models, pictures, category=category)
-        return StreamingResponse(jobs.run(work), media_type="application/x-ndjson")
+        hints = {"category": category or None, "smooth": bool(smooth)}
+        work = partial(make_meshes, models, picture, **hints)
+        address = request.client.host if request.client else ""
+        return StreamingResponse(jobs.run(work, address), media_type="application/x-ndjson")
 
     routes = [
         Route("/about", about),
@@ -207,24 +208,36 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
     return Starlette(routes=routes, middleware=[Middleware(Gate, host=host)])
 
 
-async def _receive(request: Request) -> list[Picture]:
-    """The pictures in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with their bytes in the body."""
+async def _receive(request: Request) -> Picture:
+    """The picture in a request to /mesh?width=W&height=H (and &box=x,y,width,height), with its bytes in the body."""
+    content = await _read(request)
     query = request.query_params
     box = tuple(map(_number, query["box"].split(","))) if "box" in query else None
     if box is not None and len(box) != 4:
         raise ValueError("a box has four numbers")
+    return unpack(content, _number(query["width"]), _number(query["height"]), box)
+
+
+async def _read(request: Request) -> bytes:
     content = bytearray()
     async for chunk in request.stream():
         content += chunk
         if len(content) > MOST_BYTES:
             raise HTTPException(413, f"a picture has at most {MOST_BYTES} bytes")
-    return [unpack(bytes(content), *(_number(query[name]) for name in ("width", "height")), box)]
+    return bytes(content)
 
 
 def _number(text: str) -> int:
     if not re.fullmatch("-?[0-9]{1,6}", text):
         raise ValueError("numbers are written with the digits 0 to 9")
     return int(text)
+
+
+async def _send_away(scope: Scope, receive: Receive, send: Send) -> None:
+    """Ask to come again. The picture is read first, as browsers lose an answer that comes before its end."""
+    with contextlib.suppress(HTTPException, asyncio.TimeoutError, ClientDisconnect):
+        await asyncio.wait_for(_read(Request(scope, receive)), PATIENCE)
+    await PlainTextResponse("many visitors are here; try again later", 503)(scope, receive, send)
 
 
 class Gate:
@@ -251,7 +264,7 @@ class Gate:
         if reason := self._refuse(headers.get("host", ""), headers.get("origin")):
             app = PlainTextResponse(reason, 403)
         elif sent and (self._pictures.total() >= VISITORS or self._pictures[address] >= OF_ADDRESS):
-            app = PlainTextResponse("many visitors are here; try again later", 503)
+            app = _send_away
         self._pictures += sent
         try:
             await app(scope, receive, send_with_headers)
