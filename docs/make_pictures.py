@@ -106,6 +106,14 @@ PICTURES = {
         "{folder}/small-model.png",
         ("docs/examples/draw_small_model.py", "learn3d/studio/picture_to_mesh/small.safetensors"),
     ),
+    "page.png": Picture(
+        "python docs/draw_page.py --output {folder}",
+        "{folder}/page.png",
+        (
+            "docs/draw_page.py",
+            *(f"learn3d/studio/demo/page/{name}" for name in ("index.html", "page.css")),
+        ),
+    ),
     "quickstart.png": Picture(
         "bash tools/quickstart.sh", "quickstart/plus/pictures/*.png", _QUICKSTART
     ),

@@ -2,7 +2,8 @@
 
 import base64
 import io
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,9 +12,11 @@ from PIL import Image
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
 from learn3d.data.masks import check_mask, keep_object, mask_box
+from learn3d.networks.encoders import CENTRED_SIZE
 from learn3d.pictures import photograph
 from learn3d.studio.make_data.looks import PALETTES, natural_look
 from learn3d.studio.picture_to_mesh.cutting import Box, Outline, correct, find_outline
+from learn3d.studio.picture_to_mesh.fit import HALF_FOV_DEG as FITTED_HALF_FOV_DEG
 from learn3d.studio.picture_to_mesh.reconstruction import (
     Model,
     Reconstruction,
@@ -59,7 +62,7 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
     return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3].copy(), strokes, box)
 
 
-def find_object(picture: Picture) -> tuple[Outline, str | None]:
+def outline_object(picture: Picture) -> tuple[Outline, str | None]:
     """The object's outline, and what was left out, see `keep_object`.
 
     The mask is the given one, or is found in the box or picture. If it was corrected, nothing is
@@ -77,44 +80,38 @@ def find_object(picture: Picture) -> tuple[Outline, str | None]:
 
 def make_meshes(
     models: Mapping[str, Model],
-    pictures: Sequence[Picture],
+    picture: Picture,
     send: Send,
     category: str | None = None,
+    smooth: bool = False,
 ) -> None:
-    """Send the masks, the progress, and in the end the meshes of all models, or an error as a sentence.
+    """Send the mask, the progress, the meshes of all models and their further guesses, or an error as a sentence.
 
-    There is one picture. category: the object's, None if unknown.
+    category, smooth: what the visitor says about the object, see `reconstruct_guesses`.
     """
     try:
-        masks = []
-        for number, picture in enumerate(pictures):
-            outline, left_out = find_object(picture)
-            of = {"of": number} if len(pictures) > 1 else {}
-            which = f" in picture {number + 1}" if of else ""
-            found = {
-                "mask": _base64(np.packbits(outline.mask > 127).tobytes()),
-                "left_out": left_out,
-            }
-            send(found | {"how": outline.how} | of)
-            doubt = None
-            try:
-                check_mask(outline.mask, cropped=True)
-            except ValueError:
-                doubt = f"No object was found{which}"
-            if outline.doubt:
-                doubt = f"Is this the object{which}? {outline.doubt.capitalize()}"
-            if doubt:
-                send({"error": f"{doubt}. Drag a box around it.", "tool": "box"} | of)
-                return
-            masks.append(outline.mask)
-
-        def progress(text: str, part: float) -> None:
-            send({"progress": text, "part": part})
-
-        photo = pictures[0].colors, masks[0]
-        options = {"progress": progress, "category": category, "guesses": GUESSES}
+        outline, left_out = outline_object(picture)
+        mask = _base64(np.packbits(outline.mask > 127).tobytes())
+        send({"mask": mask, "how": outline.how, "left_out": left_out})
+        try:
+            check_mask(outline.mask, cropped=True)
+        except ValueError:
+            send({"error": "No object was found. Drag a box around it.", "tool": "box"})
+            return
+        if outline.doubt:
+            doubt = (
+                f"Is this the object? {outline.doubt.capitalize()}. If not, drag a box around it."
+            )
+            send({"doubt": doubt, "tool": "box"})
+        options = {
+            "progress": lambda stage, part: send({"progress": stage, "part": part}),
+            "category": category,
+            "smooth": smooth,
+            "guesses": GUESSES,
+        }
         made = {
-            label: reconstruct_guesses(model, *photo, **options) for label, model in models.items()
+            label: reconstruct_guesses(model, picture.colors, outline.mask, **options)
+            for label, model in models.items()
         }
         send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
         for label, guesses in made.items():
@@ -129,15 +126,27 @@ def _message(label: str, made: Reconstruction) -> dict[str, Any]:
         raise ValueError(
             f"The model {label} makes an empty shape of this picture. Try another picture."
         )
-    angle = np.radians(made.azimuth_deg)
-    x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
-    glb = mesh_bytes(made.surface, "glb", "object")
+    glb = _base64(mesh_bytes(made.surface, "glb", "object"))
+    names = {"label": label, "kind": made.kind, "doubt": made.warning}
+    return names | {"glb": glb, "camera": _camera(made)}
+
+
+def _camera(made: Reconstruction) -> dict[str, Any]:
+    """The picture's camera in the mesh's axes: from where it looks, and if it was fitted, all of it."""
+    if made.view is None:
+        angle = np.radians(made.azimuth_deg)
+        x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
+        return {"yaw": float(np.arctan2(x, z)), "pitch": 0.3}
+    right, up, forward = made.view.axes()[0].numpy() @ mesh_to_object()
+    x, y, z = map(float, -forward)
     return {
-        "label": label,
-        "glb": _base64(glb),
-        "yaw": float(np.arctan2(x, z)),
-        "kind": made.kind,
-        "warning": made.warning,
+        "yaw": math.atan2(x, z),
+        "pitch": math.asin(max(-1.0, min(1.0, y))),
+        "axes": [right.tolist(), up.tolist(), [x, y, z]],
+        "distance": float(made.view.log_distance.exp()),
+        "shift": made.view.shift[0].tolist(),
+        "focus": 0.5 / math.tan(math.radians(FITTED_HALF_FOV_DEG)),
+        "size": CENTRED_SIZE,
     }
 
 

@@ -303,6 +303,7 @@ def reconstruct_guesses(
     crop: bool = True,
     refined: bool = True,
     category: str | None = None,
+    smooth: bool = False,
     guesses: int = 1,
     progress: Progress = lambda *_: None,
 ) -> Iterator[Reconstruction]:
@@ -310,6 +311,7 @@ def reconstruct_guesses(
 
     refined: fit camera, shape and colours to the picture; methods with voxels only predict.
     category: the object's, None if unknown. With a known one there is no warning.
+    smooth: inflate the outline instead of predicting a shape.
     guesses: largest number of different shapes, the best first; a model without templates makes
     one.
     progress: called with the name of each stage and the share that is done.
@@ -334,10 +336,10 @@ def reconstruct_guesses(
     progress("camera", 0.0)
     predicted = predict(method, image, mask)
     kind, warning = (category, None) if category else recognize(model, predicted.code[0])
-    if warning is not None:
+    if smooth or warning is not None:
         surface, view = inflate(framed)
         iou = float(view.ious(surface.vertices[None], surface.faces, mask))
-        yield Reconstruction(surface, stored, 0.0, iou, None, warning)
+        yield Reconstruction(surface, stored, 0.0, iou, None, None if smooth else warning, view)
         return
     templates = model.templates
     if templates is None:
@@ -346,7 +348,13 @@ def reconstruct_guesses(
         progress("colours", 0.9)
         surface = color_mesh(mesh, fitted.view, framed, method.generator.reflection)
         yield Reconstruction(
-            surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind, warning
+            surface,
+            stored,
+            float(fitted.view.azimuth_deg),
+            fitted.iou,
+            kind,
+            warning,
+            fitted.view,
         )
         return
     options = {"category": category, "guesses": guesses}
@@ -356,7 +364,10 @@ def reconstruct_guesses(
         progress("colours", 0.9)
         mesh = fitted.vertices, fitted.faces
         surface = color_mesh(mesh, fitted.view, framed, MIRROR, fine=True)
-        yield Reconstruction(surface, stored, float(fitted.view.azimuth_deg), fitted.iou, kind)
+        azimuth_deg = float(fitted.view.azimuth_deg)
+        yield Reconstruction(
+            surface, stored, azimuth_deg, fitted.iou, kind, warning=None, view=fitted.view
+        )
 
 
 def check_category(model: Model, category: str) -> None:

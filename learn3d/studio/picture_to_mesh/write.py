@@ -20,6 +20,7 @@ from learn3d.pictures import (
     tile,
     turntable,
 )
+from learn3d.studio.picture_to_mesh.fit import View
 
 MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
@@ -38,6 +39,7 @@ class Reconstruction(NamedTuple):
     # predicted category; None without a fit, or without templates if the model has only one
     kind: str | None = None
     warning: str | None = None  # a reason to doubt the shape; None without a fit
+    view: View | None = None  # the picture's camera; None without a fit
 
 
 def export_mesh(path: Path, surface: Surface) -> None:

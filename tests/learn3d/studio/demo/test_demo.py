@@ -5,25 +5,24 @@ from __future__ import annotations
 import base64
 import io
 import socket
+import time
 
 import numpy as np
 import pytest
 import torch
-import trimesh
 from PIL import Image
 from scipy import ndimage
 
-import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.masks import keep_object
-from learn3d.data.poses import wrap_deg
 from learn3d.pictures import Surface
 from learn3d.studio.demo import picture as pictures
 from learn3d.studio.picture_to_mesh import reconstruction
 from learn3d.studio.picture_to_mesh.cutting import threshold_mask
 from learn3d.studio.picture_to_mesh.export import export
-from learn3d.studio.picture_to_mesh.reconstruction import input_azimuth_deg, load_model
-from learn3d.studio.shapes import make_shape
+from learn3d.studio.picture_to_mesh.fit import View
+from learn3d.studio.picture_to_mesh.reconstruction import load_model
+from learn3d.studio.picture_to_mesh.write import Reconstruction
 
 
 @pytest.fixture
@@ -35,19 +34,6 @@ def photo() -> np.ndarray:
     colors[distance <= 15] = 210
     colors[10:12, 10:12] = 0
     return colors
-
-
-def test_the_mask_is_the_largest_region_and_only_the_background_makes_holes(photo) -> None:
-    mask, left_out = keep_object(threshold_mask(photo, 0.2))
-    assert mask.dtype == np.uint8 and set(np.unique(mask)) == {0, 255}
-    assert np.array_equal(mask > 0, np.hypot(*np.ogrid[-50:50, -80:80]) < 30)
-    assert left_out is None and not threshold_mask(photo, 0.9).any()
-    photo[45:55, 75:85] = photo[:10, :10]
-    assert (keep_object(threshold_mask(photo, 0.05))[0] == 0)[45:55, 75:85].all(), (
-        "the background is seen"
-    )
-    photo[5:40, 5:40] = 0
-    assert keep_object(threshold_mask(photo, 0.2))[1], "a second thing"
 
 
 def test_pixels_are_unpacked_as_the_page_packs_them() -> None:
@@ -67,75 +53,92 @@ def test_the_object_is_given_or_found_or_corrected(photo) -> None:
     unknown, given = np.full((100, 160), 255, np.uint8), np.zeros((100, 160), np.uint8)
     given[20:40, 20:40] = 200
     ring, _ = keep_object(threshold_mask(photo))
-    assert np.array_equal(pictures.find_object(pictures.Picture(photo, unknown))[0].mask, ring)
-    assert np.array_equal(pictures.find_object(pictures.Picture(photo, given))[0].mask, given)
+    assert np.array_equal(pictures.outline_object(pictures.Picture(photo, unknown))[0].mask, ring)
+    assert np.array_equal(pictures.outline_object(pictures.Picture(photo, given))[0].mask, given)
     apart = given.copy()
     apart[60:80, 100:120] = 255
-    found, left_out = pictures.find_object(pictures.Picture(photo, apart))
+    found, left_out = pictures.outline_object(pictures.Picture(photo, apart))
     assert np.array_equal(found.mask, given) and left_out.startswith(
         "several objects of similar size"
     )
     strokes = np.zeros_like(given)
     strokes[10:20, 20:40] = 1
     given[90, 150] = 255
-    (corrected, _, _), _ = pictures.find_object(pictures.Picture(photo, given, strokes))
+    (corrected, _, _), _ = pictures.outline_object(pictures.Picture(photo, given, strokes))
     assert corrected[90, 150], "a correction keeps everything"
     corrected[90] = 0
     assert np.flatnonzero(corrected.any(axis=1)).tolist() == list(range(10, 40))
-    boxed, _ = pictures.find_object(pictures.Picture(photo, unknown, None, (40, 10, 80, 80)))
+    boxed, _ = pictures.outline_object(pictures.Picture(photo, unknown, None, (40, 10, 80, 80)))
     whole = ndimage.binary_fill_holes(boxed.mask > 127)  # the pale disc may be background
     assert (whole != (ring > 127)).mean() < 0.02
 
 
-def test_a_picture_gets_its_mesh_step_by_step_or_a_sentence(finished_run) -> None:
-    with Image.open(io.BytesIO(pictures.example("chair"))) as image:
-        colors, alpha = np.split(np.asarray(image), [3], axis=2)
-    assert 0.2 < (alpha > 127).mean() < 0.7
+def test_a_picture_without_an_object_gets_a_sentence(finished_run, photo) -> None:
     sent: list[dict] = []
     models = {"my run": load_model(finished_run)}
-    pictures.make_meshes(models, [pictures.Picture(colors.copy(), alpha[..., 0])], sent.append)
-    assert (
-        "mask" in sent[0]
-        and sent[0]["left_out"] is None
-        and [each["part"] for each in sent[1:-1]] == [0.0, 0.3, 0.7, 0.9]
-    )
-    (result,) = sent[-1]["meshes"]
-    glb = base64.b64decode(result["glb"])
-    assert result["label"] == "my run" and b"COLOR_0" in glb
-    assert len(trimesh.load(io.BytesIO(glb), "glb", force="mesh").faces) > 100
-    for mask in (np.zeros_like(alpha[..., 0]), np.full_like(alpha[..., 0], 254)):
-        pictures.make_meshes(models, [pictures.Picture(colors, mask)], sent.append)
+    for value in (0, 254):
+        mask = np.full(photo.shape[:2], value, np.uint8)
+        pictures.make_meshes(models, pictures.Picture(photo, mask), sent.append)
         error = "No object was found. Drag a box around it."
         assert sent[-1] == {"error": error, "tool": "box"}
 
 
-def test_a_doubtful_outline_is_shown_and_a_box_is_asked_for(finished_run) -> None:
+def test_a_doubtful_outline_is_said_and_gets_its_mesh(finished_run) -> None:
     colors = np.full((100, 120, 3), 200, np.uint8)
     colors[40:48] = (150, 30, 30)  # from side to side
-    unknown = np.full((100, 120), 255, np.uint8)
     sent: list[dict] = []
     models = {"my run": load_model(finished_run)}
-    pictures.make_meshes(models, [pictures.Picture(colors, unknown)], sent.append)
-    shown, error = sent
+    picture = pictures.Picture(colors, np.full((100, 120), 255, np.uint8))
+    pictures.make_meshes(models, picture, sent.append)
+    shown, doubt, *steps, last = sent
     assert shown["how"] == "as all that differs from the plain background"
     assert np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)).sum() == 8 * 120
-    asked = "Is this the object? Its outline touches 2 sides of the picture. Drag a box around it."
-    assert error == {"error": asked, "tool": "box"}
+    asked = "Is this the object? Its outline touches 2 sides of the picture."
+    assert doubt == {"doubt": f"{asked} If not, drag a box around it.", "tool": "box"}
+    assert [step["part"] for step in steps] == [0.0, 0.3, 0.7, 0.9] and last["meshes"]
 
 
-def test_the_side_of_the_input_is_found() -> None:
-    mesh = make_shape("chair", np.random.default_rng(6))
-    vertices = torch.from_numpy(mesh.vertices @ mesh_to_object("y", "z").T).float()
-    faces = torch.from_numpy(mesh.faces)
-    for azimuth in (0.0, 45.0, 210.0):
-        camera = nmr.LookAt.from_angles(2.732, 30.0, [azimuth], half_fov_deg=15.0)
-        mask = (
-            (nmr.render_silhouette(vertices, faces, camera, image_size=128)[0] * 255).byte().numpy()
+def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
+    """A point of the mesh is seen where the camera of the fit sees the same point of the object."""
+    vertices = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) / 4
+    view = View(
+        *torch.tensor([[40.0], [25.0], [1.5]]), torch.tensor([[0.1, -0.2]]), torch.tensor([9.0])
+    )
+    made = Reconstruction(Surface(vertices, torch.zeros(0, 3)), None, 40.0, view=view)
+    camera = pictures._camera(made)
+    points = vertices.numpy() @ mesh_to_object() @ np.transpose(camera["axes"])
+    near = camera["focus"] / (camera["distance"] - points[:, 2])
+    x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
+    for axis, wanted in enumerate((x, y)):
+        assert np.allclose(2 * near * (points[:, axis] + camera["shift"][axis]), wanted, atol=1e-4)
+
+
+def test_pictures_full_of_holes_cost_at_most_twice_as_much() -> None:
+    models = {"small model": load_model(None)}
+    with Image.open(io.BytesIO(pictures.example("chair"))) as image:
+        colors, alpha = np.split(np.asarray(image), [3], axis=2)
+    y, x = np.indices((512, 512))
+    middle = (np.abs(x - 256) < 230) & (np.abs(y - 256) < 230)
+    masks = [
+        (x // 8 + y // 8) % 2 == 0,
+        np.abs(np.hypot(x - 256, y - 256) - 200) < 3,
+        middle & ~((x % 2 == 0) & (y % 2 == 0)),
+        np.random.default_rng(0).random((512, 512)) < 0.6,
+    ]
+    ordinary = pictures.Picture(np.ascontiguousarray(colors), alpha[..., 0].copy())
+    unknown = np.full((512, 512), 255, np.uint8)
+    holes = [
+        pictures.Picture(
+            np.where(mask[..., None], np.uint8(30), np.full(3, 200, np.uint8)), unknown
         )
-        assert (
-            abs(wrap_deg(torch.tensor(input_azimuth_deg(Surface(vertices, faces), mask) - azimuth)))
-            < 5
-        )
+        for mask in masks
+    ]
+    seconds = []
+    for picture in (ordinary, ordinary, *holes):  # the first time is longer
+        start = time.process_time()
+        pictures.make_meshes(models, picture, lambda _: None)
+        seconds.append(time.process_time() - start)
+    assert max(seconds[2:]) < 2 * seconds[1], seconds
 
 
 def test_the_packages_own_model_is_the_default(

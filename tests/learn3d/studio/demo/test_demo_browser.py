@@ -1,203 +1,339 @@
-"""The page of `learn3d demo` in a browser: the real command, a real page, and the end of both."""
+"""The page of `learn3d demo` in a browser: whole visits, each to the end of the server's answer."""
 
 from __future__ import annotations
 
 import base64
 import io
-import shutil
+import json
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
+from PIL import Image, ImageSequence
 
-pytest.importorskip("uvicorn", reason="needs the extra demo")
-api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-CHROMIUM = shutil.which("chromium")
-if CHROMIUM is None:
-    pytest.skip("needs Chromium (apt-get install chromium)", allow_module_level=True)
+from learn3d.studio.demo.picture import EXAMPLES, example
 
-PATIENCE = 300_000  # milliseconds; a second or two on an idle machine
+AT_ONCE = 20_000  # milliseconds that the page has after the server's last word
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[api.Browser]:
-    with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"]
-        )
-        yield browser
-        browser.close()
+def answered(tab: Any, act: Callable[[], object], error: str = "") -> list[dict]:
+    """Do something that sends a picture, and wait for the end: the messages of the server.
+
+    The page must then be at rest, with no error or with this one.
+    """
+    with tab.expect_response(lambda response: "/mesh?" in response.url) as answer:
+        act()
+    answer.value.finished()
+    tab.locator("body:not(.busy)").wait_for(timeout=AT_ONCE)
+    tab.locator("#progress").wait_for(state="hidden", timeout=AT_ONCE)
+    said = tab.locator("#status.error")
+    assert said.count() == bool(error) and (not error or error in said.inner_text())
+    return [json.loads(line) for line in answer.value.text().splitlines()]
 
 
-@pytest.fixture
-def page(browser, server) -> Iterator[api.Page]:
-    """The open page; afterwards it must have had no errors, and have asked for nothing from elsewhere."""
-    page = browser.new_page(viewport={"width": 1280, "height": 1100})
-    page.set_default_timeout(PATIENCE)
-    said, asked = [], []
-    page.on(
-        "console", lambda message: said.append(message.text) if message.type == "error" else None
+def press(tab: Any, name: str) -> Callable[[], None]:
+    return tab.get_by_role("button", name=name, exact=True).click
+
+
+def buttons(tab: Any) -> set[str]:
+    """The names of all buttons that a finger can reach."""
+    reached = tab.evaluate(
+        """() => [...document.querySelectorAll("button")].filter(button => {
+            if (!button.checkVisibility()) return false;
+            button.scrollIntoView({ block: "center" });
+            const { x, y, width, height } = button.getBoundingClientRect();
+            return button.contains(document.elementFromPoint(x + width / 2, y + height / 2));
+        }).map(button => button.ariaLabel || button.title || button.textContent)"""
     )
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
-    page.goto(server[1])
-    page.get_by_role("button", name="sofa").wait_for()
-    yield page
-    page.close()
-    assert said == []
-    assert [url for url in asked if not url.startswith((server[1], f"blob:{server[1]}"))] == []
+    seen = [name for name in reached if name]
+    assert len(set(seen)) == len(reached), "each has a name of its own"
+    return set(seen)
 
 
-def pixels(place: api.Locator) -> np.ndarray:
-    return np.asarray(Image.open(io.BytesIO(place.screenshot())).convert("RGB")).astype(int)
+def paint(image: np.ndarray) -> np.ndarray:
+    """The mean colour of all that is not grey: of the object, not of the page."""
+    assert paint_share(image) > 0.01, "an object is shown"
+    return image[np.ptp(image, axis=2) > 60].mean(axis=0)
 
 
-def moves(page: api.Page, place: api.Locator, before: np.ndarray) -> bool:
-    """Whether more than a hundredth of the pixels change, sooner or later."""
-    for _ in range(PATIENCE // 100):
-        if (np.abs(pixels(place) - before).max(axis=2) > 20).mean() > 0.01:
-            return True
-        page.wait_for_timeout(100)
-    return False
+def paint_share(image: np.ndarray) -> float:
+    return float((np.ptp(image, axis=2) > 60).mean())
 
 
-def made(page: api.Page) -> np.ndarray:
-    """Wait for the meshes; the pixels of the picture with its outline."""
-    page.get_by_text("Drag the mesh to turn it").wait_for()
-    return pixels(page.locator("#picture"))
-
-
-@pytest.fixture
-def box(tmp_path) -> Path:
-    colors = np.full((200, 300, 3), 200, np.uint8)
-    colors[60:140, 80:220] = (40, 60, 120)
-    Image.fromarray(colors).save(tmp_path / "box.png")
-    return tmp_path / "box.png"
-
-
-def download(page: api.Page, name: str, folder: Path) -> Path:
-    with page.expect_download() as event:
-        page.get_by_role("button", name=name).first.click()
+def download(tab: Any, name: str, folder: Path) -> Path:
+    with tab.expect_download() as event:
+        tab.get_by_role("button", name=name).first.click()
     event.value.save_as(folder / event.value.suggested_filename)
     return folder / event.value.suggested_filename
 
 
-def test_a_picture_becomes_meshes_that_turn_and_can_be_kept(page, box, tmp_path) -> None:
-    page.locator("#file").set_input_files(box)
-    seen = made(page)
-    assert (seen == (40, 60, 120)).all(axis=2).mean() > 0.1, "the picture is not tinted"
+def drag(tab: Any, place: Any, *points: tuple[float, float]) -> None:
+    """Drag over an element; points are parts of its width and height."""
+    place.scroll_into_view_if_needed()
+    area = place.bounding_box()
+    for step, (x, y) in enumerate(points):
+        tab.mouse.move(area["x"] + x * area["width"], area["y"] + y * area["height"], steps=6)
+        if not step:
+            tab.mouse.down()
+    tab.mouse.up()
+
+
+def pinch(tab: Any, place: Any) -> None:
+    """Move two fingers apart on an element, to four times their distance."""
+    place.scroll_into_view_if_needed()
+    area, fingers = place.bounding_box(), tab.context.new_cdp_session(tab)
+    x, y = area["x"] + area["width"] / 2, area["y"] + area["height"] / 2
+    for kind, apart in (("touchStart", 20), ("touchMove", 50), ("touchMove", 80), ("touchEnd", 0)):
+        points = [{"x": x + side * apart, "y": y, "id": side + 1} for side in (-1, 1)]
+        message = {"type": kind, "touchPoints": points if apart else []}
+        fingers.send("Input.dispatchTouchEvent", message)
+
+
+def moves(tab: Any, pixels: Callable, place: Any, before: np.ndarray) -> bool:
+    """Whether more than a hundredth of the pixels change, sooner or later."""
+    for _ in range(AT_ONCE // 100):
+        if (np.abs(pixels(place) - before).max(axis=2) > 20).mean() > 0.01:
+            return True
+        tab.wait_for_timeout(100)
+    return False
+
+
+def halves(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the two halves of a picture, beside or above each other, are no background."""
+    height, width = image.shape[:2]
+    shown = np.abs(image - image[-2, -2]).max(axis=2) > 25
+    if width > height:
+        return shown[:, : width // 2], shown[:, width - width // 2 :]
+    return shown[: height // 2], shown[height - height // 2 :]
+
+
+def iou(one: np.ndarray, other: np.ndarray) -> float:
+    return float((one & other).sum() / (one | other).sum())
+
+
+def boxes(path: Path, *placed: tuple[slice, tuple[int, int, int]]) -> Path:
+    """A picture 300 x 200 of boxes on grey, each with its columns and its colour."""
+    image = np.full((200, 300, 3), 200, np.uint8)
+    for columns, color in placed:
+        image[60:140, columns] = color
+    Image.fromarray(image).save(path)
+    return path
+
+
+BLUE, GREEN = (40, 60, 160), (30, 140, 50)
+
+
+@pytest.fixture
+def blue(tmp_path) -> Path:
+    return boxes(tmp_path / "blue.png", (slice(80, 220), BLUE))
+
+
+def cut_out(tab: Any, folder: Path) -> np.ndarray:
+    """The object as the page saves it: R, G, B, A."""
+    folder.mkdir(exist_ok=True)
+    with Image.open(download(tab, "Cut-out", folder)) as image:
+        return np.asarray(image)
+
+
+@pytest.mark.parametrize("width", [1280, 380])
+def test_a_whole_visit(packaged, visit, pixels, tmp_path, width) -> None:
+    """A visitor presses every button, and takes every file home."""
+    tab = visit(packaged.address, width, reduced_motion="reduce", has_touch=width < 400)
+    press(tab, "sofa")()
+    press(tab, "Cancel")()
+    assert tab.get_by_text("Cancelled.").is_visible() and tab.locator(".busy").count() == 0
+    said = answered(tab, press(tab, "chair"))
+    canvas = tab.locator(".view > canvas")
+    with Image.open(io.BytesIO(example("chair"))) as image:
+        given = paint(np.asarray(image.convert("RGB")).astype(int))
+    assert np.abs(paint(pixels(canvas)) - given).max() < 50, "the mesh has the picture's colours"
+    (first,) = next(message["meshes"] for message in said if "meshes" in message)
+    made = [first, *(message["guess"] for message in said if "guess" in message)]
+    guesses = [f"Guess {number + 1}: {each['kind']}" for number, each in enumerate(made)]
+    assert len(made) > 1
+    tools = {"Box", "Add", "Remove", "Undo", "Start over", "Another picture"}
+    views = {"Zoom in", "Zoom out", "Reset the view", "Clay", "Beside the picture"}
+    kinds = {f"It is a{'n' * (kind == 'airplane')} {kind}" for kind in EXAMPLES}
+    files = {f"↓ {kind}" for kind in ("GLB", "OBJ", "Turntable", "Cut-out")}
+    reached = tools | views | kinds | files | {*EXAMPLES, *guesses, "Smooth shape instead"}
+    photo = {"Take a photo"} if tab.evaluate("matchMedia('(pointer: coarse)').matches") else set()
+    assert buttons(tab) == reached | photo
+
+    for name, each in reversed(list(zip(guesses, made, strict=True))):
+        press(tab, name)()
+        small = pixels(tab.get_by_role("button", name=name).locator("canvas"))
+        assert np.abs(paint(small) - paint(pixels(canvas))).max() < 50, "its small picture"
+        saved = download(tab, "GLB", tmp_path).read_bytes()
+        assert saved == base64.b64decode(each["glb"])
+        mesh = trimesh.load(io.BytesIO(saved), "glb", force="mesh", process=False)
+        assert len(mesh.faces) > 1000 and np.isfinite(mesh.vertices).all()
+    obj = trimesh.load(download(tab, "OBJ", tmp_path), force="mesh", process=False)
+    assert np.allclose(obj.vertices, mesh.vertices, atol=1e-4)
+    with Image.open(download(tab, "Turntable", tmp_path)) as image:
+        assert image.n_frames == 36
+        frames = [
+            np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(image)
+        ]
+    assert all(np.abs(paint(frame) - given).max() < 70 for frame in frames)
+    assert np.abs(frames[9] - frames[0]).max() > 100, "it turns"
+    assert 0.1 < (cut_out(tab, tmp_path)[..., 3] > 0).mean() < 0.9
+
+    before = pixels(canvas)
+    for name in ("Zoom in", "Zoom out", "Clay", "Clay", "Beside the picture", "Beside the picture"):
+        press(tab, name)()
+        assert moves(tab, pixels, canvas, before), name
+        before = pixels(canvas)
+    if width < 400:
+        pinch(tab, canvas)
+        assert moves(tab, pixels, canvas, before)
+        assert paint_share(pixels(canvas)) > 1.5 * paint_share(before), "two fingers zoom"
+    else:
+        press(tab, "Zoom in")()
+    press(tab, "Reset the view")()
+    press(tab, "Clay")()
+    assert moves(tab, pixels, canvas, before)
+    assert paint_share(pixels(canvas)) < 0.005, "clay has no colours"
+    press(tab, "Beside the picture")()
+    assert moves(tab, pixels, canvas, before)
+    left, right = halves(pixels(canvas))
+    assert iou(left, right) > 0.7, "the mesh is seen as the picture shows it"
+
+    for tool in ("Box", "Add", "Remove"):
+        press(tab, tool)()
+        assert tab.locator("[aria-pressed=true]", has_text=tool).count() == 1
+    said = answered(tab, press(tab, "It is a sofa"))
+    assert [message["meshes"][0]["kind"] for message in said if "meshes" in message] == ["sofa"]
+    said = answered(tab, press(tab, "Smooth shape instead"))
+    assert [message["meshes"][0]["kind"] for message in said if "meshes" in message] == [None]
+    with tab.expect_file_chooser():
+        press(tab, "Another picture")()
+    assert packaged.errors.read_text() == ""
+
+
+def test_a_picture_becomes_meshes_that_turn_and_can_be_kept(
+    server, visit, pixels, blue, tmp_path
+) -> None:
+    tab = visit(server.address)
+    answered(tab, lambda: tab.locator("#file").set_input_files(blue))
+    seen = pixels(tab.locator("#picture"))
+    assert (seen == BLUE).all(axis=2).mean() > 0.1, "the picture is not tinted"
     assert (seen == 255).all(axis=2).any(), "the outline"
-    canvas = page.locator(".view canvas")
+    canvas = tab.locator(".view > canvas")
     assert canvas.count() == 2, "one for each run"
     before = pixels(canvas.first)
     assert np.ptp(before) > 60
-    assert moves(page, canvas.first, before), "it turns by itself"
-    area = canvas.first.bounding_box()
-    page.mouse.move(area["x"] + area["width"] / 2, area["y"] + area["height"] / 2)
-    page.mouse.down()
+    assert moves(tab, pixels, canvas.first, before), "it turns by itself"
+    drag(tab, canvas.first, (0.5, 0.5), (0.7, 0.6))
     before = pixels(canvas.first)
-    page.mouse.move(
-        area["x"] + area["width"] / 2 + 90, area["y"] + area["height"] / 2 + 30, steps=5
-    )
-    assert moves(page, canvas.first, before), "it turns by hand"
-    page.mouse.up()
+    drag(tab, canvas.first, (0.5, 0.5), (0.7, 0.6))
+    assert moves(tab, pixels, canvas.first, before), "it turns by hand"
     meshes = [
-        trimesh.load(download(page, kind, tmp_path), force="mesh", process=False)
+        trimesh.load(download(tab, kind, tmp_path), force="mesh", process=False)
         for kind in ("GLB", "OBJ")
     ]
-    assert (
-        np.allclose(meshes[0].vertices, meshes[1].vertices, atol=1e-4)
-        and len(meshes[0].faces) > 100
-    )
-    (tmp_path / "kept").mkdir()
-    with Image.open(download(page, "Cut-out", tmp_path / "kept")) as image:
-        assert (np.asarray(image)[..., 3] > 0).mean() == pytest.approx(
-            80 * 140 / (200 * 300), rel=0.05
-        )
+    assert np.allclose(meshes[0].vertices, meshes[1].vertices, atol=1e-4)
+    assert len(meshes[0].faces) > 100
+    alpha = cut_out(tab, tmp_path / "kept")[..., 3]
+    assert (alpha > 0).mean() == pytest.approx(80 * 140 / (200 * 300), rel=0.05)
 
 
-def test_the_outline_is_corrected_by_brushes_and_a_box(page, box) -> None:
-    page.locator("#file").set_input_files(box)
-    first = made(page)
-    area = page.locator("#picture").bounding_box()
+def test_the_outline_is_corrected_by_brushes_and_a_box(server, visit, tmp_path) -> None:
+    two = boxes(tmp_path / "two.png", (slice(40, 160), BLUE), (slice(190, 260), GREEN))
+    tab = visit(server.address)
+    answered(tab, lambda: tab.locator("#file").set_input_files(two))
+    steps = iter(range(9))
 
-    def drag(tool: str, *ends: tuple[float, float]) -> np.ndarray:
-        if (
-            page.get_by_role("button", name=tool, exact=True).get_attribute("aria-pressed")
-            == "false"
-        ):
-            page.get_by_role("button", name=tool, exact=True).click()
-        for step, (x, y) in enumerate(ends):
-            page.mouse.move(area["x"] + x * area["width"], area["y"] + y * area["height"], steps=6)
-            if not step:
-                page.mouse.down()
-        page.mouse.up()
-        return made(page)
+    def part(columns: slice) -> float:
+        """The share of these columns that belongs to the object, beside the other shares."""
+        alpha = cut_out(tab, tmp_path / f"cut{next(steps)}")[..., 3] > 0
+        scale = alpha.shape[1] / 300
+        return float(alpha[:, int(columns.start * scale) : int(columns.stop * scale)].mean())
 
-    added = drag("Add", (0.1, 0.1), (0.2, 0.1))
-    assert (added != first).any(axis=2)[: len(first) // 5].any(), "an outline around the stroke"
-    removed = drag("Remove", (0.05, 0.1), (0.25, 0.1))
-    assert np.abs(removed - first).mean() < np.abs(added - first).mean()
-    assert np.abs(drag("Box", (0.2, 0.2), (0.8, 0.8)) - first).mean() < 3, "at most a pixel"
+    def correct(tool: str, *points: tuple[float, float]) -> None:
+        if tab.locator("[aria-pressed=true]", has_text=tool).count() == 0:
+            press(tab, tool)()
+        answered(tab, lambda: drag(tab, tab.locator("#picture"), *points))
+
+    left, right, above = slice(40, 160), slice(190, 260), slice(60, 90)
+    before = part(left), part(right)
+    assert before[0] > 0.3 and before[1] == 0
+    plain = part(above)
+    correct("Add", (0.2, 0.2), (0.3, 0.2))
+    assert part(above) > plain + 0.02
+    correct("Remove", (0.15, 0.2), (0.35, 0.2))
+    assert part(above) < plain + 0.01
+    correct("Box", (0.58, 0.2), (0.92, 0.8))
+    assert part(left) == 0 and part(right) > 0.3
+    answered(tab, press(tab, "Undo"))
+    answered(tab, press(tab, "Undo"))
+    assert part(above) > plain + 0.02, "as after the first stroke"
+    answered(tab, press(tab, "Start over"))
+    assert (part(left), part(right), part(above)) == (*before, plain)
+    assert tab.get_by_role("button", name="Undo").is_disabled()
 
 
-def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(page, box, tmp_path) -> None:
+def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(
+    server, visit, pixels, blue, tmp_path
+) -> None:
+    tab = visit(server.address)
     (tmp_path / "broken.png").write_bytes(b"no picture")
-    page.locator("#file").set_input_files(box)
-    page.get_by_text("Finding the").first.wait_for()
-    page.locator("#file").set_input_files(tmp_path / "broken.png")  # while the first is in work
-    sentence = page.get_by_text("not a picture that your browser can open")
+    tab.locator("#file").set_input_files(blue)
+    tab.get_by_text("Finding the").first.wait_for()
+    tab.locator("#file").set_input_files(tmp_path / "broken.png")  # while the first is in work
+    sentence = tab.get_by_text("not a picture that your browser can open")
     sentence.wait_for()
-    page.wait_for_timeout(1500)
-    assert sentence.is_visible() and page.locator("#progress").is_hidden()
-    Image.fromarray(np.full((50, 50, 3), 90, np.uint8)).save(tmp_path / "grey.png")
-    page.locator("#file").set_input_files(tmp_path / "grey.png")
-    page.get_by_text("No object was found").wait_for()
-    pressed = page.get_by_role("button", name="Box").get_attribute("aria-pressed")
-    assert pressed == "true", "a box can be dragged at once"
-    with Image.open(box) as image:
-        image.paste((0, 0, 0), (240, 60, 290, 140))
-        image.save(tmp_path / "two.png")
-    page.locator("#file").set_input_files(tmp_path / "two.png")
-    page.get_by_text("away from the object").wait_for()
-    content = base64.b64encode(box.read_bytes()).decode()
-    page.evaluate(
-        """text => { const data = new DataTransfer(), bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
-        data.items.add(new File([bytes], "box.png")); window.dispatchEvent(new DragEvent("drop", {dataTransfer: data,
-        cancelable: true})); }""",
-        content,
+    tab.wait_for_timeout(1500)
+    assert sentence.is_visible() and tab.locator("#progress").is_hidden()
+    grey = boxes(tmp_path / "grey.png")
+    answered(tab, lambda: tab.locator("#file").set_input_files(grey), "No object was found")
+    assert tab.locator("[aria-pressed=true]", has_text="Box").count() == 1, "it can be dragged"
+    both = boxes(tmp_path / "two.png", (slice(80, 220), BLUE), (slice(240, 290), (0, 0, 0)))
+    answered(tab, lambda: tab.locator("#file").set_input_files(both))
+    assert tab.get_by_text("away from the object").is_visible()
+    wide = boxes(tmp_path / "wide.png", (slice(0, 300), BLUE))
+    answered(tab, lambda: tab.locator("#file").set_input_files(wide))
+    assert "touches 2 sides" in tab.locator("#doubt").inner_text(), "a doubt beside the mesh"
+    green = boxes(tmp_path / "green.png", (slice(80, 220), GREEN))
+    answered(
+        tab,
+        lambda: tab.evaluate(
+            """text => {
+                const data = new DataTransfer(), bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
+                data.items.add(new File([bytes], "green.png"));
+                window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
+            }""",
+            base64.b64encode(green.read_bytes()).decode(),
+        ),
     )
-    made(page)
+    assert tab.locator("#doubt").is_hidden()
+    for place in (tab.locator("#picture"), tab.locator(".view > canvas").first):
+        red, high, low = paint(pixels(place))
+        assert high > 1.5 * max(red, low), "the dropped picture and its mesh are green"
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_narrow_windows_and_dark_mode(browser, server, scheme) -> None:
-    page = browser.new_page(viewport={"width": 380, "height": 800}, color_scheme=scheme)
-    page.goto(server[1])
-    page.get_by_role("button", name="sofa").wait_for()
-    assert page.evaluate("document.documentElement.scrollWidth") <= 380, "nothing sticks out"
-    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    light = np.mean(
-        [int(part) for part in background[background.index("(") + 1 : -1].split(",")[:3]]
-    )
-    assert (light < 80) == (scheme == "dark")
-    page.close()
+def test_narrow_windows_and_dark_mode(server, visit, fits, scheme) -> None:
+    tab = visit(server.address)
+    tab.get_by_role("button", name="sofa").wait_for()
+    fits(tab, 380, scheme)
+    answered(tab, press(tab, "sofa"))
+    for width in (320, 380, 1280):
+        fits(tab, width, scheme)
 
 
-def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(browser, server) -> None:
-    process, address = server
-    page = browser.new_page()
-    page.goto(address)
-    page.get_by_role("button", name="sofa").click()
-    page.locator(".view canvas").first.wait_for(timeout=PATIENCE)
-    assert page.get_by_role("button", name="sofa").get_attribute("aria-pressed") == "true"
-    page.get_by_role("button", name="chair").click()
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) in (0, 130), "a second or two on an idle machine"
-    page.close()
-    errors = (process.folder / "errors.txt").read_text()
+def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(server, browser) -> None:
+    tab = browser.new_page()
+    tab.goto(server.address)
+    tab.get_by_role("button", name="sofa").click()
+    tab.locator(".view > canvas").first.wait_for()
+    tab.get_by_role("button", name="chair").click()
+    assert tab.get_by_role("button", name="chair").get_attribute("aria-pressed") == "true"
+    server.process.send_signal(signal.SIGINT)
+    assert server.process.wait(timeout=60) in (0, 130), "a second or two on an idle machine"
+    tab.close()
+    errors = server.errors.read_text()
     assert "Traceback" not in errors and "ERROR" not in errors, errors

@@ -15,6 +15,7 @@ from scipy.ndimage import maximum_filter
 import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.crops import Crops
+from learn3d.data.poses import wrap_deg
 from learn3d.pictures import Surface
 from learn3d.studio.demo.picture import example
 from learn3d.studio.picture_to_mesh.reconstruction import (
@@ -28,6 +29,7 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     reconstruct_picture,
 )
 from learn3d.studio.picture_to_mesh.write import export_mesh
+from learn3d.studio.shapes import make_shape
 
 
 @pytest.fixture
@@ -237,7 +239,16 @@ def test_files_and_data_sets_give_the_same_mesh(
     assert (tmp_path / "e" / "photo.glb").is_file(), "the others are done"
 
 
-def test_a_learnt_azimuth_decides_if_outlines_do_not() -> None:
+def test_the_azimuth_of_the_input_is_found() -> None:
+    mesh = make_shape("chair", np.random.default_rng(6))
+    chair = torch.from_numpy(mesh.vertices @ mesh_to_object("y", "z").T).float()
+    chair = chair, torch.from_numpy(mesh.faces)
+    for azimuth in (0.0, 45.0, 210.0):
+        camera = nmr.LookAt.from_angles(2.732, 30.0, [azimuth], half_fov_deg=15.0)
+        mask = (nmr.render_silhouette(*chair, camera, image_size=128)[0] * 255).byte().numpy()
+        error = torch.tensor(input_azimuth_deg(Surface(*chair), mask) - azimuth)
+        assert abs(wrap_deg(error)) < 5
+    # from everywhere, a sphere has one outline: the learnt probabilities decide
     mask, probabilities = np.zeros((64, 64), np.uint8), torch.full((24,), 1e-3)
     mask[16:48, 16:48], probabilities[5] = 255, 1.0  # the cell of -105 .. -90 degrees
     assert -110 < input_azimuth_deg(Surface(*nmr.icosphere(2)), mask, probabilities) < -85
