@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from torch import Tensor
 
@@ -54,13 +55,14 @@ class Images:
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"Images cannot be changed, so {name} cannot be set")
 
-    def __iter__(self) -> Iterator[Tensor | Fragments]:
+    # Any: a type cannot tell which outputs there are
+    def __iter__(self) -> Iterator[Any]:
         return iter([getattr(self, name) for name in self._names])
 
     def __len__(self) -> int:
         return len(self._names)
 
-    def __getitem__(self, index: int) -> Tensor | Fragments:
+    def __getitem__(self, index: int) -> Any:
         return tuple(self)[index]
 
     def __repr__(self) -> str:

@@ -26,11 +26,6 @@ __all__ = [
     "voxel_precision_recall",
 ]
 
-try:
-    from scipy.spatial import cKDTree
-except ImportError:
-    cKDTree = None
-
 _CHUNK = 1 << 19  # distances held in memory at once, without SciPy
 
 
@@ -311,13 +306,17 @@ def _length(vectors: Tensor) -> Tensor:
 
 def _nearest(a: Tensor, b: Tensor) -> Tensor:
     """Index [B, N] of the point of b [B, M, 3] nearest to each point of a [B, N, 3]."""
-    search = _search_tree if cKDTree is not None and a.device.type == "cpu" else _search_all
+    try:
+        from scipy.spatial import cKDTree  # here, as its import takes longer than that of nmr
+    except ImportError:
+        cKDTree = None
+
+    def search_tree(x: Tensor, y: Tensor) -> Tensor:
+        _, number = cKDTree(y.numpy()).query(x.numpy(), workers=torch.get_num_threads())
+        return torch.from_numpy(number)
+
+    search = search_tree if cKDTree is not None and a.device.type == "cpu" else _search_all
     return torch.stack([search(x, y) for x, y in zip(a, b, strict=True)])
-
-
-def _search_tree(a: Tensor, b: Tensor) -> Tensor:
-    _, number = cKDTree(b.numpy()).query(a.numpy(), workers=torch.get_num_threads())
-    return torch.from_numpy(number)
 
 
 def _search_all(a: Tensor, b: Tensor) -> Tensor:
