@@ -15,6 +15,7 @@ from .conversions import (
 )
 from .look_at import Look, LookAt, Orthographic, points_from_angles
 from .pinhole import Pinhole
+from .poses import cat
 from .projection import Camera, ProjectingCamera, Projection
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "Pinhole",
     "ProjectingCamera",
     "Projection",
+    "cat",
     "from_opencv",
     "from_opengl",
     "from_pytorch3d",

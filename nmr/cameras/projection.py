@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .. import ops
 from .._validate import as_numbers, callers_level, check_vertices, describe, holds_for_all
+from .poses import Poses
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -50,7 +51,7 @@ class Camera(Protocol):
         ...
 
 
-class ProjectingCamera:
+class ProjectingCamera(Poses):
     """Base class of cameras that define :meth:`projection`; it provides :meth:`transform`."""
 
     perspective = True

@@ -297,6 +297,10 @@ CALLS = {
     "metrics.voxel_iou": Call(metrics.voxel_iou, GRIDS),
     "metrics.voxel_precision_recall": Call(metrics.voxel_precision_recall, GRIDS),
     "cameras.Projection": seen(cameras.Projection, PROJECTION),
+    "cameras.cat": Call(
+        lambda eye, points: cameras.cat([nmr.LookAt(eye)[1], nmr.LookAt(eye[0])]).unproject(points),
+        EYE | {"points": noise(4, 3)},
+    ),
     "cameras.from_opencv": seen(
         lambda **given: cameras.from_opencv(*given.values(), height=480, width=640), PINHOLE
     ),

@@ -1,0 +1,222 @@
+"""Cameras of several poses: their number, single ones, several joined; and points from depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
+
+import torch
+from torch import Tensor
+
+from .._validate import describe
+
+if TYPE_CHECKING:
+    from .projection import ProjectingCamera
+
+C = TypeVar("C", bound="ProjectingCamera")
+
+# parameters that may differ between poses, and the axes that they have in one pose
+_AXES = {"eye": 1, "at": 1, "up": 1, "direction": 1, "half_fov_deg": 0, "scale": 0}
+_AXES |= {"K": 2, "R": 2, "t": 1, "dist_coeffs": 1}
+_AXES |= {"matrix": 2, "intrinsics": 2, "distortion": 1, "origin": 1, "extent": 0}
+
+
+class Poses:
+    """The part of a camera that counts, selects and inverts its poses."""
+
+    def __len__(self) -> int:
+        """The number of poses."""
+        return max((len(x) for x in _batched(self).values()), default=1)
+
+    def __getitem__(self: C, index: int | slice | Sequence[int] | Tensor) -> C:
+        """Some of the poses, as a camera of the same class; a number gives one with one pose.
+
+        Gradients reach the parameters of the whole camera.
+        """
+        count = len(self)
+        if isinstance(index, int):
+            if not -count <= index < count:
+                raise IndexError(f"pose {index} of a camera with {count} poses")
+            index = slice(index % count, index % count + 1)
+        if isinstance(index, (list, tuple)):
+            index = torch.tensor(index, device="cpu")
+        whole = _batched(self)
+        if count == 1:  # parameters without a batch axis
+            whole = {name: x if name in whole else x.unsqueeze(0) for name, x in _given(self)}
+        chosen = {name: x[index] if len(x) > 1 or count == 1 else x for name, x in whole.items()}
+        return replace(self, **chosen)
+
+    def unproject(self: ProjectingCamera, points: Tensor) -> Tensor:
+        """The inverse of :meth:`transform`: points from renderer space to world space.
+
+        Parameters
+        ----------
+        points : float Tensor [B, N, 3] or [N, 3]
+            x right and y up, both in [-1, 1] across the image; z is the depth. For a camera with
+            square pixels and an image that is not square, call
+            ``camera.for_image(height, width).unproject(points)``.
+
+        Returns
+        -------
+        Tensor [B, N, 3]
+            In the dtype of ``points``; a B of 1 grows to the number of poses. Differentiable in
+            the points and in the camera's parameters.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For wrong types and shapes, another batch size than that of the poses, and a camera
+            with lens distortion.
+
+        Examples
+        --------
+        >>> camera, points = nmr.LookAt([1.0, 2.0, -3.0]), torch.rand(5, 3)
+        >>> (camera.unproject(camera.transform(points)) - points).abs().max() < 1e-5
+        tensor(True)
+        """
+        if not isinstance(points, Tensor) or not points.is_floating_point():
+            raise TypeError(f"points must be a float tensor [B, N, 3], got {describe(points)}")
+        if points.ndim not in (2, 3) or points.shape[-1] != 3:
+            raise ValueError(f"points must have shape [B, N, 3] or [N, 3], got {describe(points)}")
+        camera = self.projection().plain()
+        if camera.distortion is not None and camera.perspective:
+            raise ValueError(
+                "a camera with lens distortion has no unproject; undistort the pixels (cv2.undistortPoints) and drop "
+                "dist_coeffs"
+            )
+        matrix, intrinsics = (x.to(points.device) for x in (camera.matrix, camera.intrinsics))
+        given = (points if points.ndim == 3 else points.unsqueeze(0)).double()
+        if len(given) != 1 and camera.batch not in (1, len(given)):
+            raise ValueError(
+                f"points must have batch size 1 or {camera.batch}, that of the poses, got {describe(points)}"
+            )
+        place, depth = given.split([2, 1], dim=-1)
+        place = (place - intrinsics[:, None, :, 2]) @ torch.linalg.inv(intrinsics[:, :, :2]).mT
+        place = place * depth if camera.perspective else place
+        seen = torch.cat([place, depth.expand(*place.shape[:2], 1)], dim=-1)
+        world = (seen - matrix[:, None, :, 3]) @ torch.linalg.inv(matrix[:, :, :3]).mT
+        return world.to(points)
+
+    def unproject_depth(self: ProjectingCamera, depth: Tensor) -> Tensor:
+        """The points that the pixels of a depth image see, in world space.
+
+        Parameters
+        ----------
+        depth : float Tensor [B, h, w] or [h, w]
+            As :func:`nmr.render_depth` draws it. Without anti-aliasing it is exact; on background
+            it is ``far``.
+
+        Returns
+        -------
+        Tensor [B, h, w, 3]
+            The world point at the centre of the pixel in row y from the top and column x.
+            Differentiable in depth and in the camera's parameters.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As :meth:`unproject`.
+
+        Examples
+        --------
+        >>> vertices, faces = nmr.icosphere(3)
+        >>> camera = nmr.LookAt([0.0, 0.0, -3.0])
+        >>> depth = nmr.render_depth(vertices, faces, camera, image_size=64, anti_aliasing=False)
+        >>> points = camera.unproject_depth(depth)[depth < 100]
+        >>> (points.norm(dim=-1) - 1).abs().max() < 0.02  # they lie on the sphere
+        tensor(True)
+        """
+        if not isinstance(depth, Tensor) or not depth.is_floating_point():
+            raise TypeError(f"depth must be a float tensor [B, h, w], got {describe(depth)}")
+        if depth.ndim not in (2, 3):
+            raise ValueError(f"depth must have shape [B, h, w] or [h, w], got {describe(depth)}")
+        height, width = depth.shape[-2:]
+        x, y = (
+            (2 * torch.arange(n, dtype=torch.float64, device=depth.device) + 1) / n - 1
+            for n in (width, height)
+        )
+        grid = torch.stack([x.expand(height, width), -y[:, None].expand(height, width)], dim=-1)
+        depth = depth.reshape(-1, height, width, 1)
+        points = torch.cat([grid.to(depth).expand(len(depth), -1, -1, -1), depth], dim=-1)
+        camera = self.for_image(height, width)
+        return camera.unproject(points.flatten(1, 2)).unflatten(1, (height, width))
+
+
+def cat(cameras: Sequence[C]) -> C:
+    """One camera with the poses of several, one after the other.
+
+    Parameters
+    ----------
+    cameras : sequence of at least one camera of nmr's, all of one class
+
+    Returns
+    -------
+    camera of the same class
+        ``cat([a, b])[i]`` is ``a[i]`` for i below ``len(a)``. Differentiable in all parameters.
+
+    Raises
+    ------
+    TypeError, ValueError
+        For cameras of different classes, and if one has a parameter that another lacks, or
+        another handedness, image size or perspective.
+
+    Examples
+    --------
+    >>> front, sides = nmr.LookAt([0.0, 0.0, -3.0]), nmr.LookAt([[3.0, 0, 0], [-3.0, 0, 0]])
+    >>> len(nmr.cameras.cat([front, sides]))
+    3
+    """
+    cameras = list(cameras)
+    if not cameras or not all(isinstance(x, Poses) and is_dataclass(x) for x in cameras):
+        raise TypeError(f"cat takes a list of nmr's cameras, got {[describe(x) for x in cameras]}")
+    if len({type(x) for x in cameras}) > 1:
+        raise TypeError(
+            f"the cameras must be of one class, got {[describe(x) for x in cameras]}; "
+            "camera.for_image(height, width).projection() makes a Projection of any"
+        )
+    first, joined = cameras[0], {}
+    for field in fields(first):
+        values = [getattr(x, field.name) for x in cameras]
+        if isinstance(values[0], Poses):
+            joined[field.name] = cat(values)
+        elif field.name in _AXES and not all(x is None for x in values):
+            if any(x is None for x in values):
+                raise ValueError(f"{field.name} is None in some of the cameras")
+            parts = [
+                _rows(x, field.name, len(camera)) for x, camera in zip(values, cameras, strict=True)
+            ]
+            joined[field.name] = torch.cat(parts)
+        elif any(x != values[0] for x in values):
+            raise ValueError(f"{field.name} differs between the cameras: {values}")
+    return replace(first, **joined)
+
+
+def _given(camera: object) -> list[tuple[str, Tensor]]:
+    """The parameters that a camera has, as tensors; of a camera in a camera, that one."""
+    found = []
+    for field in fields(camera) if is_dataclass(camera) else ():
+        value = getattr(camera, field.name)
+        if isinstance(value, Poses):
+            found.append((field.name, value))
+        elif field.name in _AXES and value is not None:
+            found.append((field.name, _tensor(value)))
+    return found
+
+
+def _batched(camera: object) -> dict[str, Tensor]:
+    """Those with a batch axis."""
+    return {name: x for name, x in _given(camera) if isinstance(x, Poses) or x.ndim > _AXES[name]}
+
+
+def _rows(value: float | Tensor, name: str, count: int) -> Tensor:
+    """A parameter as ``[count, ...]``."""
+    value = _tensor(value)
+    value = value if value.ndim > _AXES[name] else value.unsqueeze(0)
+    return value.expand(count, *value.shape[1:])
+
+
+def _tensor(value: float | Tensor) -> Tensor:
+    if isinstance(value, Tensor):
+        return value
+    return torch.tensor(value, dtype=torch.float64, device="cpu")
