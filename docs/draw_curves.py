@@ -95,7 +95,7 @@ def draw(curves: Curves, mean_shapes: dict[str, float], angles: Curves) -> Figur
     count = 2 + bool(angles)
     size = (max(2.6 * len(curves) + 0.4, 4.8), 2.2 * count + 0.2)
     figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(count, len(curves), sharex="row" if angles else "col", squeeze=False)
+    axes = figure.subplots(count, len(curves), squeeze=False)
     for column, (title, methods) in enumerate(curves.items()):
         axes[0, column].set_title(title)
         axes[1, column].set_xlabel(f"steps of {STEP_IMAGES} images")

@@ -50,7 +50,9 @@ _RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
 _LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
 _CARS = _LONG.replace("airplane", "car")
-_CURVES = ("kato-5000", "ablation-5000-bf16", "kato-cars=generated", "ablation-cars=generated")
+_CURVES = ("pilot-airplanes=generated", "baselines-generated-airplanes=generated")
+_CURVES += ("kato-cars=generated", "ablation-cars=generated", "baselines-generated-cars=generated")
+_CURVES += ("kato-5000", "ablation-5000-bf16")
 _FUNCTIONS = (
     "silhouette",
     "rgb",
