@@ -14,7 +14,7 @@ from learn3d.data.layouts import LAYOUTS, Layout, check_options
 from learn3d.data.sampling import VIEWS_OF_OBJECT, Augmentation, Sampling
 from learn3d.methods.method import MethodSettings
 from learn3d.methods.optimization import LRSchedule, TrainingSchedule
-from learn3d.settings import Count, FilePath, Items, Step, checked
+from learn3d.settings import Count, FilePath, Items, OpenInPresets, Step, checked
 
 T = TypeVar("T")
 _MAY_DIFFER = "a resumed run may have another value"
@@ -26,13 +26,13 @@ MayDiffer = Annotated[T, _MAY_DIFFER]
 class TrainConfig:
     """One training run. config.json and every checkpoint hold it."""
 
-    data: MayDiffer[FilePath]
+    data: MayDiffer[OpenInPresets[FilePath]]
     """Folder of the data set. In the layout kato its files are 02691156_train_images.npz and so
     on."""
-    category: Annotated[str, Field(min_length=1)]
+    category: OpenInPresets[Annotated[str, Field(min_length=1)]]
     """Categories to train on together, separated by commas: names (chair), synset ids, or names
     of your own."""
-    output: MayDiffer[FilePath]
+    output: MayDiffer[OpenInPresets[FilePath]]
     """Folder of this run: checkpoints, metrics, pictures. It must be new or empty without
     --resume or --overwrite."""
     preset: str

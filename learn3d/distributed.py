@@ -22,8 +22,8 @@ from learn3d.data.dataset import Batch
 from learn3d.terminal import stop_on_signal
 
 TIMEOUT = timedelta(seconds=50)  # time that a rank waits in a step for the others
-# time that it waits for others that read data or save a checkpoint
-PATIENCE = timedelta(minutes=30)
+# the same for others that read data or save a checkpoint
+SLOW_TIMEOUT = timedelta(minutes=30)
 
 
 def world_size() -> int:
@@ -63,7 +63,7 @@ def join_ranks(device: str) -> Iterator[None]:
             "cpu:gloo,cuda:nccl" if device == "cuda" else "gloo", timeout=TIMEOUT
         )
         global _patient
-        _patient = dist.new_group(backend="gloo", timeout=PATIENCE)
+        _patient = dist.new_group(backend="gloo", timeout=SLOW_TIMEOUT)
     with (
         stop_on_signal()
     ):  # torchrun sends SIGTERM if another rank has ended; this one says so by itself
@@ -98,7 +98,7 @@ def own_rows(batch_size: int, views: int) -> Tensor:
 
 
 def all_gather_objects(value: Any, *, patient: bool = False) -> list[Any]:
-    """The values of all ranks, by rank. patient: wait for `PATIENCE`."""
+    """The values of all ranks, by rank. patient: wait for `SLOW_TIMEOUT`."""
     if world_size() == 1:
         return [value]
     found = [None] * world_size()
@@ -214,4 +214,4 @@ def wait_for_writer() -> None:
     all_gather_objects(None, patient=True)
 
 
-_patient: Any = None  # the group of all ranks whose operations wait for `PATIENCE`
+_patient: Any = None  # the group of all ranks whose operations wait for `SLOW_TIMEOUT`

@@ -55,9 +55,8 @@ def depth_losses(depth: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def gaussian_prior_loss(codes: Tensor, form: Literal["squared", "norm"]) -> Tensor:
-    """L_prior: batch mean of the norm of the codes (eq.
-
-    5, "norm") or of its square (published code, "squared").
+    """L_prior: batch mean of the norm of the codes ("norm", the paper's eq. 5) or of its square
+    ("squared", published code).
 
     codes [B,C]; differentiable; the gradient at a zero code is zero.
     """

@@ -8,6 +8,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from learn3d.config import TrainConfig, all_options
 from learn3d.files import limits
 from learn3d.files.reading import read_json
@@ -19,7 +21,7 @@ from learn3d.methods.vpl import VPLSettings
 from learn3d.terminal import unknown_name
 
 DEFAULT_PRESET = "plus-kato"
-#: Options that a preset leaves open; its values for them are placeholders.
+#: Options that a preset leaves open: tyro.MISSING.
 PLACES = ("data", "category", "output")
 
 #: Short names of the methods, accepted wherever a preset is: the preset for Kato's data, and a line for `train --help`.
@@ -48,9 +50,7 @@ SHORT_NAMES = {
 
 # Peng et al. 2020, section 4, with the losses of their published code.
 _KATO = TrainConfig(
-    data=Path("DATA"),
-    category="CATEGORY",
-    output=Path("OUTPUT"),
+    **dict.fromkeys(PLACES, tyro.MISSING),
     preset="peng2020-kato",
     label="Proposed",
     settings=PoseInvariantSettings(),

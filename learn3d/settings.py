@@ -15,7 +15,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+import tyro
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, WrapValidator
 from pydantic.dataclasses import dataclass
 
 from learn3d.terminal import unknown_name
@@ -74,10 +75,10 @@ def _path(value: Any) -> Path:
     return Path(value)
 
 
-MOST = 1e30  # largest value of a setting; float32 ends at 3e38
+LARGEST = 1e30  # largest value of a setting; float32 ends at 3e38
 
-Positive = Annotated[float, Field(gt=0, le=MOST)]
-NonNegative = Annotated[float, Field(ge=0, le=MOST)]
+Positive = Annotated[float, Field(gt=0, le=LARGEST)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Weight = NonNegative  # weight of a loss
 Share = Annotated[float, Field(ge=0, le=1)]
 Step = Annotated[int, Field(ge=1, le=10**9)]  # a training step, counted from 1
@@ -87,4 +88,8 @@ Pixels = Annotated[int, Field(ge=1, le=1024)]  # side of the networks' images; 2
 Channels = Annotated[int, Field(ge=1, le=512)]
 LayerChannels = Annotated[int, Field(ge=1, le=1024)]  # channels of one layer
 FilePath = Annotated[Path, BeforeValidator(_path)]
+#: A field that presets leave open: their value for it is tyro.MISSING, and a command line must give it.
+OpenInPresets = Annotated[
+    T, WrapValidator(lambda value, check: value if value is tyro.MISSING else check(value))
+]
 Items = Field(strict=False)  # Annotated[tuple[...], Items] accepts a list, as JSON has no tuples

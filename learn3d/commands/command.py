@@ -22,6 +22,7 @@ Runs = tyro.conf.Positional[
 ]
 DataFolder = tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="DATA")]]
 
+HELP = {"-h", "--help"}
 #: Options of nested dataclasses have no prefixes.
 FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.AvoidSubcommands)
 
@@ -53,7 +54,7 @@ class Command:
         """The command with the given options. Prints the help and exits if --help is among them."""
         about = ""
         default = cls.default(arguments)
-        if {"-h", "--help"} & set(arguments):
+        if HELP & set(arguments):
             about = cls.about()
             _join_help_lines(cls, default)
         given = {} if default is None else {"default": default}

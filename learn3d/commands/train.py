@@ -1,23 +1,31 @@
 """Commands on runs: train a model, and measure trained ones."""
 
-import argparse
-import copy
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from learn3d.commands.command import Command, OnDataset, Runs
+from learn3d.commands.command import HELP, Command, OnDataset, Runs
 from learn3d.config import TrainConfig
 from learn3d.distributed import join_ranks, rank
 from learn3d.files.writing import check_target, write_json
-from learn3d.presets import DEFAULT_PRESET, PLACES, PRESETS, SHORT_NAMES, full_name, load_config
+from learn3d.presets import DEFAULT_PRESET, PRESETS, SHORT_NAMES, full_name, load_config
 from learn3d.runs.baselines import baselines_of_runs
 from learn3d.runs.measurement import MEASURES, class_means, evaluate_runs, format_table
 from learn3d.terminal import INTERRUPTED, align, say
 from learn3d.training import train
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The options of `Train` that decide the defaults of the others."""
+
+    preset: str | None = None
+    output: Path | None = None
+    resume: bool = False
 
 
 class Train(Command):
@@ -47,17 +55,11 @@ class Train(Command):
     @classmethod
     def default(cls, arguments: Sequence[str]) -> "Train":
         """The options of the saved run with --resume, else those of the preset."""
-        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-        parser.add_argument("--preset", nargs="?")
-        parser.add_argument("--output", nargs="?", type=Path)
-        parser.add_argument("--resume", action="store_true")
-        given, others = parser.parse_known_args(arguments)
+        words = [word for word in arguments if word not in HELP]
+        given, _ = tyro.cli(_Chosen, prog="learn3d train", args=words, return_unknown_args=True)
         preset = full_name(given.preset or DEFAULT_PRESET)
-        if not given.resume or {"-h", "--help"} & set(others):
-            config = copy.copy(PRESETS[preset])
-            for name in PLACES:
-                object.__setattr__(config, name, tyro.MISSING)  # tyro asks for them
-            return cls(config=config)
+        if not given.resume or len(words) < len(arguments):
+            return cls(config=PRESETS[preset])
         if given.output is None:
             raise ValueError("--resume needs --output: the folder of the run that is to go on")
         saved = load_config(given.output / "config.json")

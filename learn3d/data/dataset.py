@@ -171,9 +171,9 @@ class ViewDataset:
         return DatasetInfo(*sizes, mirror_plane_deg, cube_side, solidity)
 
     def batch(self, indices: Tensor, *, voxels: bool = True) -> Batch:
-        """The samples `indices`, integer [B] in 0 ..
+        """The samples `indices`, integer [B] from 0 to M-1, as one Batch on the CPU.
 
-        M-1, as one Batch on the CPU. ValueError for other indices.
+        Raises ValueError for other indices.
 
         voxels: False for training, which needs none; they are twice as large as the images.
         """

@@ -78,7 +78,7 @@ class LookAtPoses(_PoseSet):
 
     def in_range(self) -> Tensor:
         """Which poses are finite and within the bounds of `files.limits`: bool [M]."""
-        (near, far), (narrow, wide) = limits.DISTANCE, limits.FOV_DEG
+        (near, far), (narrow, wide) = limits.CAMERA_DISTANCE, limits.FOV_DEG
         azimuth, elevation, distance, half_fov = map(torch.as_tensor, vars(self).values())
         sound = (azimuth.abs() <= limits.ANGLE_DEG) & (elevation.abs() < 90)
         return (
@@ -155,9 +155,13 @@ class RotationPoses(_PoseSet):
 Poses = LookAtPoses | RotationPoses
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PoseCandidates:
-    """C candidate poses for each of M images. Pose i * C + c is candidate c of image i."""
+    """C candidate poses for each of M images. Pose i * C + c is candidate c of image i.
+
+    The weights are the only part of a data set that changes: a training reweights them
+    (`methods.pose_updates`), later batches draw by them, and checkpoints hold them.
+    """
 
     poses: LookAtPoses  # M * C poses
     view_ids: np.ndarray  # int64 [M * C]: their view classes
@@ -166,6 +170,12 @@ class PoseCandidates:
 
     def __len__(self) -> int:
         return len(self.weights)
+
+    def reweight(self, weights: np.ndarray) -> float:
+        """Replace the weights. Returns the share of images whose best candidate changed."""
+        changed = float((weights.argmax(1) != self.weights.argmax(1)).mean())
+        self.weights = weights
+        return changed
 
     def draw(self, indices: Tensor, seed: int, step: int) -> tuple[LookAtPoses, Tensor]:
         """Poses and view classes int64 [B] of the images `indices`: a candidate each, drawn by

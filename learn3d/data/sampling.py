@@ -26,9 +26,8 @@ VIEWS_OF_OBJECT: dict[Sampling, int] = {"views": 1, "pairs": 2, "groups": GROUP_
 def batches(
     dataset: ViewDataset, options: Any, start: int = 1, rows: Tensor | slice = ALL_ROWS
 ) -> Iterator[Batch]:
-    """The batches of the training steps `start` ..
-
-    `options.iterations`, sampled and augmented, without voxels.
+    """The batches of the training steps from `start` to `options.iterations`, sampled and
+    augmented, without voxels.
 
     options: `sampling`, `batch_size`, `augment`, `seed` and `iterations`, as in `TrainConfig`.
     rows: int64 [b], the rows that this rank takes of each batch (default: all). Random numbers

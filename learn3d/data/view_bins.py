@@ -95,9 +95,8 @@ class AngleBins:
 def training_classes(
     views: tuple[np.ndarray, np.ndarray], training: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Class int64 [M] in 0 ..
-
-    K-1 of each view, and the cells int64 [K] of the classes: those with training views.
+    """Class of each view, int64 [M] below K, and the cells int64 [K] of the classes: those with
+    training views.
 
     views: their cells int64 [M] and directions float [M, D]. training: those of the training
     views. A view in another cell gets the class of the training view with the nearest direction,

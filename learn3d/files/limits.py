@@ -43,5 +43,5 @@ VIEW_CLASSES = 100_000  # cells of azimuth and elevation; 512 in the papers
 
 # Cameras
 ANGLE_DEG = 36_000.0  # azimuths; a hundred turns, at which the spacing of float32 is 0.004 degrees
-DISTANCE = (1e-3, 1e4)  # lengths of the object
+CAMERA_DISTANCE = (1e-3, 1e4)  # lengths of the object
 FOV_DEG = (0.1, 170.0)  # full field of view; a telescope: 0.5

@@ -31,8 +31,8 @@ CLAMP_LIMIT = 0.499  # clamped coordinates, in sides of the cube; kato18 counts 
 class MeshSettings(MethodSettings):
     """Networks from images to meshes."""
 
-    # A subclass may make this a field.
-    lambda_view = 0.0  # weight of the loss of a network that classifies the azimuth of an image
+    # weight of the loss of a network that classifies the azimuth of an image; a subclass may make it a field
+    lambda_view: ClassVar[float] = 0.0
 
     encoder: EncoderName = "conv"
     """Network from images to codes. conv: three convolutions on 64-pixel RGB and mask.

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from learn3d.data.dataset import Batch, DatasetInfo
+from learn3d.data.sampling import Sampling
 from learn3d.methods.optimization import EMA, TrainingSchedule
 from learn3d.pictures import Surface, grid_surface
 from learn3d.settings import checked
@@ -24,20 +25,42 @@ Losses: TypeAlias = dict[str, tuple[float, Tensor]]
 
 @checked
 class MethodSettings:
-    """Settings of a method.
+    """Settings of a method: fields are options.
 
-    A run also reads the values below, which subclasses override, some by properties.
+    The properties follow from them; a run reads these, and subclasses override them.
     """
 
-    # These values have no annotation, so they are no fields: nobody can set them.
-    image_size = 64  # side of the encoder's input images in pixels
-    sampling = None  # the sampling that the training needs, or None if it can take all
-    reads_view_ids = False  # whether training depends on the view classes
-    wants_mirror_plane = False  # whether networks depend on the mirror plane of the training data
-    wants_solidity = False  # whether networks or losses depend on the solidity of the training data
-    varies_over_run = None  # name of a setting that makes losses depend on the number of iterations
+    @property
+    def image_size(self) -> int:
+        """Side of the encoder's input images in pixels; data sets are read at this size."""
+        return 64
 
-    needs_poses = True  # whether every training image must have a known pose
+    @property
+    def sampling(self) -> Sampling | None:
+        """The only sampling with which the losses work; None if they take any batch."""
+        return None
+
+    @property
+    def reads_view_ids(self) -> bool:
+        """Whether losses read the view classes, which a flipped image does not keep."""
+        return False
+
+    @property
+    def wants_mirror_plane(self) -> bool:
+        """Whether a run must look for the mirror plane of the training masks."""
+        return False
+
+    @property
+    def wants_solidity(self) -> bool:
+        """Whether a run must measure the solidity of the training masks."""
+        return False
+
+    @property
+    def varies_over_run(self) -> str | None:
+        """Name of a setting that makes losses depend on the number of iterations, which then must
+        not change when a run is resumed; None if there is none.
+        """
+        return None
 
     def check_run(self, *, iterations: int, batch_size: int) -> None:
         """Raise ValueError if the settings do not fit a run of this length and batch size."""
@@ -51,7 +74,7 @@ class MethodSettings:
 
         Raises ValueError if the method cannot learn from such data.
         """
-        if self.needs_poses and info.pose_features == 0:
+        if info.pose_features == 0:
             raise ValueError(
                 f"{type(self).__name__.removesuffix('Settings')} learns from images whose camera poses are known, but "
                 "this data set has no poses; take a data set with poses, or estimate them from its masks (learn3d "

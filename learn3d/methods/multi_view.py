@@ -10,7 +10,7 @@ from torch import nn
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE, Batch
-from learn3d.data.sampling import GROUP_SIZE
+from learn3d.data.sampling import GROUP_SIZE, Sampling
 from learn3d.losses import depth_losses, gaussian_prior_loss
 from learn3d.methods.mesh_method import MeshMethod, MeshSettings
 from learn3d.methods.method import Losses
@@ -23,7 +23,9 @@ from learn3d.settings import Positive, Weight, checked
 class MultiViewSettings(MeshSettings):
     """Networks, and the weight of the smoothness loss."""
 
-    sampling = "pairs"
+    @property
+    def sampling(self) -> Sampling:
+        return "pairs"
 
 
 class MultiView(MeshMethod):
@@ -50,7 +52,6 @@ class MultiView(MeshMethod):
 class ManyViewsSettings(MeshSettings):
     """Networks and weights of the losses; a loss with weight 0 is not computed."""
 
-    sampling = "groups"
     encoder: EncoderName = "conv-light"
     symmetry: SymmetryOption = "auto"
     clamp_to_cube: bool = True
@@ -66,6 +67,10 @@ class ManyViewsSettings(MeshSettings):
     lambda_view: Weight = 0.0
     """Weight of the loss of a small network that classifies the azimuth of an image;
     reconstruction places the camera of a picture by it. 0: no such network."""
+
+    @property
+    def sampling(self) -> Sampling:
+        return "groups"
 
 
 class ManyViews(MeshMethod):

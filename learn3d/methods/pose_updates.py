@@ -55,10 +55,8 @@ def update_poses(method: MeshMethod, dataset: ViewDataset) -> float:
             )
     prior = torch.from_numpy(candidates.prior)
     logits = torch.cat(logits) + prior.clamp_min(_LEAST_PRIOR).log()
-    weights = _with_marginal(logits, candidates.poses.azimuth_deg.view(prior.shape), prior).numpy()
-    changed = float((weights.argmax(1) != candidates.weights.argmax(1)).mean())
-    candidates.weights[:] = weights
-    return changed
+    weights = _with_marginal(logits, candidates.poses.azimuth_deg.view(prior.shape), prior)
+    return candidates.reweight(weights.numpy())
 
 
 def _with_marginal(logits: Tensor, azimuth_deg: Tensor, prior: Tensor) -> Tensor:

@@ -39,9 +39,6 @@ FourLayers = Annotated[tuple[LayerChannels, LayerChannels, LayerChannels, LayerC
 class PrGANSettings(MethodSettings):
     """Learning rates, widths, phases and cameras, as in the published code for airplanes."""
 
-    image_size = SILHOUETTE_SIZE
-    reads_view_ids = True
-
     encoder_from_step: Step = 53_051
     """First step that trains the encoder instead of the GAN (published: after 50 epochs)."""
     generator_learning_rate: Positive = 2.5e-3
@@ -67,6 +64,14 @@ class PrGANSettings(MethodSettings):
     the images."""
     half_fov_deg: Annotated[float, Field(gt=0, lt=90)] = 15.0
     """Half of the field of view of the data set's cameras."""
+
+    @property
+    def image_size(self) -> int:
+        return SILHOUETTE_SIZE
+
+    @property
+    def reads_view_ids(self) -> bool:
+        return True
 
     def check_run(self, *, iterations: int, batch_size: int) -> None:
         if self.encoder_from_step > iterations:

@@ -23,7 +23,7 @@ from learn3d.presets import command_line
 from learn3d.runs import checkpoint
 from learn3d.runs.folder import METRICS
 from learn3d.runs.log import read_records
-from learn3d.settings import MOST, Step, split_names
+from learn3d.settings import LARGEST, Step, split_names
 from learn3d.terminal import align, note
 
 #: For each measure its header in tables and its definition. Measures are means over images, then over categories.
@@ -70,7 +70,7 @@ MEASURES = {
 }
 HEADERS = [header for header, _ in MEASURES.values()]
 
-Number = Annotated[float, Field(ge=-MOST, le=MOST)] | None
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)] | None
 Amount = Annotated[int, Field(ge=0, le=10**9)]
 
 

@@ -140,7 +140,7 @@ class Run:
         for name, optimizer in self.method.optimizers.items():
             checkpoint.restore_optimizer(name, optimizer, tensors, path)
         if self.candidates is not None:
-            self.candidates.weights[:] = tensors["poses.weights"]
+            self.candidates.reweight(tensors["poses.weights"].numpy())
         if "random.cpu" not in tensors:
             raise ValueError(
                 f"{path} holds no state of the random numbers; is it the last checkpoint of a run?"

@@ -123,9 +123,8 @@ def rotation_cells(rotations: np.ndarray) -> np.ndarray:
 
 
 def view_classes(rotations: np.ndarray, training: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Class int64 [M] in 0 ..
-
-    K-1 of each rotation [M, 3, 3], and the K names. Classes are cells of `training`.
+    """Class of each rotation [M, 3, 3], int64 [M] below K, and the K names. Classes are cells of
+    `training`.
     """
     # The trace of A^T B grows as the angle between the rotations A and B falls.
     ids, kept = training_classes(

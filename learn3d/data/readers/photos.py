@@ -64,7 +64,9 @@ class Photo:
         Annotated[float, Field(strict=False, gt=-limits.ANGLE_DEG, lt=limits.ANGLE_DEG)] | None
     ) = None
     elevation_deg: Annotated[float, Field(strict=False, gt=-90, lt=90)] | None = None
-    distance: Annotated[float, Field(strict=False, gt=0.5, lt=limits.DISTANCE[1])] | None = None
+    distance: Annotated[float, Field(strict=False, gt=0.5, lt=limits.CAMERA_DISTANCE[1])] | None = (
+        None
+    )
     fov_deg: (
         Annotated[float, Field(strict=False, gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None
     ) = None

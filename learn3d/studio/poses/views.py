@@ -42,7 +42,7 @@ class CameraOptions:
     elevation: str | None = None
     """Elevation of all cameras in degrees, or a range LOW:HIGH. If not given: from the data set, or
     30 if it has none."""
-    distance: Annotated[float, Field(gt=0.5, lt=limits.DISTANCE[1])] | None = None
+    distance: Annotated[float, Field(gt=0.5, lt=limits.CAMERA_DISTANCE[1])] | None = None
     """Distance of all cameras, in units of the object's longest side. If not given: from the data
     set, or estimated from the largest mask."""
     fov_deg: Annotated[float, Field(gt=limits.FOV_DEG[0], lt=limits.FOV_DEG[1])] | None = None

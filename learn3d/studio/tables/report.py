@@ -23,7 +23,7 @@ from learn3d.presets import command_line
 from learn3d.runs.folder import METRICS
 from learn3d.runs.log import read_records
 from learn3d.runs.measurement import MEASURES
-from learn3d.settings import MOST
+from learn3d.settings import LARGEST
 from learn3d.studio.picture_to_mesh.smoothing import smooth
 from learn3d.studio.tables.comparison import percentile_interval, resampled_means
 from learn3d.studio.tables.trained_models import TrainedModel, open_runs
@@ -306,7 +306,7 @@ def read_metrics(folder: Path) -> Log:
     for _, record in read_records(read_bytes(file, limits.METRICS_BYTES, "the metrics of a run")):
         step, split = record.pop("step"), record.pop("split")
         for name, value in record.items():
-            title, known = f"{split} {name}", type(value) in (int, float) and abs(value) <= MOST
+            title, known = f"{split} {name}", type(value) in (int, float) and abs(value) <= LARGEST
             if (
                 known
                 and name not in _NOT_CURVES

@@ -20,7 +20,7 @@ def test_poses_are_found_again_from_the_models_shapes() -> None:
     (vertices, faces), dataset = dart_shapes(6), darts(6)
     poses = LookAtPoses(torch.arange(24.0).repeat(144) * 15, 30.0, 2.732, 15.0)
     weights = np.full((144, 24), 1 / 24, np.float32)
-    candidates = PoseCandidates(poses, np.zeros(24 * 144, int), weights, weights.copy())
+    candidates = PoseCandidates(poses, np.zeros(24 * 144, int), weights, weights)
     dataset = dataclasses.replace(dataset, candidates=candidates)
     batches_of_shapes = iter(vertices.repeat_interleave(24, 0).split(128))
     decode = lambda codes: Meshes(next(batches_of_shapes), faces)  # noqa: E731
@@ -28,9 +28,9 @@ def test_poses_are_found_again_from_the_models_shapes() -> None:
         in_use=contextlib.nullcontext, encode=torch.Tensor.float, decode=decode
     )
     changed = update_poses(method, dataset)
-    found = torch.from_numpy(weights.argmax(1)) * 15.0
+    found = torch.from_numpy(candidates.weights.argmax(1)) * 15.0
     assert ((found - dataset.poses.azimuth_deg + 180) % 360 - 180).abs().max() == 0
-    assert np.allclose(weights.sum(1), 1) and changed == pytest.approx(1 - 1 / 24)
+    assert np.allclose(candidates.weights.sum(1), 1) and changed == pytest.approx(1 - 1 / 24)
     assert (
         update_steps(1600, 3) == (200, 400, 800)
         and update_steps(2, 3) == (1,)
