@@ -8,11 +8,11 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from learn3d.config import TrainConfig, config_to_dict
+from learn3d.config import config_to_dict
 from learn3d.files.writing import write_json
 from learn3d.runs.folder import CONFIG
 from learn3d.runs.measurement import CurvePoint, ObjectMeans, Result
-from learn3d.studio.tables.plan import variant_of
+from learn3d.studio.tables.plan import PlannedRun
 from learn3d.tasks import Task, Workers
 from learn3d.terminal import stop_on_signal
 
@@ -43,9 +43,10 @@ def result(**changes: Any) -> Result:
     return Result(**(numbers | counts | texts | lists | changes))
 
 
-def work(config: TrainConfig) -> bool:
+def work(run: PlannedRun) -> bool:
     """A category called "fails" fails, "waits" goes on until it is asked to stop; others leave a result whose IoUs
     depend on the variant, the seed and the object."""
+    config = run.config
     print("threads", config.threads, flush=True)
     if config.category == "fails":
         print("first line")
@@ -60,7 +61,7 @@ def work(config: TrainConfig) -> bool:
                 time.sleep(0.02)
             print("saved", flush=True)
         return False
-    base = {"vanilla": 0.3, "proposed": 0.4}[variant_of(config)] + 0.01 * config.seed
+    base = {"vanilla": 0.3, "proposed": 0.4}[run.variant] + 0.01 * config.seed
     means = [round(base + 0.02 * k, 5) for k in range(5)]
     iou = sum(means) / 5
     measured = result(
@@ -80,7 +81,7 @@ def work(config: TrainConfig) -> bool:
     return True
 
 
-def fail_if_started(config: TrainConfig) -> bool:
+def fail_if_started(run: PlannedRun) -> bool:
     """Replaces `work` if nothing may be trained."""
     raise ValueError("started")
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from learn3d.config import TrainConfig
 from learn3d.data.conventions import SYNSETS
 from learn3d.evaluation import ANGLES_DEG
 from learn3d.files import limits
@@ -26,14 +25,14 @@ from learn3d.runs.measurement import (
     Result,
     format_measures,
 )
-from learn3d.studio.tables.plan import Request, name_run, select_rows, variant_of
+from learn3d.studio.tables.plan import PlannedRun, Request, select_rows
 from learn3d.studio.tables.tables import MEAN, TABLES, Row, Table
 
 RESAMPLES = 2000
 Cells = list[list[str]]
 # results of one method for each category of a column, by seed; a baseline's seed is None
 Side = list[dict[int | None, Result | Baseline]]
-MeasuredRuns = Sequence[tuple[TrainConfig, Result]]
+MeasuredRuns = Sequence[tuple[PlannedRun, Result]]
 
 # measures that results of earlier versions lack
 _LATER_MEASURES = {"voxel_iou_unclamped", "mmd_floor"}
@@ -87,19 +86,19 @@ def percentile_interval(resampled: np.ndarray) -> tuple[float, float] | None:
 
 def make_report(
     request: Request,
-    runs: Sequence[TrainConfig],
-    results: Mapping[Path, Result],
+    runs: Sequence[PlannedRun],
+    results: Mapping[str, Result],
     baselines: Sequence[Baseline] = (),
 ) -> tuple[dict[str, Cells], str]:
     """The tables "main", "differences", "runs", "angles", "curves", perhaps "poses"; and their
     Markdown.
 
     "runs" has both checkpoints of a run, if they differ. "curves" has the validations of each run.
-    The Markdown leaves them out. results: by folder. baselines: those of all categories. Commands
+    The Markdown leaves them out. results: by name of the run. baselines: those of all categories. Commands
     have DATA and OUTPUT in place of folders, so that the report has no path of a machine.
     """
     table = TABLES[request.table]
-    done = [(run, results[run.output]) for run in runs if run.output in results]
+    done = [(run, results[run.name]) for run in runs if run.name in results]
     rows = select_rows(request)
     main, differences = _compare_methods(table, rows, runs, done, baselines)
     trained = _run_rows(done)
@@ -114,7 +113,7 @@ def make_report(
     parts = [f"## {table.title}", _markdown(main), NOTES]
     if baselines:
         parts.append(ABOUT_BASELINES)
-    if missing := [name_run(run) for run in runs if run.output not in results]:
+    if missing := [run.name for run in runs if run.name not in results]:
         parts.append(f"Missing: {', '.join(missing)}.")
     parts += [
         f"Differences to {table.baseline}, paired by seed and by object:",
@@ -141,21 +140,21 @@ def _by_method(done: MeasuredRuns) -> dict[tuple[str, str], dict[int, Result]]:
     """Results by variant and category, then by seed."""
     measured: dict[tuple[str, str], dict[int, Result]] = {}
     for run, result in done:
-        measured.setdefault((variant_of(run), run.category), {})[run.seed] = result
+        measured.setdefault((run.variant, run.config.category), {})[run.config.seed] = result
     return measured
 
 
 def _compare_methods(
     table: Table,
     rows: Mapping[str, Row],
-    runs: Sequence[TrainConfig],
+    runs: Sequence[PlannedRun],
     done: MeasuredRuns,
     baselines: Sequence[Baseline],
 ) -> tuple[Cells, Cells]:
     """Printed and measured values of each row by category, and differences to the baseline."""
     measured = _by_method(done)
     without_network = {(b.name, b.category): {None: b} for b in baselines}
-    categories = list(dict.fromkeys(run.category for run in runs))
+    categories = list(dict.fromkeys(run.config.category for run in runs))
     columns = {name: [name] for name in categories} | {MEAN: categories}
 
     def results_of(name: str, found: Mapping[tuple[str, str], dict] = measured) -> list[Side]:
@@ -193,14 +192,14 @@ def _compare_methods(
 
 
 def _disagreements(
-    table: Table, rows: Mapping[str, Row], runs: Sequence[TrainConfig], done: MeasuredRuns
+    table: Table, rows: Mapping[str, Row], runs: Sequence[PlannedRun], done: MeasuredRuns
 ) -> list[str]:
     """A sentence for each method and category on which measures of accuracy disagree about it and
     the baseline.
     """
     measured = _by_method(done)
     found = []
-    for category in dict.fromkeys(run.category for run in runs):
+    for category in dict.fromkeys(run.config.category for run in runs):
         theirs = measured.get((table.rows[table.baseline].variant, category), {})
         for label, row in rows.items():
             ours = measured.get((row.variant, category), {})
@@ -227,12 +226,12 @@ def _run_rows(done: MeasuredRuns) -> Cells:
             counts = [
                 f"step {measured.step}" + (f" ({which})" if result.other else ""),
                 str(measured.iterations),
-                str(run.batch_size),
+                str(run.config.batch_size),
                 str(measured.images),
             ]
             minutes = "-" if measured.seconds is None else f"{measured.seconds / 60:.1f}"
             values = format_measures(vars(measured))
-            rows.append([name_run(run), *counts, *values, minutes, measured.commit])
+            rows.append([run.name, *counts, *values, minutes, measured.commit])
     return rows
 
 
@@ -242,7 +241,7 @@ def _angle_rows(done: MeasuredRuns) -> Cells:
     for run, result in done:
         if known := dict(result.angles):
             values = [known.get(angle) for angle in ANGLES_DEG]
-            rows.append([name_run(run), *("-" if v is None else f"{v:.4f}" for v in values)])
+            rows.append([run.name, *("-" if v is None else f"{v:.4f}" for v in values)])
     return rows
 
 
@@ -253,7 +252,7 @@ def _curve_rows(done: MeasuredRuns) -> Cells:
         for split, step, *values in result.curve:
             rows.append(
                 [
-                    name_run(run),
+                    run.name,
                     split,
                     str(step),
                     *("-" if v is None else f"{v:.4f}" for v in values),
@@ -262,15 +261,15 @@ def _curve_rows(done: MeasuredRuns) -> Cells:
     return rows
 
 
-def _general_command(run: TrainConfig) -> str:
+def _general_command(run: PlannedRun) -> str:
     """The command of a run, with words in place of folders, category and seed."""
     return command_line(
-        run,
+        run.config,
         data="DATA",
         category="CATEGORY",
         seed="SEED",
         poses="OUTPUT/poses/CATEGORY-seedSEED.npz",
-        output=f"OUTPUT/runs/CATEGORY/{variant_of(run)}-seedSEED",
+        output=f"OUTPUT/runs/CATEGORY/{run.variant}-seedSEED",
     )
 
 
@@ -342,17 +341,22 @@ def read_pose_errors(poses: Path) -> dict[str, float]:
     )
 
 
-def _pose_rows(runs: Sequence[TrainConfig], results: Mapping[Path, Result]) -> Cells:
+def _pose_rows(runs: Sequence[PlannedRun], results: Mapping[str, Result]) -> Cells:
     """A header; errors of each run's estimated poses, and its IoU beside that on known poses."""
-    known = {(run.category, run.seed): results.get(run.output) for run in runs if run.poses is None}
+    known = {
+        (run.config.category, run.config.seed): results.get(run.name)
+        for run in runs
+        if run.config.poses is None
+    }
     by_category: dict[str, dict[str, Sequence[float]]] = {}
     for run in runs:
-        both = known.get((run.category, run.seed)), results.get(run.output)
-        if run.poses is not None and None not in both:
-            errors = read_pose_errors(run.poses)
+        config = run.config
+        both = known.get((config.category, config.seed)), results.get(run.name)
+        if config.poses is not None and None not in both:
+            errors = read_pose_errors(config.poses)
             ious = [result.voxel_iou for result in both]
             values = [*(errors[name] for name in _POSE_ERRORS), *ious, ious[1] / ious[0]]
-            by_category.setdefault(run.category, {})[str(run.seed)] = values
+            by_category.setdefault(config.category, {})[str(config.seed)] = values
     rows = [
         [
             "category",

@@ -23,7 +23,7 @@ from learn3d.studio.poses.comparison import compare
 from learn3d.studio.poses.estimate import NEAR_DEG, PoseOptions
 from learn3d.studio.poses.views import CameraOptions, estimate_views, load_views
 from learn3d.studio.tables.comparison import make_report, read_pose_errors
-from learn3d.studio.tables.plan import Request, name_run, plan_runs, variant_of
+from learn3d.studio.tables.plan import PlannedRun, Request, plan_runs
 from learn3d.studio.tables.tables import TABLES, VARIANTS
 from learn3d.tasks import Task, run_tasks
 from learn3d.terminal import INTERRUPTED, align, note, say
@@ -67,12 +67,13 @@ def _measure_updated_poses(config: TrainConfig) -> None:
     writing.write_json(config.poses.with_suffix(".json"), errors)
 
 
-def train_and_test(config: TrainConfig) -> bool:
+def train_and_test(run: PlannedRun) -> bool:
     """Estimate poses if needed, train, measure, write test.json; False if a signal stopped it.
 
     An existing run continues; `train` checks that it has the same options and data. Raises as
     `train` and `evaluate_runs` do.
     """
+    config = run.config
     if config.poses is not None:
         estimate_poses(config)
     resume = run_folder.is_run(config.output)
@@ -82,7 +83,7 @@ def train_and_test(config: TrainConfig) -> bool:
         return False
     if config.poses is not None:
         _measure_updated_poses(config)
-    which = VARIANTS[variant_of(config)].checkpoint
+    which = VARIANTS[run.variant].checkpoint
     measure = functools.partial(
         evaluate_runs, [config.output], data=config.data, device=config.device
     )
@@ -96,9 +97,7 @@ def train_and_test(config: TrainConfig) -> bool:
     return True
 
 
-def run_experiment(
-    request: Request, *, work: Callable[[TrainConfig], bool] = train_and_test
-) -> int:
+def run_experiment(request: Request, *, work: Callable[[PlannedRun], bool] = train_and_test) -> int:
     """Train and test the missing runs of a table and write its report.
 
     Returns the exit status: 0, 1 if a run failed, 130 if a signal stopped it. The report of the
@@ -108,7 +107,7 @@ def run_experiment(
     """
     threads = request.threads or request.workers.threads
     runs = plan_runs(dataclasses.replace(request, threads=threads))
-    if conflicts := [text for run in runs if (text := find_conflict(run))]:
+    if conflicts := [text for run in runs if (text := find_conflict(run.config))]:
         advice = "ask for the same options, choose another --output, or remove these folders"
         raise ValueError("\n  ".join([*conflicts, advice]))
     results = read_results(runs)
@@ -116,14 +115,15 @@ def run_experiment(
     if not request.report_only:
         logs = request.output / "runs/*/*" / LOG_FILE
         note(f"{request.table}: {len(runs)} runs, {len(results)} of them done; logs: {logs}")
-        missing = [run for run in runs if run.output not in results]
-        tasks = [Task(name_run(run), work, (run,), run.output / LOG_FILE) for run in missing]
+        missing = [run for run in runs if run.name not in results]
+        tasks = [Task(run.name, work, (run,), run.config.output / LOG_FILE) for run in missing]
         failed = run_tasks(tasks, request.workers)
         results = read_results(runs)
     baselines = []
     if TABLES[request.table].measure == "voxel_iou":
-        for category in dict.fromkeys(run.category for run in runs):
-            baselines += find_baselines(request.output, runs[0].layout, runs[0].data, category)
+        first = runs[0].config
+        for category in dict.fromkeys(run.config.category for run in runs):
+            baselines += find_baselines(request.output, first.layout, first.data, category)
     tables, text = make_report(request, runs, results, baselines)
     path = request.output / f"{request.table}.md"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -155,17 +155,18 @@ def read_result(path: Path) -> Result:
         ) from None
 
 
-def read_results(runs: Sequence[TrainConfig]) -> dict[Path, Result]:
-    """The stored results of these runs, by folder.
+def read_results(runs: Sequence[PlannedRun]) -> dict[str, Result]:
+    """The stored results of these runs, by name.
 
     Those of other data or another number of iterations are left out.
     """
     results = {}
     for run in runs:
-        if (path := run.output / RESULT_FILE).is_file():
+        config = run.config
+        if (path := config.output / RESULT_FILE).is_file():
             result = read_result(path)
-            if (result.iterations, result.data) == (run.iterations, str(run.data.resolve())):
-                results[run.output] = result
+            if (result.iterations, result.data) == (config.iterations, str(config.data.resolve())):
+                results[run.name] = result
     return results
 
 

@@ -60,14 +60,17 @@ class Request:
             raise ValueError(f"seeds must be at least 1, got {self.seeds}")
 
 
-def variant_of(run: TrainConfig) -> str:
-    """The variant that a planned run trains, in OUTPUT/runs/<category>/<variant>-seed<k>."""
-    return run.output.name.removesuffix(f"-seed{run.seed}")
+@dataclass(frozen=True)
+class PlannedRun:
+    """A training of a table, in the folder OUTPUT/runs/<category>/<variant>-seed<k>."""
 
+    variant: str  # name in `VARIANTS`
+    config: TrainConfig
 
-def name_run(run: TrainConfig) -> str:
-    """The name of a planned run, <category>/<variant>-seed<k>."""
-    return f"{run.category}/{run.output.name}"
+    @property
+    def name(self) -> str:
+        """<category>/<variant>-seed<k>."""
+        return f"{self.config.category}/{self.variant}-seed{self.config.seed}"
 
 
 def select_rows(request: Request) -> dict[str, Row]:
@@ -90,7 +93,7 @@ def select_rows(request: Request) -> dict[str, Row]:
     }
 
 
-def plan_runs(request: Request) -> list[TrainConfig]:
+def plan_runs(request: Request) -> list[PlannedRun]:
     """The training runs of a request, by category, then row, then seed.
 
     Tables that need the same run share its folder.
@@ -107,7 +110,7 @@ def plan_runs(request: Request) -> list[TrainConfig]:
     variants = [row.variant for row in select_rows(request).values() if row.variant]
     changes = _parse_changes(variants, request.set)
     return [
-        _configure(request, name, changes[name], layout, category, seed)
+        PlannedRun(name, _configure(request, name, changes[name], layout, category, seed))
         for category in dict.fromkeys(split_names(request.category) or table.categories)
         for name in variants
         for seed in range(request.seeds or table.seeds)

@@ -219,10 +219,10 @@ def test_no_html_from_names_in_results() -> None:
 )
 def test_damaged_results_are_named(changes, message: str, request_for) -> None:
     (run,) = plan_runs(request_for(methods=("proposed",)))
-    run.output.mkdir(parents=True)
+    run.config.output.mkdir(parents=True)
     stored = stub_work.result().model_dump()
     text = changes if isinstance(changes, str) else json.dumps(stored | changes)
-    (run.output / "test.json").write_text(text)
+    (run.config.output / "test.json").write_text(text)
     with pytest.raises(
         ValueError, match=rf"test.json is no measurement of a run .*{message}.*remove it"
     ):

@@ -33,7 +33,7 @@ from learn3d.studio.tables.experiment import (
     run_experiment,
     train_and_test,
 )
-from learn3d.studio.tables.plan import Request, name_run, plan_runs, variant_of
+from learn3d.studio.tables.plan import PlannedRun, Request, plan_runs
 from learn3d.studio.tables.tables import BIN_WIDTHS, TABLES, VARIANTS
 from learn3d.tasks import Workers
 
@@ -42,8 +42,8 @@ def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
     runs = plan_runs(
         Request("ablation", tmp_path, tmp_path / "out", category="chair,lamp", seeds=2)
     )
-    assert len({run.output for run in runs}) == len(runs) == 4 * 2 * 2
-    run = next(run for run in runs if name_run(run) == "chair/without-adversarial-seed1")
+    assert len({run.config.output for run in runs}) == len(runs) == 4 * 2 * 2
+    (run,) = (run.config for run in runs if run.name == "chair/without-adversarial-seed1")
     assert run.output == tmp_path / "out" / "runs" / "chair" / "without-adversarial-seed1"
     settings = run.settings
     assert (settings.lambda_adversarial, settings.lambda_classification, settings.lambda_prior) == (
@@ -53,20 +53,22 @@ def test_runs_of_a_table_have_names_and_configurations(tmp_path) -> None:
     )
     assert (run.seed, run.iterations, run.batch_size) == (1, 20_000, 128)
     bins = plan_runs(Request("bins", tmp_path, tmp_path, category="chair"))
-    assert [(run.view_bins, run.layout) for run in bins] == [(width, "kar") for width in BIN_WIDTHS]
+    assert [(run.config.view_bins, run.config.layout) for run in bins] == [
+        (width, "kar") for width in BIN_WIDTHS
+    ]
 
 
 def test_only_named_settings_differ_from_the_preset(tmp_path, request_for) -> None:
     for table in TABLES:
         for run in plan_runs(Request(table, tmp_path, tmp_path, "chair", seeds=1)):
-            variant = VARIANTS[variant_of(run)]
+            variant = VARIANTS[run.variant]
             usual = PRESETS[variant.preset].settings
             changed = {
                 name: value for name, value in variant.changes.items() if hasattr(usual, name)
             }
-            assert run.settings == dataclasses.replace(usual, **changed)
+            assert run.config.settings == dataclasses.replace(usual, **changed)
     (run,) = plan_runs(request_for("prgan", methods=("prgan",), iterations=2000))
-    assert run.settings.encoder_from_step == 1001, "the second half, however long it is"
+    assert run.config.settings.encoder_from_step == 1001, "the second half, however long it is"
 
 
 def test_smaller_batches_show_as_many_images(tmp_path) -> None:
@@ -75,7 +77,11 @@ def test_smaller_batches_show_as_many_images(tmp_path) -> None:
             "plus", tmp_path, tmp_path, "chair", ("proposed", "proposed-shared", "plus"), **asked
         )
         runs = plan_runs(dataclasses.replace(request, seeds=1))
-        return {(variant_of(r), r.iterations, r.batch_size, r.schedule.warmup_steps) for r in runs}
+        return {
+            (r.variant, c.iterations, c.batch_size, c.schedule.warmup_steps)
+            for r in runs
+            for c in (r.config,)
+        }
 
     small = {("proposed-shared", 80_000, 32, 100), ("plus", 80_000, 32, 100)}
     assert sizes() == {("proposed", 20_000, 128, 0)} | small
@@ -90,7 +96,7 @@ def test_smaller_batches_show_as_many_images(tmp_path) -> None:
         ("pascal", "pascal-plus", "pascal-proposed"),
     ):
         runs = plan_runs(Request(table, tmp_path, tmp_path, "airplane", seeds=1))
-        images = {variant_of(run): run.iterations * run.batch_size for run in runs}
+        images = {run.variant: run.config.iterations * run.config.batch_size for run in runs}
         assert images[plus] == images[proposed]
 
 
@@ -101,7 +107,7 @@ def test_changes_reach_the_methods_that_they_name(request_for) -> None:
         "lambda_smooth=0.5",
         "augment=flip-image,channels",
     )
-    vanilla, proposed = plan_runs(request_for(set=changes))
+    vanilla, proposed = (run.config for run in plan_runs(request_for(set=changes)))
     assert (vanilla.settings.learning_rate, proposed.settings.learning_rate) == (3e-4, 1e-4)
     for run in (vanilla, proposed):
         assert run.settings.lambda_smooth == 0.5
@@ -109,7 +115,7 @@ def test_changes_reach_the_methods_that_they_name(request_for) -> None:
     (run,) = plan_runs(
         request_for("prgan", methods=("PrGAN",), set=("prgan:discriminator_channels=8,16,32,64",))
     )
-    assert run.settings.discriminator_channels == (8, 16, 32, 64)
+    assert run.config.settings.discriminator_channels == (8, 16, 32, 64)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +150,7 @@ def test_the_command_of_a_run_gives_its_configuration(tmp_path, table: str) -> N
     )
     asked = {"iterations": 7, "layout": "kar", "set": changes}
     for run in plan_runs(Request(table, tmp_path / "a b", tmp_path, "chair", **asked)):
-        assert Train.parse("train", shlex.split(command_line(run))[2:]).config == run
+        assert Train.parse("train", shlex.split(command_line(run.config))[2:]).config == run.config
 
 
 SMALL = ("precision=fp32", "encoder=conv-small", "generator=sphere-small")
@@ -161,7 +167,7 @@ def test_finished_runs_are_skipped_and_shared(make, request_for) -> None:
 def test_results_of_other_networks_or_data_are_not_taken(tmp_path, make, request_for) -> None:
     make(request_for())
     (run, _) = plan_runs(request_for())
-    assert list(read_results([run])) == [run.output]
+    assert list(read_results([run])) == [run.name]
     for other in (
         request_for(iterations=7),
         dataclasses.replace(request_for(), data=tmp_path / "elsewhere"),
@@ -170,7 +176,8 @@ def test_results_of_other_networks_or_data_are_not_taken(tmp_path, make, request
 
 
 def test_runs_made_by_hand_are_adopted_and_others_are_named(make, request_for) -> None:
-    (run,) = plan_runs(request_for(methods=("proposed",)))
+    (planned,) = plan_runs(request_for(methods=("proposed",)))
+    run = planned.config
     assert find_conflict(run) == ""
     run.output.mkdir(parents=True)
     precision = resolve_precision("auto", "cpu")
@@ -259,7 +266,7 @@ def test_a_real_run_from_training_to_report(tmp_path, tiny_folder, read_report) 
     np.savez(tmp_path / "02691156_train_images.npz", np.full((3, 24, 4, 64, 64), 200, np.uint8))
     for name in ("train_voxels", "val_images", "val_voxels"):
         shutil.copy(tiny_folder / f"02691156_{name}.npz", tmp_path)
-    moved = dataclasses.replace(run, data=tmp_path)
+    moved = PlannedRun(run.variant, dataclasses.replace(run.config, data=tmp_path))
     with pytest.raises(ValueError, match="other training data"):
         train_and_test(moved)
 
@@ -275,14 +282,14 @@ def test_poses_are_estimated_for_the_runs_that_need_them(
     )
     runs = plan_runs(given)
     assert all(map(train_and_test, runs))
-    table, poses = tmp_path / "out/poses/airplane-seed0.npz", [run.poses for run in runs]
+    table, poses = tmp_path / "out/poses/airplane-seed0.npz", [run.config.poses for run in runs]
     assert poses == [None, table]
     monkeypatch.setattr(experiment, "PoseOptions", None)
-    experiment.estimate_poses(runs[1])
+    experiment.estimate_poses(runs[1].config)
     assert run_experiment(dataclasses.replace(given, report_only=True)) == 0
     _, row = json.loads((tmp_path / "out/poses.json").read_text())["poses"]
     known, estimated = (
-        json.loads((run.output / "test.json").read_text())["voxel_iou"] for run in runs
+        json.loads((run.config.output / "test.json").read_text())["voxel_iou"] for run in runs
     )
     assert row[-3:] == [f"{value:.3f}" for value in (known, estimated, estimated / known)]
     errors = json.loads(table.with_suffix(".json").read_text())
@@ -308,6 +315,6 @@ def test_a_run_goes_on_or_starts(
         experiment, "evaluate_runs", lambda *_, **__: pytest.fail("a stopped run is not measured")
     )
     assert not train_and_test(run)
-    shutil.copytree(finished_run, run.output)
+    shutil.copytree(finished_run, run.config.output)
     assert not train_and_test(run)
     assert resumed == [False, True]
