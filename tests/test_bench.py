@@ -67,11 +67,13 @@ def test_peers_are_timed_if_they_are_installed_and_draw_the_same(monkeypatch, ca
         raise ModuleNotFoundError("No module named 'absent'")
 
     same, options = (lambda work: (work.draw, work.draw)), {"subdivisions": 1, "size": 32}
-    monkeypatch.setattr(peers, "PEERS", {"itself": (same, options), "absent": (absent, options)})
+    itself = peers.Peer(same, options, "pip install itself")
+    monkeypatch.setattr(peers, "PEERS", {"itself": itself, "absent": itself._replace(make=absent)})
     peers.main(repeats=1)
-    rows = r"80 faces, 32x32, with gradient \| itself [\d.]+ \| [\d.]+ \| .*\n\| \(absent: ModuleNotFoundError"
+    row = r"alpha \| 80 \| 32x32 \| vertices \| 1 \| "
+    rows = rf"\| itself \| {row}[\d.]+ \| [\d.]+ \| .*\n\| absent \| {row}not measured \(ModuleNotFoundError"
     assert re.search(rows, capsys.readouterr().out)
-    other = (lambda work: (work.draw, lambda _: torch.zeros(1, 32, 32))), options
+    other = itself._replace(make=lambda work: (work.draw, lambda _: torch.zeros(1, 32, 32)))
     monkeypatch.setattr(peers, "PEERS", {"other": other})
     with pytest.raises(SystemExit, match="nmr and other draw different images"):
         peers.main(repeats=1)

@@ -1,14 +1,17 @@
 """Measure nmr beside deodr, PyTorch3D, Open3D and Mesa (through pyrender), each if it is installed, one thread each.
 
-Prints a table in Markdown: medians in milliseconds, with the backward pass for the two renderers
-that have one. Stops if the images differ. PYOPENGL_PLATFORM=egl takes EGL instead of OSMesa.
+Prints the machine and a table in Markdown: medians in milliseconds, with the backward pass for the
+two renderers that have one, and how each is installed. Renderers for GPUs are quoted. Stops if
+images differ. PYOPENGL_PLATFORM=egl takes EGL instead of OSMesa.
 """
 
 import math
 import os
+import platform
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -96,40 +99,80 @@ def mesa(work: Work) -> tuple[Draw, Draw]:
     return work.draw, theirs
 
 
-#: Name of each peer: the function that makes both programs, and options of `spheres`.
-PEERS: dict[str, tuple[Callable[[Work], tuple[Draw, Draw]], dict[str, Any]]] = {
-    "deodr": (lambda work: (work.draw, deodr(work)), {"subdivisions": 3, "size": 256}),
-    "PyTorch3D": (pytorch3d_soft, {"subdivisions": 3, "size": 64}),
-    "Open3D": (open3d_rays, {"subdivisions": 4, "size": 512, "output": "depth"}),
-    "Mesa": (mesa, {"subdivisions": 4, "size": 512, "output": "depth"}),
+class Peer(NamedTuple):
+    """Another renderer that runs on the CPU."""
+
+    make: Callable[[Work], tuple[Draw, Draw]]  # nmr and the peer, which draw the same
+    options: dict[str, Any]  # of `spheres`
+    install: str
+
+
+PEERS = {
+    "deodr": Peer(
+        lambda work: (work.draw, deodr(work)), {"subdivisions": 3, "size": 256}, "pip install deodr"
+    ),
+    "PyTorch3D": Peer(
+        pytorch3d_soft,
+        {"subdivisions": 3, "size": 64},
+        "FORCE_CUDA=0 pip install --no-build-isolation git+https://github.com/facebookresearch/pytorch3d",
+    ),
+    "Open3D": Peer(
+        open3d_rays, {"subdivisions": 4, "size": 512, "output": "depth"}, "pip install open3d"
+    ),
+    "Mesa": Peer(
+        mesa,
+        {"subdivisions": 4, "size": 512, "output": "depth"},
+        "apt install libosmesa6; pip install pyrender",
+    ),
 }
+# Renderers that are not measured here: W1 of bench.py with 128 meshes, from vertices to gradients.
+QUOTED = {
+    "neural_renderer 1.1.3": ("16.0", "pip install neural_renderer_pytorch, which compiles CUDA"),
+    "nvdiffrast 0.4": ("3.5", "from github.com/NVlabs/nvdiffrast, with CUDA"),
+}
+SOURCE = "one NVIDIA H200, measured on 2026-11-20"
+
+
+def processor() -> str:
+    """The name of the processor, as Linux knows it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
 
 
 def main(repeats: int = 15) -> None:
-    print("| one thread, milliseconds | peer | nmr | |\n|---|---|---|---|")
-    for peer, (make, options) in PEERS.items():
+    print(f"{processor()}, torch {torch.__version__}, load {os.getloadavg()[0]:.1f}\n")
+    print("| renderer | draws | faces | pixels | gradients | threads | ms | nmr, ms | | install |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for name, (make, options, install) in PEERS.items():
         work = spheres(batch=1, anti_aliasing=False, **options)
+        gradients = work.output == "alpha"
+        size = f"{len(work.faces):,} | {work.size}x{work.size}"
+        row = f"| {name} | {work.output} | {size} | {'vertices' if gradients else 'no'} | 1"
         try:
             ours, theirs = make(work)
         except Exception as error:  # libraries behind bindings fail in their own ways
-            print(f"| ({peer}: {type(error).__name__}, {str(error).splitlines()[0]}) | | | |")
+            why = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            print(f"{row} | not measured ({why}) | | | `{install}` |")
             continue
-        check_same(peer, ours(work.vertices), theirs(work.vertices))
-        gradients = work.output == "alpha"
+        check_same(name, ours(work.vertices), theirs(work.vertices))
         then = (lambda images: (images - 0.5).square().mean().backward()) if gradients else id
         run = partial(time_passes, 1, gradients=gradients)
         programs = {
-            name: partial(run, draw, then, work.vertices)
-            for name, draw in (("a", theirs), ("b", ours))
+            which: partial(run, draw, then, work.vertices)
+            for which, draw in (("a", theirs), ("b", ours))
         }
         a, b = (
             1e3 * float(np.median([total for _, total in times]))
             for times in time_by_turns(programs, repeats)
         )
-        print(
-            f"| {work}{', with gradient' * gradients} | {peer} {a:.1f} | {b:.1f} | {a / b:.1f} times |",
-            flush=True,
-        )
+        print(f"{row} | {a:.1f} | {b:.1f} | {a / b:.1f}x | `{install}` |", flush=True)
+    for name, (time, install) in QUOTED.items():
+        size = "alpha, 128 meshes | 1,280 | 64x64, 2x2 anti-aliased | vertices | GPU"
+        print(f"| {name} | {size} | {time} ({SOURCE}) | | | {install} |")
 
 
 if __name__ == "__main__":
