@@ -110,75 +110,83 @@ def fin(
     )
 
 
+# Measures of tails, of slow airplanes and of jets. lean_deg: sweep of the stabiliser. taper: its
+# chord at the tip over that in the middle. ahead: how far the fin begins before its usual place.
+_TAIL = {
+    "height": (0.14, 0.21),
+    "sweep_deg": (5, 20),
+    "root": (0.13, 0.19),
+    "tip": (0.06, 0.1),
+    "half": (0.15, 0.22),
+    "chord": (0.09, 0.13),
+    "lean_deg": (0, 15),
+    "taper": (0.4, 0.8),
+    "ahead": (-0.01, 0.03),
+}
+_SWEPT_TAIL = _TAIL | {"sweep_deg": (28, 45), "lean_deg": (25, 38)}
+
+
 def tail(draw: Draw, kind: str, radius: float, swept: bool = False) -> Part:
     """Fin and stabiliser: "conventional", "cross" (half-way up the fin), "T", "V" or "twin"."""
-    height = draw(0.14, 0.21)
-    sweep = draw(28, 45) if swept else draw(5, 20)
-    root = draw(0.13, 0.19)
-    tip = draw(0.06, 0.1)
-    half = draw(0.15, 0.22)
-    chord = draw(0.09, 0.13)
-    lean = draw(25, 38) if swept else draw(0, 15)
-    tip_chord = draw(0.4, 0.8) * chord
+    measures = draw.measures(**(_SWEPT_TAIL if swept else _TAIL))
+    return _tail(draw, kind, radius, swept, **measures)
+
+
+def _tail(
+    draw: Draw,
+    kind: str,
+    radius: float,
+    swept: bool,
+    *,
+    height,
+    sweep_deg,
+    root,
+    tip,
+    half,
+    chord,
+    lean_deg,
+    taper,
+    ahead,
+) -> Part:
+    z = -0.5 + root + ahead
     base = 0.25 * radius
-    z = -0.5 + root + draw(-0.01, 0.03)
     if kind == "V":
-        side = wing(
-            [
-                (0, 0, z - 0.02, root, 0.1),
-                (1.25 * half, 0, z - 0.02 - 0.5 * half * (1 + swept), tip, 0.1),
-            ]
-        )
-        return side.rotated("z", draw(32, 45)).moved(y=base).both_sides()
+        middle = (0, 0, z - 0.02, root, 0.1)
+        end = (1.25 * half, 0, z - 0.02 - 0.5 * half * (1 + swept), tip, 0.1)
+        return wing([middle, end]).rotated("z", draw(32, 45)).moved(y=base).both_sides()
     dihedral = draw(0, 7)
     if kind == "twin":
-        plan = Planform(
-            half=half,
-            root=chord,
-            tip=0.95 * chord,
-            sweep_deg=3,
-            dihedral_deg=dihedral,
-            z=-0.5 + chord + 0.01,
-            y=0.4 * radius,
-        )
-        x, y, front, end = plan.at(1.0)
-        upright = fin(
-            0.8 * height, root=1.2 * end, tip=0.8 * end, sweep_deg=draw(5, 25), z=front + 0.02
-        )
-        return plan.wing() + upright.moved(x, y - draw(0.1, 0.45) * height).both_sides()
-    part = fin(height + base, root=root, tip=tip, sweep_deg=sweep, z=z).moved(y=0.4 * base)
+        return _twin_tail(draw, radius, half, chord, height, dihedral)
+    total = height + base
+    upright = fin(total, root, tip, sweep_deg, z)
     if swept and draw.maybe(0.4):  # a dorsal fillet
-        part += fin(
-            0.45 * height + base,
-            root=1.6 * root,
-            tip=0.5 * root,
-            sweep_deg=62,
-            z=z + 0.75 * root,
-            thickness=0.04,
-        ).moved(y=0.4 * base)
-    share = {"T": 0.97, "cross": draw(0.35, 0.6), "conventional": 0.0}[kind]
+        low = 0.45 * height + base
+        upright += fin(low, 1.6 * root, 0.5 * root, 62, z + 0.75 * root, 0.04)
+    part = upright.moved(y=0.4 * base)
+    rise = {"T": 0.97, "cross": draw(0.35, 0.6), "conventional": 0.0}[kind] * total
+    end = taper * chord
     if kind == "conventional":
         front = -0.5 + chord + draw(0.0, 0.04)
         level = draw(0.1, 0.45) * radius
     else:
         dihedral = 0.0
-        rise = share * (height + base)
-        front = z - rise * np.tan(np.radians(sweep)) + 0.01
+        front = z - rise * np.tan(np.radians(sweep_deg)) + 0.01
         level = 0.4 * base + rise
     if kind == "T":
-        chord = min(chord, 1.3 * tip)
-        tip_chord = min(tip_chord, 0.9 * tip)
-    plan = Planform(
-        half=half,
-        root=chord,
-        tip=tip_chord,
-        sweep_deg=lean,
-        dihedral_deg=dihedral,
-        z=front,
-        y=level,
-        thickness=0.1,
-    )
-    return part + plan.wing()
+        chord, end = min(chord, 1.3 * tip), min(end, 0.9 * tip)
+    stabiliser = Planform(half, chord, end, lean_deg, dihedral, front, level, thickness=0.1)
+    return part + stabiliser.wing()
+
+
+def _twin_tail(
+    draw: Draw, radius: float, half: float, chord: float, height: float, dihedral_deg: float
+) -> Part:
+    """A stabiliser with a fin at each end."""
+    front = -0.5 + chord + 0.01
+    plan = Planform(half, chord, 0.95 * chord, 3, dihedral_deg, front, 0.4 * radius)
+    x, y, z, end = plan.at(1.0)
+    upright = fin(0.8 * height, 1.2 * end, 0.8 * end, sweep_deg=draw(5, 25), z=z + 0.02)
+    return plan.wing() + upright.moved(x, y - draw(0.1, 0.45) * height).both_sides()
 
 
 def along_z(
@@ -388,6 +396,26 @@ def business_jet(draw: Draw, *, radius, nose) -> Part:
 )
 def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
     """A jet fighter: wings of four forms, one or two fins, canards, stores under the wings."""
+    plan = _fighter_wing(draw, shape, radius)
+    plane = fuselage(radius, tail_start=0.75, **form) + plan.wing()
+    long, z = draw(0.18, 0.28), draw(0.15, 0.22)
+    plane += canopy(0.9 * radius, 1.1 * radius, long, 0.8 * radius, z)
+    plane += _intakes(draw, radius, twin) + _fighter_fins(draw, radius, twin)
+    if shape != "delta":
+        half, sweep = draw(0.17, 0.23), draw(30, 45)
+        plane += Planform(half, 0.15, 0.06, sweep, -3, -0.34, 0.0, thickness=0.06).wing()
+        if draw.maybe(0.4):  # strakes from the wing root towards the nose
+            outer = (2.0 * radius, plan.y, plan.z - 0.03, 0.7 * plan.root, 0.05)
+            inner = (0.0, plan.y, plan.z + 0.2, plan.root + 0.1, 0.05)
+            plane += wing([inner, outer]).both_sides()
+    elif draw.maybe(0.5):  # canards
+        half, y = draw(0.15, 0.2), 0.35 * radius
+        plane += Planform(half, 0.11, 0.04, 45, 4, 0.24, y, thickness=0.06).wing()
+    places = {(0.4, 0.6, 0.8, 1.0)[draw.count(0, 3)] for _ in range(draw.count(0, 3))}
+    return plane + join(_store(draw, plan, share).both_sides() for share in sorted(places))
+
+
+def _fighter_wing(draw: Draw, shape: str, radius: float) -> Planform:
     root, tip, sweep, z = {
         "delta": (draw(0.42, 0.52), draw(0.02, 0.06), draw(46, 58), 0.1),
         "swept": (draw(0.2, 0.28), draw(0.08, 0.12), draw(35, 50), 0.12),
@@ -397,66 +425,25 @@ def fighter(draw: Draw, *, radius, twin, shape, **form) -> Part:
     half = draw(0.28, 0.4) if shape == "delta" else draw(0.3, 0.4)
     if shape == "delta":
         half = min(half, 0.9 * root / np.tan(np.radians(sweep)))
-    plan = Planform(
-        half=half,
-        root=root,
-        tip=tip,
-        sweep_deg=sweep,
-        dihedral_deg=draw(-5, 2),
-        z=z,
-        y=draw(-0.3, 0.6) * radius,
-        thickness=0.06,
-    )
-    plane = fuselage(radius, tail_start=0.75, **form) + plan.wing()
-    plane += canopy(
-        width=0.9 * radius,
-        height=1.1 * radius,
-        length=draw(0.18, 0.28),
-        y=0.8 * radius,
-        z=draw(0.15, 0.22),
-    )
+    dihedral, y = draw(-5, 2), draw(-0.3, 0.6) * radius
+    return Planform(half, root, tip, sweep, dihedral, z, y, thickness=0.06)
+
+
+def _intakes(draw: Draw, radius: float, twin: bool) -> Part:
+    """Two tunnels beside the fuselage, or one nozzle with intakes at the sides, below, or in the nose."""
     if twin:
-        plane += _intake_tunnel(radius, draw(0.8, 1.25) * radius).both_sides()
-    else:
-        side = box(
-            (0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02
-        ).both_sides()
-        chin = box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02)
-        plane += draw.pick([side, chin, Part()]) + nozzle(0.75 * radius, 0.08).moved(z=-0.52)
+        return _intake_tunnel(radius, draw(0.8, 1.25) * radius).both_sides()
+    side = box((0.8 * radius, 1.2 * radius, 0.34), (0.95 * radius, 0.1 * radius, 0.03), 0.02)
+    chin = box((1.2 * radius, 0.9 * radius, 0.3), (0, -0.9 * radius, 0.06), 0.02)
+    return draw.pick([side.both_sides(), chin, Part()]) + nozzle(0.75 * radius, 0.08).moved(z=-0.52)
+
+
+def _fighter_fins(draw: Draw, radius: float, twin: bool) -> Part:
+    """Two fins, canted outwards, or an upright one."""
     if draw.maybe(0.55 if twin else 0.1):
-        plane += _canted_fin(draw, radius).both_sides()
-    else:
-        height = draw(0.17, 0.25) + 0.6 * radius
-        plane += fin(height, root=draw(0.2, 0.3), tip=0.09, sweep_deg=draw(35, 52), z=-0.2).moved(
-            y=0.3 * radius
-        )
-    if shape != "delta":
-        plane += Planform(
-            half=draw(0.17, 0.23),
-            root=0.15,
-            tip=0.06,
-            sweep_deg=draw(30, 45),
-            dihedral_deg=-3,
-            z=-0.34,
-            y=0.0,
-            thickness=0.06,
-        ).wing()
-        if draw.maybe(0.4):  # strakes from the wing root towards the nose
-            outer = (2.0 * radius, plan.y, z - 0.03, 0.7 * root, 0.05)
-            plane += wing([(0.0, plan.y, z + 0.2, root + 0.1, 0.05), outer]).both_sides()
-    elif draw.maybe(0.5):  # canards
-        plane += Planform(
-            half=draw(0.15, 0.2),
-            root=0.11,
-            tip=0.04,
-            sweep_deg=45,
-            dihedral_deg=4,
-            z=0.24,
-            y=0.35 * radius,
-            thickness=0.06,
-        ).wing()
-    places = {(0.4, 0.6, 0.8, 1.0)[draw.count(0, 3)] for _ in range(draw.count(0, 3))}
-    return plane + join(_store(draw, plan, share).both_sides() for share in sorted(places))
+        return _canted_fin(draw, radius).both_sides()
+    height, root = draw(0.17, 0.25) + 0.6 * radius, draw(0.2, 0.3)
+    return fin(height, root, 0.09, sweep_deg=draw(35, 52), z=-0.2).moved(y=0.3 * radius)
 
 
 def _intake_tunnel(radius: float, wide: float) -> Part:

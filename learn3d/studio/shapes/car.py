@@ -199,91 +199,106 @@ def _spoiler(draw: Draw, body: SimpleNamespace, *, inset, high) -> Part:
 def _hull(body: SimpleNamespace) -> Part:
     """The body: cross-sections from front to rear, the wheel arches cut into lower corners."""
     length = body.length
-    belt = body.shoulder
     boot = min(body.window * length, length - 0.12)
     cowl = body.bonnet * length
     # start and end of the open box behind the cabin, or of the open cabin
     beds = {"pickup": (boot + 0.06, length - 0.08), "roadster": (cowl + 0.1, boot)}
     bed = beds.get(body.kind, (length, length))
+    line = _side_view(body, cowl, boot)
+    arch = body.wheel + 0.055  # radius of the wheel arches
+    s = _stations(body, line[:, 0], bed, arch)
+    top = np.interp(s, *line.T)
+    sides, cabin, well = _cross_sections(body, s, top, arch)
+    upper = np.where((bed[0] < s) & (s < bed[1]), well, cabin)
+    right = np.concatenate([sides, upper])  # [12, 2, S]
+    left = right[-2:0:-1] * [[-1], [1]]  # without the points in the plane of symmetry
+    x, y = np.concatenate([right, left]).transpose(1, 2, 0)
+    return loft(points(x, y, (length / 2 - s)[:, None]))
 
-    # The upper edge of the body seen from the side: distance from the front bumper, and height.
+
+def _side_view(body: SimpleNamespace, cowl: float, boot: float) -> np.ndarray:
+    """The upper edge of the body seen from the side [P, 2]: distance from the front bumper, and height.
+
+    cowl: where the bonnet ends. boot: where the boot or bed starts.
+    """
+    length, belt = body.length, body.shoulder
     roof_rear = body.roof * length
     roof_front = cowl + body.screen * length
-    side_view = [
-        (0, 0.75 * belt),
-        (0.06, 0.9 * belt),
-        (0.22, belt),
-        (cowl, belt + 0.08),
-    ]
+    corners = [(0, 0.75 * belt), (0.06, 0.9 * belt), (0.22, belt), (cowl, belt + 0.08)]
     if body.kind != "roadster":
-        side_view += [
+        corners += [
             (roof_front, body.height),
             ((roof_front + roof_rear) / 2, body.height + 0.015),
             (roof_rear, body.height - 0.02),
         ]
-    side_view += [(boot, belt + 0.07), (length - 0.08, belt + 0.04), (length, 0.85 * belt)]
-    line = rounded_path(side_view, 0.12, 2)
+    corners += [(boot, belt + 0.07), (length - 0.08, belt + 0.04), (length, 0.85 * belt)]
+    line = rounded_path(corners, 0.12, 2)
     line[:, 0] = np.maximum.accumulate(line[:, 0] + 1e-4 * np.arange(len(line)))
+    return line
 
-    # The distances of the cross-sections from the front bumper [S]: at every corner, arch and end
-    # of the bed.
-    arch = body.wheel + 0.055  # radius of the wheel arches
+
+def _stations(
+    body: SimpleNamespace, corners: np.ndarray, bed: tuple[float, float], arch: float
+) -> np.ndarray:
+    """Distances of the cross-sections from the front bumper [S]: at every corner, arch and end of the bed."""
     around_axle = arch * np.append([-1.02, 1.02], 0.999 * np.cos(np.linspace(0, np.pi, 8)))
     ends = [end + side for end in bed for side in (-0.015, 0.015)]
     s = np.concatenate(
-        [line[:, 0], np.linspace(0, length, 7), *(a + around_axle for a in body.axles), ends]
+        [corners, np.linspace(0, body.length, 7), *(a + around_axle for a in body.axles), ends]
     )
-    s = np.unique(s[(s >= 0) & (s <= length)].round(3))
-    s = s[np.append(True, np.diff(s) > 0.004)]
+    s = np.unique(s[(s >= 0) & (s <= body.length)].round(3))
+    return s[np.append(True, np.diff(s) > 0.004)]
 
-    # Heights and half widths of each cross-section, all [S].
-    to_front = s / length
-    to_rear = 1 - s / length
-    top = np.interp(s, *line.T)
-    width = body.width / 2 * (1 - 0.15 * np.clip(1 - to_front / 0.18, 0, 1) ** 2)
-    width = width * (1 - 0.06 * np.clip(1 - to_rear / 0.15, 0, 1) ** 2)
-    floor = (
-        body.clearance
-        + 0.12 * np.clip(1 - to_front / 0.08, 0, 1)
-        + 0.15 * np.clip(1 - to_rear / 0.1, 0, 1)
-    )
-    inner = np.full_like(s, body.width / 2 - TYRE - 0.06)  # the floor between the wheels
+
+def _cross_sections(
+    body: SimpleNamespace, s: np.ndarray, top: np.ndarray, arch: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The right halves of the cross-sections at `s` [S], each as points (x, y), [6, 2, S].
+
+    The first has the floor and the side, from the middle outwards and up to the shoulder line.
+    The others go on to the middle: over the cabin, and down into the bed. top: the height of the
+    upper edge.
+    """
+
+    def near_front(reach: float) -> np.ndarray:
+        return np.clip(1 - s / body.length / reach, 0, 1)
+
+    def near_rear(reach: float) -> np.ndarray:
+        return np.clip(1 - (1 - s / body.length) / reach, 0, 1)
+
+    zero = np.zeros_like(s)
+    width = body.width / 2 * (1 - 0.15 * near_front(0.18) ** 2) * (1 - 0.06 * near_rear(0.15) ** 2)
+    floor = body.clearance + 0.12 * near_front(0.08) + 0.15 * near_rear(0.1)
+    inner = zero + (body.width / 2 - TYRE - 0.06)  # the floor between the wheels
     cut = floor + 0.002  # lower edge of the sides
     for axle in body.axles:
         over_wheel = body.wheel + np.sqrt(np.maximum(arch**2 - (s - axle) ** 2, 0.0))
         cut = np.where(np.abs(s - axle) < arch, np.maximum(cut, over_wheel), cut)
-    shoulder = np.minimum(belt, top - 0.03)
+    shoulder = np.minimum(body.shoulder, top - 0.03)
     middle = np.maximum(0.55 * floor + 0.45 * shoulder, 0.5 * (cut + shoulder))
+    sides = [(zero, floor), (inner, floor), (inner, cut), (0.95 * width, cut)]
+    sides += [(width, middle), (0.97 * width, shoulder)]
+
     # rim of the roof
     edge = np.maximum(top - 0.045 - 0.1 * np.clip(top - shoulder - 0.1, 0, 0.3), shoulder + 0.01)
     roof = np.maximum(0.96 * width - 0.03 - body.lean * (edge - shoulder), 0.45 * width)
-    rim = shoulder + 0.02  # of the bed
-    bottom = np.full_like(s, belt - 0.38)  # of the bed
+    cabin = [
+        (0.97 * width - 0.03, shoulder + 0.006),
+        (roof, edge),
+        (0.88 * roof, 0.5 * (edge + top)),
+    ]
+    cabin += [(0.6 * roof, top - 0.008), (0.3 * roof, top - 0.002), (zero, top)]
+
+    rim, bottom = shoulder + 0.02, zero + (body.shoulder - 0.38)
     # the wheel arch seen from the bed
     hump = np.maximum(bottom + 0.004, np.minimum(cut + 0.03, rim - 0.03))
-
-    # The right half of each cross-section: points (x, y) from the middle of the floor outwards
-    # and up to the middle.
-    zero = np.zeros_like(s)
-    lower_x = [zero, inner, inner, 0.95 * width, width, 0.97 * width]
-    lower_y = [floor, floor, cut, cut, middle, shoulder]
-    cabin_x = [0.97 * width - 0.03, roof, 0.88 * roof, 0.6 * roof, 0.3 * roof, zero]
-    cabin_y = [shoulder + 0.006, edge, 0.5 * (edge + top), top - 0.008, top - 0.002, top]
-    bed_x = [
-        0.95 * width - 0.02,
-        0.92 * width - 0.05,
-        0.9 * width - 0.06,
-        inner - 0.03,
-        inner - 0.032,
-        zero,
+    well = [
+        (0.95 * width - 0.02, rim),
+        (0.92 * width - 0.05, rim - 0.01),
+        (0.9 * width - 0.06, hump),
     ]
-    bed_y = [rim, rim - 0.01, hump, hump - 0.001, bottom, bottom]
-    upper = np.where((bed[0] < s) & (s < bed[1]), [bed_x, bed_y], [cabin_x, cabin_y])
-    x, y = np.concatenate([[lower_x, lower_y], upper], 1).transpose(0, 2, 1)  # [S, 12]
-    left = slice(-2, 0, -1)  # the mirrored points, without those in the plane of symmetry
-    x = np.c_[x, -x[:, left]]
-    y = np.c_[y, y[:, left]]
-    return loft(points(x, y, (length / 2 - s)[:, None]))
+    well += [(inner - 0.03, hump - 0.001), (inner - 0.032, bottom), (zero, bottom)]
+    return np.array(sides), np.array(cabin), np.array(well)
 
 
 KINDS = {partial(car, kind=kind): weight for kind, (weight, *_) in _KINDS.items()}
