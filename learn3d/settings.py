@@ -82,7 +82,7 @@ NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 Weight = NonNegative  # weight of a loss
 Share = Annotated[float, Field(ge=0, le=1)]
 Step = Annotated[int, Field(ge=1, le=10**9)]  # a training step, counted from 1
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=10**9)]
 Pixels = Annotated[int, Field(ge=1, le=1024)]  # side of the networks' images; 224 in the papers
 #: Channels of a network's first layer; its widest layer has eight times as many. 512 take 4.1 GB; 128 in the papers.
 Channels = Annotated[int, Field(ge=1, le=512)]

@@ -16,29 +16,45 @@ P = ParamSpec("P")
 INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 #: Control characters, characters that change the direction of text, and surrogates, which cannot be encoded.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+#: What torch says in a RuntimeError if there is too little memory.
+_NO_MEMORY = re.compile("bad_alloc|DefaultCPUAllocator|out of memory|an't allocate memory")
 
 
 def without_traceback(main: Callable[P, int]) -> Callable[P, int]:
     """Decorator of the main function of a command, which returns an exit status: errors become
     one line on stderr.
 
-    ValueError, OSError, MemoryError and FloatingPointError end it with status 1 and the line
-    "error: " and the message. Ctrl-C ends it with status 130. Any other error is a bug and keeps
-    its traceback.
+    ValueError, OSError, MemoryError, FloatingPointError and torch's errors for too little memory
+    end it with status 1 and the line "error: " and the message. Ctrl-C ends it with status 130. Any
+    other error is a bug and keeps its traceback.
     """
 
     @functools.wraps(main)
     def run(*arguments: P.args, **options: P.kwargs) -> int:
         try:
             return main(*arguments, **options)
-        except (ValueError, OSError, MemoryError, FloatingPointError) as error:
+        except (ValueError, OSError, FloatingPointError) as error:
             note(f"error: {error}")
+            return 1
+        except (MemoryError, RuntimeError) as error:
+            if not lacks_memory(error):
+                raise
+            reason = (str(error).strip().splitlines() or ["MemoryError"])[0][:200]
+            note(
+                "error: there is too little memory; end other programs, or give a smaller batch, picture or data set "
+                f"({reason})"
+            )
             return 1
         except KeyboardInterrupt:
             note("interrupted; what was saved before is as it was")
             return INTERRUPTED
 
     return run
+
+
+def lacks_memory(error: Exception) -> bool:
+    """Whether an error of Python, NumPy or torch means that there is too little memory."""
+    return isinstance(error, MemoryError) or bool(_NO_MEMORY.search(str(error)))
 
 
 def plain(text: str) -> str:

@@ -249,13 +249,13 @@ def _check_split(
         if dataset.poses is None:
             advice = f"learn3d estimate-poses --layout {layout} finds them from the masks"
             found.append(OddFile(Path(folder) / category, f"has no poses: {advice}"))
-        for message in _shared(dataset, seen):
-            found.append(OddFile(Path(folder) / category, message))
         if has_shards(folder, category, split):
             from learn3d.data import shards
 
             where = shards_folder(folder, category, split)
             shards.check_arrays(dataset, where, found.append)
+        if all(isinstance(each, OddFile) for each in found):  # else not all can be read
+            found += [OddFile(Path(folder) / category, text) for text in _shared(dataset, seen)]
     except (ValueError, OSError) as error:
         if all(isinstance(each, OddFile) for each in found):
             found.append(error)  # else it follows from faults that are listed
@@ -280,7 +280,7 @@ def _shared(dataset: ViewDataset, seen: dict[bytes, tuple[str, str]]) -> list[st
         kind, parts = "pictures", dataset.images
     shared: dict[str, list[str]] = {}
     for number, name in enumerate(names):
-        part = np.ascontiguousarray(parts[number])
+        part = np.ascontiguousarray(parts[np.array([number])])
         split, other = seen.setdefault(hashlib.sha1(part).digest(), (dataset.split, name))
         if split != dataset.split and part.any():
             shared.setdefault(split, []).append(f"{name} ({other} in {split})")

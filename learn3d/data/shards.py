@@ -78,6 +78,13 @@ class SetFile:
     view_names: Annotated[list[Text], Field(max_length=limits.VIEW_CLASSES)]
     poses: Literal[(None, *_POSES)]  # class of the poses; None if they are unknown
     constants: dict[Text, float]  # fields of the poses with one value for all
+    # CRC-32 of the other fields; None in files of versions that had none
+    crc: Annotated[int, Field(ge=0)] | None = None
+
+    def checksum(self) -> int:
+        """The value for `crc`."""
+        facts = dataclasses.asdict(self) | {"crc": None}
+        return zlib.crc32(json.dumps(facts, sort_keys=True).encode())
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -117,6 +124,7 @@ def finish_set(folder: Path, layout: str, shards: int, part: ViewDataset) -> Non
         poses=None if part.poses is None else type(part.poses).__name__,
         constants={name: v for name, v in _pose_fields(part).items() if not isinstance(v, Tensor)},
     )
+    facts = dataclasses.replace(facts, crc=facts.checksum())
     write_json(folder / SET_FILE, dataclasses.asdict(facts), sync=True)
 
 
@@ -172,6 +180,11 @@ def load(
         raise DamagedFile(
             where / SET_FILE, f"is no description of shards ({error}); {_MAKE_AGAIN}"
         ) from None
+    if facts.crc is None:
+        old = "has no checksum of its cameras, as older versions wrote it; make the shards again for one"
+        on_fault(OddFile(where / SET_FILE, old))
+    elif facts.crc != facts.checksum():
+        raise DamagedFile(where / SET_FILE, f"{CHANGED}; {_MAKE_AGAIN}")
     if facts.layout != layout or image_size not in (None, facts.image_size):
         found = f"images of {facts.image_size} pixels in the layout {facts.layout!r}"
         wanted = f"{image_size or facts.image_size} pixels in {layout!r}"
@@ -179,11 +192,13 @@ def load(
         raise DamagedFile(where, f"has {found}, expected {wanted}; {hint}")
     paths = sorted(where.glob(_FILES))
     if len(paths) != facts.shards:
-        missing = next(
-            path for n in itertools.count() if (path := shard_path(where, n)) not in paths
-        )
-        found = f"the split needs {facts.shards} shards, but has {len(paths)}"
-        on_fault(DamagedFile(missing, found))
+        numbers = {int(path.stem) for path in paths}
+        first = next(number for number in itertools.count() if number not in numbers)
+        which, number = "is missing", first
+        if first >= facts.shards:
+            which, number = "is not one of them", max(numbers)
+        found = f"{which}: the split has {facts.shards} shards, and {len(paths)} files"
+        on_fault(DamagedFile(shard_path(where, number), found))
     read = (attempt(on_fault, _read_shard, path, facts, category, split) for path in paths)
     parts = [part for part in read if part is not None]
     if not parts:

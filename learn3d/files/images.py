@@ -23,17 +23,17 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
     """
     wanted = f"an image in the format {', '.join(formats)}"
     with faults_of(path, wanted), open_file(path, limits.IMAGE_FILE_BYTES, wanted) as file:
+        most = limits.IMAGE_PIXELS
+        limit = f"the limits are {max_side} a side and {most}: make it smaller"
         try:
             image = Image.open(file, formats=formats)
         except UnidentifiedImageError:
             raise ValueError("it has another format") from None
+        except Image.DecompressionBombError:  # Pillow's own limit, before the size is known here
+            raise DamagedFile(path, f"has too many pixels; {limit}") from None
         pixels = image.width * image.height
-        most = limits.IMAGE_PIXELS
         if max(image.size) > max_side or pixels > most:
-            size = f"{image.width}x{image.height} pixels"
-            raise DamagedFile(
-                path, f"is {size}; the limits are {max_side} a side and {most}: make it smaller"
-            )
+            raise DamagedFile(path, f"is {image.width}x{image.height} pixels; {limit}")
         sandbox.allow(56 * pixels, pixels / 1e7)  # for decoding, masking and framing
         image.load()
         return image

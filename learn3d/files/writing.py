@@ -13,6 +13,17 @@ from learn3d.terminal import stop_on_signal
 
 
 @contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Give an OSError without a file name this one: that for a full disk has none."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextlib.contextmanager
 def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; at the end the file there is renamed to
     `path`.
@@ -27,22 +38,18 @@ def replacing(path: Path, *, sync: bool = False, writer: str = "") -> Iterator[P
     # a killed process may have left a hard link, which must not be overwritten
     temporary.unlink(missing_ok=True)
     try:
-        temporary.touch()
-        # as the umask says; safetensors would let only the owner read its files
-        mode = temporary.stat().st_mode
-        temporary.unlink()
-        yield temporary
-        temporary.chmod(mode)
-        if sync:
-            _sync(temporary)
-        os.replace(temporary, path)
-        if sync:
-            _sync(path.parent)
-    except OSError as error:
-        # the error for a full disk has no file name
-        if error.errno is not None and error.filename is None:
-            error.filename = str(path)
-        raise
+        with _naming(path):
+            temporary.touch()
+            # as the umask says; safetensors would let only the owner read its files
+            mode = temporary.stat().st_mode
+            temporary.unlink()
+            yield temporary
+            temporary.chmod(mode)
+            if sync:
+                _sync(temporary)
+            os.replace(temporary, path)
+            if sync:
+                _sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -118,7 +125,8 @@ def publishing(folder: Path, paths: Sequence[str]) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix=".make_dataset_", dir=folder) as temporary:
         new, old = Path(temporary) / "new", Path(temporary) / "old"
         new.mkdir()
-        yield new
+        with _naming(folder):
+            yield new
         with stop_on_signal():
             for source, target in ((folder, old), (new, folder)):
                 for path in paths:

@@ -3,10 +3,11 @@
 The supervision is that of Peng et al. 2020: single images, each with its mask and its pose.
 """
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor, nn
 
 import nmr
@@ -18,7 +19,7 @@ from learn3d.methods.pose_invariant import PoseInvariant, PoseInvariantSettings
 from learn3d.networks.discriminators import pose_discriminator
 from learn3d.networks.encoders import EncoderName
 from learn3d.networks.generators import GeneratorName, SymmetryOption
-from learn3d.settings import Count, Positive, Weight, checked
+from learn3d.settings import Positive, Weight, checked
 
 REDUCED = MASK_SIZE // 2  # side of the masks in the mask bank
 
@@ -37,7 +38,7 @@ class PlusSettings(PoseInvariantSettings):
     lambda_area: Weight | Literal["auto"] = "auto"
     lambda_novel_view: Weight = 0.5
     """Weight of the loss at novel views."""
-    bank_size: Count = 2048
+    bank_size: Annotated[int, Field(ge=1, le=100_000)] = 2048
     """Number of training masks in the mask bank of the loss at novel views."""
     lambda_view: Weight = 0.0
     """Weight of the loss of a small network that classifies the azimuth of an image;

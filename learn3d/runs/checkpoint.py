@@ -5,13 +5,15 @@ The header has two entries: "learn3d", the JSON of `Metadata`, and "crc32", the 
 JSON and of the names, dtypes, shapes and bytes of all tensors.
 """
 
+import contextlib
 import dataclasses
 import functools
 import importlib.metadata
 import json
+import math
 import subprocess
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,13 +21,14 @@ import torch
 from pydantic import BeforeValidator, Field
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from learn3d.config import TrainConfig
 from learn3d.data.dataset import DatasetInfo, ViewDataset
 from learn3d.data.layouts import LAYOUTS, Layout, load_dataset
 from learn3d.device import resolve_precision
-from learn3d.files import writing
+from learn3d.files import limits, writing
 from learn3d.files.reading import DamagedFile, parse_json
 from learn3d.methods import create_method
 from learn3d.methods.method import Method
@@ -73,6 +76,8 @@ def _git_commit() -> str | None:
         return None
 
 
+# a checkpoint has at most so many numbers for each of its networks: weights, EMA, two moments of Adam
+_FILE_SHARE = 6
 _USE_ANOTHER = "use another checkpoint of the run"
 AnyStep = Annotated[int, Field(ge=0, le=10**9)]
 
@@ -167,6 +172,8 @@ def load(
     try:
         return tensors, Metadata(**parse_json(text))
     except (TypeError, ValueError) as error:  # TypeError: not a JSON object
+        if not with_tensors and path.stat().st_size < limits.WEIGHTS_BYTES:
+            load(path)  # perhaps the file has changed, which is the better message
         raise ValueError(f"{path} is no checkpoint of this version of learn3d: {error}") from None
 
 
@@ -189,15 +196,57 @@ def load_method(
     """Open a checkpoint for evaluation or reconstruction, see `load`.
 
     Returns the method in evaluation mode, with its EMA weights if it has any; its configuration;
-    the metadata.
+    the metadata. The names and sizes of the tensors are compared with the networks before any is
+    filled or read.
     """
-    tensors, metadata = load(path, which)
+    path = find(path, which)
+    metadata = load_metadata(path)
+    shapes = _shapes(path)
+    kind = "ema" if starting_with("ema.", shapes) else "network"
     how = {"device": device, "precision": resolve_precision(precision, device), "seed": 0}
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), _at_most(starting_with(f"{kind}.", shapes), path):
         method = create_method(metadata.config.settings, metadata.info, **how)
-    restore_networks(method, tensors, path, "ema" if starting_with("ema.", tensors) else "network")
+    wanted = {name: tuple(tensor.shape) for name, tensor in network_tensors(method).items()}
+    for name, shape in wanted.items():
+        if (found := shapes.get(name.replace("network", kind, 1))) != shape:
+            raise DamagedFile(path, f"does not fit: {name} is {found}, its networks need {shape}")
+    most = _FILE_SHARE * _count(wanted) + limits.WEIGHTS_BYTES // 4
+    if _count(shapes) > most:
+        raise DamagedFile(path, f"has {_count(shapes)} numbers; its networks have {_count(wanted)}")
+    tensors, metadata = load(path)
+    restore_networks(method, tensors, path, kind)
     method.networks.eval().requires_grad_(False)
     return method, metadata.config, metadata
+
+
+def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """The shape of each tensor of a checkpoint; no tensor is read."""
+    with safe_open(path, framework="pt") as file:
+        return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
+
+
+def _count(shapes: dict[str, tuple[int, ...]]) -> int:
+    return sum(map(math.prod, shapes.values()))
+
+
+@contextlib.contextmanager
+def _at_most(shapes: dict[str, tuple[int, ...]], path: Path) -> Iterator[None]:
+    """Context in which networks are built: those with more weights than the file are refused
+    before their weights are filled.
+    """
+    taken: dict[tuple[nn.Module, str], int] = {}
+    most = 2 * _count(shapes) + 10**7  # some layers are made and replaced
+
+    def take(module: nn.Module, name: str, weights: nn.Parameter | None) -> None:
+        taken[module, name] = 0 if weights is None else weights.numel()
+        if sum(taken.values()) > most:
+            raise DamagedFile(path, "does not fit: its networks have far more weights than it")
+
+    hook = register_module_parameter_registration_hook(take)
+    try:
+        yield
+    finally:
+        hook.remove()
 
 
 def load_data(
@@ -254,7 +303,8 @@ def restore_networks(
         try:
             network.load_state_dict(starting_with(f"{kind}.{name}.", tensors))
         except RuntimeError as error:
-            raise ValueError(f"{source} does not fit the {name}: {error}") from None
+            reason = "; ".join(line.strip() for line in str(error).splitlines()[1:4])
+            raise ValueError(f"{source} does not fit the {name}: {reason[:500]}") from None
 
 
 def starting_with(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

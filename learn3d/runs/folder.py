@@ -57,6 +57,11 @@ def lock_folder(folder: Path) -> Iterator[None]:
         reason = f"cannot be written to ({error.strerror})"
         raise OSError(f"the output folder {folder} {reason}; choose another --output") from None
     try:
+        for name in (PICTURES, TENSORBOARD, METRICS):
+            if (folder / name).is_symlink():  # else a run would write and remove files elsewhere
+                raise OSError(
+                    f"{folder / name} is a link; a run writes to its own folder only: remove it"
+                )
         yield
     finally:
         with contextlib.suppress(OSError):  # a read-only disk, or the folder was removed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from learn3d.terminal import align, say, without_traceback
 
@@ -59,6 +61,30 @@ def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(error: Exception,
     else:
         assert main() == 1
         assert capsys.readouterr().err == f"error: {error}\n"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("std::bad_alloc"),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate\n7 bytes."),
+        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"),
+    ],
+    ids=range(4),
+)
+def test_too_little_memory_is_a_line_whoever_notices_it(error: Exception, capsys) -> None:
+    @without_traceback
+    def main(error: Exception) -> int:
+        raise error
+
+    assert main(error) == 1
+    assert re.fullmatch(
+        r"error: there is too little memory; end other programs, or give .* \(.+\)\n",
+        capsys.readouterr().err,
+    )
+    with pytest.raises(RuntimeError, match="shape"):
+        main(RuntimeError("a shape is wrong"))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from learn3d.data.dataset import ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
+from learn3d.networks.encoders import CODE_SIZE
 
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
@@ -38,6 +39,16 @@ class KnownCodes(NamedTuple):
     # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
     hidden: Tensor | None = None
     output: Tensor | None = None  # float [H + 1]: weights of its logit, the bias last
+
+    def fits(self, categories: int) -> bool:
+        """Whether the shapes are those of so many categories."""
+        if self.kinds.ndim != 3 or self.kinds.shape[::2] != (categories, CODE_SIZE):
+            return False
+        if self.hidden is None or self.output is None:
+            return self.kinds.numel() > 0 and self.hidden is self.output is None
+        units = self.output.numel() - 1
+        shapes = [(units, CODE_SIZE + 1), (units + 1,)]
+        return self.kinds.numel() > 0 and [self.hidden.shape, self.output.shape] == shapes
 
     def nearest_kind(self, code: Tensor) -> int:
         """The category whose codes are nearest to a code [C]."""

@@ -19,6 +19,7 @@ from learn3d.data.layouts import LAYOUTS, Layout, require_folder
 from learn3d.data.masks import check_mask, keep_object, mask_box
 from learn3d.data.poses import Poses
 from learn3d.files.images import resample
+from learn3d.files.reading import DamagedFile
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Method
 from learn3d.networks.encoders import CENTRED_SIZE, centre
@@ -78,9 +79,12 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     method, config, metadata = checkpoint.load_method(path)
     tensors = checkpoint.load(path)[0]
     stored = ((KnownCodes, KNOWN_CODES), (Templates, TEMPLATES))
-    parts = (
+    parts = [
         kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored
-    )
+    ]
+    categories = len(split_names(config.category))
+    if not all(part is None or part.fits(categories) for part in parts):
+        raise DamagedFile(path, "has known codes or templates of other shapes than its categories")
     return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, *parts)
 
 

@@ -26,6 +26,7 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
+from learn3d.networks.encoders import CODE_SIZE
 from learn3d.studio.picture_to_mesh.fit import (
     Fit,
     Prediction,
@@ -71,6 +72,13 @@ class Templates(NamedTuple):
     numbers: Tensor  # int32 [N, M]: numbers of M shapes of each of N categories
     codes: Tensor  # float [N, M, K]
     axes: Tensor  # float [K + 1, C]: the mean of all codes, and K axes
+
+    def fits(self, categories: int) -> bool:
+        """Whether the shapes are those of so many categories."""
+        if self.codes is None or self.axes is None or self.axes.shape[1:] != (CODE_SIZE,):
+            return False
+        shape = (categories, *self.numbers.shape[1:2], len(self.axes) - 1)
+        return self.numbers.shape == shape[:2] and self.codes.shape == shape and 0 not in shape
 
     def nearest(
         self, code: Tensor, categories: Sequence[str], category: str | None = None

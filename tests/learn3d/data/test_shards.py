@@ -91,8 +91,25 @@ def set_file(stored: Path) -> Path:
 
 
 def change_set_file(stored: Path, **changes: int) -> None:
-    path = set_file(stored)
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    """With the right checksum."""
+    facts = json.loads(set_file(stored).read_text()) | changes | {"crc": None}
+    crc = zlib.crc32(json.dumps(facts, sort_keys=True).encode())
+    set_file(stored).write_text(json.dumps(facts | {"crc": crc}))
+
+
+@pytest.mark.parametrize("name", ["elevation_deg", "distance", "half_fov_deg"])
+def test_cameras_have_a_checksum_and_older_shards_are_read_and_said(stored, name, capsys) -> None:
+    facts = json.loads(set_file(stored).read_text())
+    facts["constants"][name] *= 1.01
+    set_file(stored).write_text(json.dumps(facts))
+    expect(stored, set_file(stored), "its content has changed since it was written")
+    del facts["crc"]
+    facts["constants"][name] /= 1.01
+    set_file(stored).write_text(json.dumps(facts))
+    assert load_dataset("kato", stored, "airplane", "train").num_objects == 3
+    assert "set.json: has no checksum of its cameras" in capsys.readouterr().err
+    (found,) = problems("kato", stored, "train", "airplane")
+    assert found.severity == "warning" and "has no checksum of its cameras" in found.message
 
 
 def flip_bit(path: Path, name: str) -> None:
@@ -121,10 +138,13 @@ def test_shards_that_are_missing_or_too_many_are_refused(stored, tiny_folder, co
     path = shard_file(stored, 1)
     path.rename(other := shard_file(stored, 7))
     other.rename(other.with_name("mine.safetensors"))
-    expect(stored, path, "the split needs 3 shards, but has 2")
+    expect(stored, path, "is missing: the split has 3 shards, and 2 files")
     shard_file(stored, 1).write_bytes(shard_file(stored).read_bytes())
     other.write_bytes(b"of an earlier, larger set")
-    with pytest.raises(ValueError, match="the split needs 3 shards, but has 4"):
+    with pytest.raises(
+        ValueError,
+        match=r"00007\.safetensors: is not one of them: the split has 3 shards, and 4 files",
+    ):
         load_dataset("kato", stored, "airplane", "train")
     (mine := other.with_name("photograph.png")).write_bytes(b"mine")
     set_file(stored).unlink()  # as an unfinished conversion leaves it
@@ -212,7 +232,7 @@ def test_a_shard_that_changed_after_a_kill_is_noticed(stored, tiny_config, tmp_p
 def test_a_set_that_claims_a_million_shards_is_refused_at_once(stored) -> None:
     change_set_file(stored, shards=10**6)
     began = time.process_time()
-    expect(stored, shard_file(stored, 3), "the split needs 1000000 shards, but has 3")
+    expect(stored, shard_file(stored, 3), "is missing: the split has 1000000 shards, and 3 files")
     assert time.process_time() - began < 2
 
 

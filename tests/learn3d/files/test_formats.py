@@ -39,7 +39,7 @@ def test_images_that_promise_too_many_pixels_are_not_decoded(tmp_path, size):
         read_photo,
         lambda path: sandbox.read(images.read_with_depth, path, path.with_name("none"), 64),
     ):
-        with pytest.raises(ValueError, match=r"a\.png: .*(make it smaller|DecompressionBomb)"):
+        with pytest.raises(ValueError, match=r"a\.png: .*make it smaller$"):
             read(tmp_path / "a.png")
 
 

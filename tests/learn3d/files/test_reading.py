@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -148,3 +150,9 @@ def test_a_target_is_checked_before_the_work(tmp_path, monkeypatch) -> None:
     ):
         with pytest.raises(OSError, match=rf"^cannot write .*{why}.* give another --x$"):
             writing.check_target(tmp_path / name, "--x", folder=folder)
+
+
+def test_a_full_disk_is_named_with_its_folder(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=re.escape(f"No space left on device: '{tmp_path}'")):
+        with writing.publishing(tmp_path, ["a"]):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -97,6 +97,32 @@ def test_metadata_of_another_form(tmp_path, change, message: str) -> None:
             read(tmp_path / "a.safetensors")
 
 
+def test_sizes_and_shapes_come_before_tensors_are_read(finished_run, tmp_path, monkeypatch) -> None:
+    path = tmp_path / "a.safetensors"
+    loaded, about = checkpoint.load(finished_run / "last.safetensors")
+    name = next(name for name in loaded if name.startswith("network."))
+    load = checkpoint.load
+
+    def refused(message: str) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(checkpoint, "load", lambda *a, **o: load(*a, **o) if o else pytest.fail())
+            with pytest.raises(DamagedFile, match=message):
+                checkpoint.load_method(path)
+
+    checkpoint.save(path, loaded | {name: torch.zeros(7)}, about)
+    refused(rf"a.safetensors: does not fit: {name} is \(7,\), its networks need \(")
+    checkpoint.save(path, {k: v for k, v in loaded.items() if k != name}, about)
+    refused(f"does not fit: {name} is None, its networks need")
+    many = torch.zeros(1, dtype=torch.uint8).expand(500_000_000)
+    checkpoint.save(path, loaded | {"optimizer.more": many}, about)
+    refused(r"has 5\d{8} numbers; its networks have \d+$")
+    values = dataclasses.asdict(about)
+    values["config"]["settings"]["encoder"] = "conv"
+    text = json.dumps(values, default=str)
+    save_file({}, path, {"learn3d": text, "crc32": f"{zlib.crc32(text.encode()):08x}"})
+    refused("does not fit: its networks have far more weights than it")
+
+
 class StandIn:
     """As much of a method as a checkpoint asks for, with a step of Adam behind it."""
 

@@ -50,6 +50,17 @@ def test_a_folder_in_use_is_refused_and_a_killed_process_does_not_hold_it(tmp_pa
     assert not (folder / ".lock").exists()
 
 
+@pytest.mark.parametrize("name", ["pictures", "tensorboard", "metrics.jsonl"])
+def test_a_run_folder_with_links_is_refused(tmp_path, name: str) -> None:
+    """A run writes there, and --overwrite removes files."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match=rf"{name} is a link; a run writes to its own folder only"):
+        with run_folder.lock_folder(tmp_path / "run"):
+            pass
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [name]
+
+
 @pytest.mark.parametrize("links", [True, False])
 def test_the_last_two_checkpoints_are_kept(tiny_run, tmp_path, monkeypatch, links: bool) -> None:
     def no_links(*_: object) -> None:

@@ -9,10 +9,11 @@ import torch
 
 from learn3d.data.layouts import load_dataset
 from learn3d.evaluation import evaluate
+from learn3d.files.reading import DamagedFile
 from learn3d.runs import checkpoint
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
 from learn3d.studio.picture_to_mesh.export import export
-from learn3d.studio.picture_to_mesh.reconstruction import SMALL_MODEL
+from learn3d.studio.picture_to_mesh.reconstruction import SMALL_MODEL, load_model
 from learn3d.training import train
 
 
@@ -46,6 +47,26 @@ def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch
     export(finished_run, tmp_path / "small.safetensors")
     content = (tmp_path / "small.safetensors").read_bytes()
     assert not [path for path in (tmp_path, finished_run) if str(path).encode() in content]
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("template_codes", (3, 7)),
+        ("template_axes", (5, 7)),
+        ("known_codes", (5,)),
+        ("known_codes", (6, 0, 512)),
+        ("hidden_layer", ()),
+        ("output_layer", (3, 3)),
+    ],
+)
+def test_known_codes_and_templates_of_other_shapes_are_refused(tmp_path, name, shape) -> None:
+    tensors, metadata = checkpoint.load(SMALL_MODEL)
+    load_model(SMALL_MODEL)
+    assert name in tensors
+    checkpoint.save(tmp_path / "a.safetensors", tensors | {name: torch.zeros(shape)}, metadata)
+    with pytest.raises(DamagedFile, match=r"a\.safetensors: has known codes or templates of other"):
+        load_model(tmp_path / "a.safetensors")
 
 
 def test_other_methods_are_refused(tiny_config, run_folder, tmp_path) -> None:
