@@ -1,4 +1,4 @@
-"""Layouts against their descriptions: masks and voxels are those of the TRUE mesh under the numbers in the files.
+"""Layouts against their descriptions: masks are those of the TRUE mesh under the numbers in the files.
 
 Nothing here goes through our readers: `data/test_round_trip.py` compares what these read with the
 meshes. If the description is in right-handed world coordinates, so is the test: cameras are
@@ -8,7 +8,6 @@ OpenCV's.
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 from pathlib import Path
 
@@ -48,10 +47,8 @@ def in_object_frame(vertices: torch.Tensor) -> torch.Tensor:
     return (vertices @ torch.from_numpy(mesh_to_object("y", "x").T)).float()
 
 
-def silhouette(vertices, faces, camera, size, anti_aliasing=True) -> np.ndarray:
-    alpha = nmr.render_silhouette(
-        vertices.float(), faces, camera, image_size=size, anti_aliasing=anti_aliasing
-    )
+def silhouette(vertices, faces, camera, size) -> np.ndarray:
+    alpha = nmr.render_silhouette(vertices.float(), faces, camera, image_size=size)
     return np.rint(255 * alpha[0].numpy())
 
 
@@ -61,30 +58,6 @@ def assert_same_mask(stored: np.ndarray, wanted: np.ndarray) -> None:
     assert (stored != wanted).mean() < 5e-4 and np.abs(stored - wanted).max() <= 64, (
         stored != wanted
     ).mean()
-
-
-def assert_oriented(
-    voxels: np.ndarray, vertices: torch.Tensor, faces: torch.Tensor, span: float
-) -> None:
-    """Of all 48 orientations of the grid, the one it has agrees best with the mesh; axes as the vertices'.
-
-    vertices: in the axes of the grid, which spans [-span / 2, span / 2].
-    """
-    boxes = [part.bounds for part in trimesh.Trimesh(vertices.numpy(), faces.numpy()).split()]
-    centers = (np.indices((32,) * 3).reshape(3, -1).T + 0.5) / 32 * span - span / 2
-    inside = np.any(
-        [((low < centers) & (centers < high)).all(axis=1) for low, high in boxes], axis=0
-    )
-    inside = inside.reshape((32,) * 3)
-    scores = {}
-    for order in itertools.permutations(range(3)):
-        for flips in itertools.product((1, -1), repeat=3):
-            other = inside.transpose(order)[:: flips[0], :: flips[1], :: flips[2]]
-            scores[order, flips] = (other & voxels).sum() / (other | voxels).sum()
-    assert (
-        max(scores, key=scores.get) == ((0, 1, 2), (1, 1, 1))
-        and scores[(0, 1, 2), (1, 1, 1)] > 0.75
-    )
 
 
 def opencv_camera(eye: np.ndarray, focal: float, size: int) -> nmr.cameras.Camera:
@@ -108,44 +81,31 @@ def views(layout: str, radius: float, count: int, seed: int) -> Poses:
     return WRITERS[layout].views(np.array([[radius, 0.0, 0.0]]), count, np.random.default_rng(seed))
 
 
-def test_kar(tmp_path, folder):
+def test_files_of_kar_that_the_reader_leaves(tmp_path, folder):
+    """Lists, metres of depth and matrices of cameras; `data/test_round_trip.py` has images, view.txt and voxels."""
     make(tmp_path, folder, "kar", test=1, val=1, views=3)
     splits = json.loads((tmp_path / "splits.json").read_text())[SYNSET]
-    assert splits["name"] == "chair" and [len(splits[s]) for s in ("train", "val", "test")] == [
-        3,
-        1,
-        1,
-    ]
+    assert splits["name"] == "chair"
+    assert [len(splits[split]) for split in ("train", "val", "test")] == [3, 1, 1]
     (name,) = splits["test"]
     mesh, faces = true_mesh(folder, name)
     vertices, root = in_object_frame(mesh), tmp_path / "renders" / SYNSET / name
-    volume = loadmat(tmp_path / "voxels" / "modelVoxels32" / SYNSET / f"{name}.mat")["Volume"] > 0
-    assert_oriented(volume, vertices[:, [2, 1, 0]] * torch.tensor([-1, 1, 1]), faces, span=1)
-    rows = np.loadtxt(root / "view.txt")
-    assert rows.shape == (3, 4)
-    for i, (azimuth, elevation, _, distance) in enumerate(rows):
+    for i, (azimuth, elevation, _, distance) in enumerate(np.loadtxt(root / "view.txt")):
+        alpha = read_image(root / f"render_{i}.png")[..., 3]
         camera = nmr.LookAt.from_angles([distance], [elevation], [azimuth], half_fov_deg=14.9314)
-        rgba = read_image(root / f"render_{i}.png")
-        assert_same_mask(rgba[..., 3], silhouette(vertices, faces, camera, 224))
-        assert (rgba[rgba[..., 3] == 0] == 0).all() and rgba[rgba[..., 3] > 0][:, :3].min() > 20
-        # the whole object is seen
-        assert not rgba[[0, -1], :, 3].any() and not rgba[:, [0, -1], 3].any()
-        depth = np.asarray(Image.open(root / f"depth_{i}.png"))
-        hard = silhouette(vertices, faces, camera, 224, anti_aliasing=False)
-        assert_same_mask(255.0 * (depth < 250), hard)
         true_depth = nmr.render_depth(vertices, faces, camera, image_size=224, anti_aliasing=False)[
             0
         ].numpy()
-        seen = (depth < 250) & (hard > 0)
-        np.testing.assert_allclose(
-            depth[seen] / 240 * 1.8 + distance - 0.9, true_depth[seen], atol=0.005
-        )
+        depth = read_image(root / f"depth_{i}.png")
+        metres, seen = depth / 240 * 1.8 + distance - 0.9, (depth < 250) & (alpha == 255)
+        assert seen.mean() > 0.05
+        np.testing.assert_allclose(metres[seen], true_depth[seen], atol=0.005)
         matrices = loadmat(root / f"camera_{i}.mat")
         rotation, offset = matrices["extrinsic"][:, :3], matrices["extrinsic"][:, 3]
         opencv = nmr.cameras.from_opencv(
             matrices["K"], rotation, offset, height=224, width=224, pixel_center=0.5
         )
-        assert_same_mask(rgba[..., 3], silhouette(mesh, faces, opencv, 224))
+        assert_same_mask(alpha, silhouette(mesh, faces, opencv, 224))
         quaternion = Rotation.from_quat(np.roll(matrices["quat"].reshape(4), -1))
         np.testing.assert_allclose(quaternion.as_matrix(), rotation, atol=1e-6)
 
