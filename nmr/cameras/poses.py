@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
 
-from .._validate import describe
+from .._packing import is_list
+from .._validate import check_values, describe
 
 if TYPE_CHECKING:
     from .projection import ProjectingCamera
@@ -27,7 +28,7 @@ class Poses:
 
     def __len__(self) -> int:
         """The number of poses."""
-        return max((len(x) for x in _batched(self).values()), default=1)
+        return next((len(x) for x in _parameters(self).values() if len(x) != 1), 1)
 
     def __getitem__(self: C, index: int | slice | Sequence[int] | Tensor) -> C:
         """Some of the poses, as a camera of the same class; a number gives one with one pose.
@@ -38,14 +39,8 @@ class Poses:
         if isinstance(index, int):
             if not -count <= index < count:
                 raise IndexError(f"pose {index} of a camera with {count} poses")
-            index = slice(index % count, index % count + 1)
-        if isinstance(index, (list, tuple)):
-            index = torch.tensor(index, device="cpu")
-        whole = _batched(self)
-        if count == 1:  # parameters without a batch axis
-            whole = {name: x if name in whole else x.unsqueeze(0) for name, x in _given(self)}
-        chosen = {name: x[index] if len(x) > 1 or count == 1 else x for name, x in whole.items()}
-        return replace(self, **chosen)
+            index = [index]
+        return replace(self, **{name: x[index] for name, x in _parameters(self, count).items()})
 
     def unproject(self: ProjectingCamera, points: Tensor) -> Tensor:
         """The inverse of :meth:`transform`: points from renderer space to world space.
@@ -75,10 +70,9 @@ class Poses:
         >>> (camera.unproject(camera.transform(points)) - points).abs().max() < 1e-5
         tensor(True)
         """
-        if not isinstance(points, Tensor) or not points.is_floating_point():
-            raise TypeError(f"points must be a float tensor [B, N, 3], got {describe(points)}")
-        if points.ndim not in (2, 3) or points.shape[-1] != 3:
-            raise ValueError(f"points must have shape [B, N, 3] or [N, 3], got {describe(points)}")
+        given = check_values(points, "points", "N, 3")
+        if is_list(given) or given.shape[-1] != 3:
+            raise ValueError(f"points must be a tensor [B, N, 3] or [N, 3], got {describe(points)}")
         camera = self.projection().plain()
         if camera.distortion is not None and camera.perspective:
             raise ValueError(
@@ -86,12 +80,11 @@ class Poses:
                 "dist_coeffs"
             )
         matrix, intrinsics = (x.to(points.device) for x in (camera.matrix, camera.intrinsics))
-        given = (points if points.ndim == 3 else points.unsqueeze(0)).double()
         if len(given) != 1 and camera.batch not in (1, len(given)):
             raise ValueError(
                 f"points must have batch size 1 or {camera.batch}, that of the poses, got {describe(points)}"
             )
-        place, depth = given.split([2, 1], dim=-1)
+        place, depth = given.double().split([2, 1], dim=-1)
         place = (place - intrinsics[:, None, :, 2]) @ torch.linalg.inv(intrinsics[:, :, :2]).mT
         place = place * depth if camera.perspective else place
         seen = torch.cat([place, depth.expand(*place.shape[:2], 1)], dim=-1)
@@ -127,18 +120,17 @@ class Poses:
         >>> (points.norm(dim=-1) - 1).abs().max() < 0.02  # they lie on the sphere
         tensor(True)
         """
-        if not isinstance(depth, Tensor) or not depth.is_floating_point():
-            raise TypeError(f"depth must be a float tensor [B, h, w], got {describe(depth)}")
-        if depth.ndim not in (2, 3):
-            raise ValueError(f"depth must have shape [B, h, w] or [h, w], got {describe(depth)}")
-        height, width = depth.shape[-2:]
+        given = check_values(depth, "depth", "h, w")
+        if is_list(given):
+            raise TypeError("depth must be a tensor [B, h, w], got a list; use torch.stack()")
+        height, width = given.shape[1:]
         x, y = (
-            (2 * torch.arange(n, dtype=torch.float64, device=depth.device) + 1) / n - 1
+            (2 * torch.arange(n, dtype=torch.float64, device=given.device) + 1) / n - 1
             for n in (width, height)
         )
         grid = torch.stack([x.expand(height, width), -y[:, None].expand(height, width)], dim=-1)
-        depth = depth.reshape(-1, height, width, 1)
-        points = torch.cat([grid.to(depth).expand(len(depth), -1, -1, -1), depth], dim=-1)
+        grid = grid.to(given).expand(len(given), -1, -1, -1)
+        points = torch.cat([grid, given.unsqueeze(-1)], dim=-1)
         camera = self.for_image(height, width)
         return camera.unproject(points.flatten(1, 2)).unflatten(1, (height, width))
 
@@ -168,55 +160,40 @@ def cat(cameras: Sequence[C]) -> C:
     3
     """
     cameras = list(cameras)
-    if not cameras or not all(isinstance(x, Poses) and is_dataclass(x) for x in cameras):
+    if not cameras or not all(isinstance(x, Poses) for x in cameras):
         raise TypeError(f"cat takes a list of nmr's cameras, got {[describe(x) for x in cameras]}")
     if len({type(x) for x in cameras}) > 1:
         raise TypeError(
             f"the cameras must be of one class, got {[describe(x) for x in cameras]}; "
             "camera.for_image(height, width).projection() makes a Projection of any"
         )
-    first, joined = cameras[0], {}
+    first, rows = cameras[0], [_parameters(x, len(x)) for x in cameras]
     for field in fields(first):
+        if any((field.name in row) != (field.name in rows[0]) for row in rows):
+            raise ValueError(f"{field.name} is None in some of the cameras")
         values = [getattr(x, field.name) for x in cameras]
-        if isinstance(values[0], Poses):
-            joined[field.name] = cat(values)
-        elif field.name in _AXES and not all(x is None for x in values):
-            if any(x is None for x in values):
-                raise ValueError(f"{field.name} is None in some of the cameras")
-            parts = [
-                _rows(x, field.name, len(camera)) for x, camera in zip(values, cameras, strict=True)
-            ]
-            joined[field.name] = torch.cat(parts)
-        elif any(x != values[0] for x in values):
+        if field.name not in rows[0] and any(x != values[0] for x in values):
             raise ValueError(f"{field.name} differs between the cameras: {values}")
-    return replace(first, **joined)
+    joined = {name: [row[name] for row in rows] for name in rows[0]}
+    return replace(
+        first,
+        **{name: (cat if isinstance(x[0], Poses) else torch.cat)(x) for name, x in joined.items()},
+    )
 
 
-def _given(camera: object) -> list[tuple[str, Tensor]]:
-    """The parameters that a camera has, as tensors; of a camera in a camera, that one."""
-    found = []
-    for field in fields(camera) if is_dataclass(camera) else ():
-        value = getattr(camera, field.name)
-        if isinstance(value, Poses):
-            found.append((field.name, value))
-        elif field.name in _AXES and value is not None:
-            found.append((field.name, _tensor(value)))
+def _parameters(camera: object, count: int | None = None) -> dict[str, Tensor]:
+    """The parameters ``[1 or B, ...]`` that a camera has, or with a row for each of ``count``
+    poses; of a camera within a camera, that one.
+    """
+    found = {}
+    for field in fields(camera):
+        value, axes = getattr(camera, field.name), _AXES.get(field.name)
+        if not isinstance(value, Poses):
+            if axes is None or value is None:
+                continue
+            if not isinstance(value, Tensor):
+                value = torch.tensor(value, dtype=torch.float64, device="cpu")
+            value = value if value.ndim > axes else value.unsqueeze(0)
+            value = value if count is None else value.expand(count, *value.shape[1:])
+        found[field.name] = value
     return found
-
-
-def _batched(camera: object) -> dict[str, Tensor]:
-    """Those with a batch axis."""
-    return {name: x for name, x in _given(camera) if isinstance(x, Poses) or x.ndim > _AXES[name]}
-
-
-def _rows(value: float | Tensor, name: str, count: int) -> Tensor:
-    """A parameter as ``[count, ...]``."""
-    value = _tensor(value)
-    value = value if value.ndim > _AXES[name] else value.unsqueeze(0)
-    return value.expand(count, *value.shape[1:])
-
-
-def _tensor(value: float | Tensor) -> Tensor:
-    if isinstance(value, Tensor):
-        return value
-    return torch.tensor(value, dtype=torch.float64, device="cpu")

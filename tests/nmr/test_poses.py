@@ -40,6 +40,7 @@ def test_a_camera_is_the_sequence_of_its_poses(name):
         assert not len(wanted) or torch.equal(some.transform(VERTICES), wanted)
     joined = cameras.cat([camera, camera[0], *camera])
     assert torch.equal(joined.transform(VERTICES), torch.cat([whole, whole[:1], whole]))
+    assert len(nmr.LookAt(torch.zeros(0, 3))) == 0
     with pytest.raises(IndexError, match=f"pose {len(whole)} of a camera with {len(whole)} poses"):
         camera[len(whole)]
 
@@ -103,7 +104,7 @@ WRONG = {
         "dist_coeffs is None in some of the cameras",
     ),
     "integers": (lambda: CAMERAS["one"].unproject(FACES), TypeError, "float tensor"),
-    "shape": (lambda: CAMERAS["one"].unproject(EYES[:, :2]), ValueError, "have shape"),
+    "shape": (lambda: CAMERAS["one"].unproject(EYES[:, :2]), ValueError, r"a tensor \[B, N, 3\]"),
     "batch": (
         lambda: CAMERAS["look at"].unproject(normal(2, 4, 3)),
         ValueError,
@@ -113,7 +114,7 @@ WRONG = {
     "depth's shape": (
         lambda: CAMERAS["one"].unproject_depth(EYES[0]),
         ValueError,
-        r"\[B, h, w\] or \[h, w\]",
+        r"\[h, w\] or \[B, h, w\]",
     ),
 }
 
