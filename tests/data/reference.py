@@ -6,7 +6,6 @@ faces, as the published kernels do. Works in the dtype of its input.
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import torch
@@ -127,21 +126,6 @@ def resolve(image: Tensor, anti_aliasing: bool) -> Tensor:
     """The image ``[h, w, C]``, row 0 = top, of raster pixels ``[H, W, C]``, row 0 = bottom."""
     image = image.flip(0)
     return image.unfold(0, 2, 2).unfold(1, 2, 2).mean((-1, -2)) if anti_aliasing else image
-
-
-def texture_color(texture: Tensor, weights: Tensor, eps: float) -> Tensor:
-    """Colour ``[C]`` of one pixel: its face's texture ``[ts, ts, ts, C]`` at the weights ``[3]`` of its vertices."""
-    size = texture.shape[0]
-    t = (weights * (size - 1)).clamp_max(size - 1 - eps).clamp_min(0)
-    color = torch.zeros_like(texture[0, 0, 0])
-    for corner in itertools.product((0, 1), repeat=3):
-        cell, share = [], 1.0
-        for k, upper in enumerate(corner):
-            below = math.floor(t[k])
-            cell.append(min(below + upper, size - 1))
-            share = share * (t[k] - below if upper else 1 - (t[k] - below))
-        color = color + share * texture[tuple(cell)]
-    return color
 
 
 def _raster_gradient(grad_resolved: Tensor, anti_aliasing: bool) -> Tensor:

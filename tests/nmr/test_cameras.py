@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from scenes import any_number, double, leaf_of, normal, same_bits, uniform, value_and_gradients
 from torch.autograd import gradcheck
 from torch.testing import assert_close
@@ -317,40 +316,22 @@ def test_the_optical_axis_has_a_gradient():
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.sampled_from([np.float32, np.float64]),
     hnp.arrays(np.float64, (2, 5, 3), elements=any_number),
-    hnp.arrays(np.float64, (12,), elements=any_number),
-    hnp.arrays(np.float64, (9,), elements=any_number),
-    hnp.arrays(np.float64, (5,), elements=any_number),
-    hnp.arrays(
-        np.float32, (2, 5, 3), elements=st.sampled_from([0.0, 1.0, -3.0, 1e-30, 1e4, 1e20, 3e38])
-    ),
+    hnp.arrays(np.float64, (17,), elements=any_number),
 )
-def test_never_nan(dtype, vertices, pose, calibration, distortion, upstream):
-    """Any vertices through any camera, with any finite upstream gradient."""
-    with np.errstate(over="ignore"):
-        vertices, pose, K, d, upstream = (
-            torch.from_numpy(x.astype(dtype))
-            for x in (vertices, pose, calibration.reshape(3, 3), distortion, upstream)
-        )
-    eye, at, up, t = pose.split(3)
-    fov = torch.tensor(40.0, dtype=vertices.dtype)
-    for make, parameters in (
-        (nmr.LookAt, (eye, at, up, fov)),
-        (lambda *pose: nmr.Look(*pose, 1e-8), (eye, at, up)),
-        (nmr.Orthographic, (eye, at, up)),
-        (lambda K, t, d: nmr.Pinhole(K, torch.eye(3), t, d, orig_size=2), (K, t, d)),
-    ):
-        out, *grads = value_and_gradients(
-            lambda x, *given, make=make: make(*given).transform(x),
-            vertices,
-            *parameters,
-            upstream=upstream,
-        )
-        nowhere = out[..., 0] == math.inf
-        assert not out.isnan().any() and (out[nowhere][:, 1] == math.inf).all()
-        assert out[~nowhere][:, :2].isfinite().all()
-        assert not any(grad.isnan().any() for grad in grads) and not grads[0][nowhere].any()
+def test_a_pinhole_gives_no_nan(vertices, calibration):
+    """Any vertices through any calibration; of the other cameras this is a test of the kernels."""
+    vertices, calibration = torch.from_numpy(vertices), torch.from_numpy(calibration)
+    K, t, d = calibration[:9].view(3, 3), calibration[9:12], calibration[12:]
+    out, *grads = value_and_gradients(
+        lambda x, K, t, d: nmr.Pinhole(K, torch.eye(3), t, d, orig_size=2).transform(x),
+        vertices,
+        *(K, t, d),
+    )
+    nowhere = out[..., 0] == math.inf
+    assert not out.isnan().any() and (out[nowhere][:, 1] == math.inf).all()
+    assert out[~nowhere][:, :2].isfinite().all()
+    assert not any(grad.isnan().any() for grad in grads) and not grads[0][nowhere].any()
 
 
 def test_a_camera_of_ones_own_can_give_a_projection():

@@ -219,19 +219,6 @@ def test_empty_batches_and_meshes(name, batch, num_faces):
 
 
 @NAMES
-def test_float32_is_close_to_float64(name):
-    vertices, faces = MESHES[1]
-    values = values_of(name, vertices, faces)
-    single = outcome(name, vertices, faces, values, EYES[0])
-    wide = outcome(name, vertices.double(), faces, [x.double() for x in values], EYES[0])
-    for a, b in zip((*single[0], *single[1]), (*wide[0], *wide[1]), strict=True):
-        assert b.dtype == torch.float64 or not b.is_floating_point()
-        error = (a.double() - b).abs().flatten()
-        # a pixel at an edge may belong to the other side
-        assert error.quantile(0.98) <= 1e-3 * b.abs().max()
-
-
-@NAMES
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("eyes", [EYES, INSIDE], ids=["outside", "inside"])
 def test_faces_with_a_corner_that_is_not_finite_draw_nothing_and_spoil_nothing(name, bad, eyes):

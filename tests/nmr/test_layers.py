@@ -35,22 +35,6 @@ def test_equals_the_slow_definition(seed, fill_back):
     assert_close(fragments.depth[0], depth, rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("image_size", [33, (20, 41)])
-@pytest.mark.parametrize("seed", range(4))
-def test_the_first_layer_is_what_is_seen(dtype, image_size, seed):
-    vertices, faces = random_soup(seed, 1, dtype=dtype)
-    plain, one, layers = (
-        nmr.render_fragments(vertices, faces, image_size=image_size, **how)
-        for how in ({}, {"faces_per_pixel": 1}, {"faces_per_pixel": 3})
-    )
-    first = layers.layer(0)
-    for name in ("sided_face_index", "weights", "depth", "covered", "is_back", "face_index"):
-        assert torch.equal(getattr(first, name), getattr(plain, name))
-    assert torch.equal(first.normals(), plain.normals())
-    assert torch.equal(*(x.resolve(x.interpolate(vertices)) for x in (first, plain)))
-    assert one.layers is None and torch.equal(one.sided_face_index, plain.sided_face_index)
-
-
 def test_of_equally_near_faces_the_first_comes_first():
     vertices = torch.tensor([[-0.9, -0.9, 2.0], [0.9, -0.9, 2.0], [0.0, 0.9, 2.0]])
     faces = torch.tensor([[0, 1, 2], [1, 2, 0], [2, 1, 0], [0, 1, 2]])

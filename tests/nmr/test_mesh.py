@@ -147,19 +147,6 @@ def test_lights_per_image(smooth):
         assert_close([x[b] for x in grads], own_grads, rtol=1e-4, atol=1e-4)
 
 
-def test_values_of_a_batch_may_be_lists():
-    vertices = torch.stack([VERTICES[0], 0.7 * VERTICES[0]])
-    uv_faces = torch.stack([FACES[0] % 50, FACES[0] % 49])
-    values = torch.rand(2, 4, 4, 3), torch.rand(2, 50, 2), uv_faces
-    stacked, lists = (
-        nmr.render_rgb(
-            vertices, FACES[0], nmr.LookAt(EYES[:2]), colors=nmr.UVTexture(*given), **SIZE
-        )
-        for given in (values, map(list, values))
-    )
-    assert torch.equal(stacked, lists) and stacked.any()
-
-
 def test_a_list_of_one_grows_to_the_cameras_batch():
     one, plain = (
         nmr.render_silhouette(*mesh, nmr.LookAt(EYES), **SIZE)

@@ -125,19 +125,6 @@ def test_export():
     assert torch.equal(program(MESHES), Depth()(MESHES))
 
 
-def test_memory_that_is_missing_is_reported_once(monkeypatch):
-    calls = []
-
-    def without_memory(*args, **kwargs):
-        calls.append(args)
-        raise RuntimeError("can't allocate memory")
-
-    monkeypatch.setattr(torch.Tensor, "new_empty", without_memory)
-    with pytest.raises(RuntimeError, match="can't allocate memory"):
-        nmr.ops.normals(MESHES, FACES, None, True)
-    assert len(calls) == 1
-
-
 def test_the_first_render_imports_no_compiler():
     """It takes milliseconds; torch._dynamo alone takes a second."""
     program = """
@@ -152,23 +139,6 @@ print("torch._dynamo" in sys.modules)
         [sys.executable, "-I", "-c", program], capture_output=True, text=True, check=True
     )
     assert run.stdout.strip() == "False"
-
-
-@pytest.mark.parametrize("kernel", ["silhouette", "silhouette_backward"])
-@pytest.mark.parametrize(
-    "differentiate", [gradient, lambda f, v: torch.func.grad(f)(v)], ids=["autograd", "func"]
-)
-def test_an_allocation_that_fails_in_a_kernel_is_reported_once(kernel, differentiate, monkeypatch):
-    calls = []
-
-    def fail(**arguments):
-        calls.append(kernel)
-        raise MemoryError("std::bad_alloc")
-
-    monkeypatch.setattr(nmr._C, kernel, fail)
-    with pytest.raises(MemoryError, match=r"^std::bad_alloc$"):
-        differentiate(FUNCTIONS["silhouette"], SPHERE)
-    assert calls == [kernel]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")

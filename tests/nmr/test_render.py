@@ -226,10 +226,11 @@ def test_flat_normals_point_at_the_viewer_and_are_those_of_the_faces():
 LARGE = double([[-4.0, -3.0, 1.0], [5.0, -4.0, 3.0], [0.5, 6.0, 2.0]])
 
 
-def test_depth_and_normals_have_true_derivatives(anti_aliasing):
+def test_depth_and_normals_have_true_derivatives(anti_aliasing, perspective):
     tilted = torch.cat([LARGE, LARGE[:1] * double([1.5, 1.0, 1.2])]).requires_grad_()
     faces = torch.tensor([[0, 1, 2], [0, 1, 3]])
     how, close = dict(image_size=4, anti_aliasing=anti_aliasing), dict(atol=1e-6, rtol=1e-4)
+    how["camera"] = None if perspective else nmr.Orthographic([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     gradcheck(lambda v: nmr.render_depth(v, faces[:1], **how), leaf_of(LARGE), **close)
     for smooth in (False, True):
         draw = functools.partial(nmr.render_normals, faces=faces, smooth=smooth, **how)

@@ -1,9 +1,8 @@
 """texture_cubes and interpolate: slow definitions, finite differences, their invariances, bad input."""
 
 import pytest
-import reference
 import torch
-from scenes import leaf_of, normal, random_soup, uniform, value_and_gradients
+from scenes import random_soup, uniform, value_and_gradients
 from torch.testing import assert_close
 
 import nmr
@@ -14,27 +13,6 @@ EPS = 1e-3
 def fragments_of(vertices, faces, size):
     index = nmr.ops.rasterize(vertices, faces, None, size, size, True, 0.1, 50.0, True)
     return index, nmr.ops.fragments(vertices, faces, None, index, 50.0, True)[0]
-
-
-@pytest.mark.parametrize("size, channels", [(1, 3), (2, 3), (3, 1), (4, 5)])
-@pytest.mark.parametrize("texture_batch", [1, 2])
-def test_texture_cubes_equal_the_slow_definition(size, channels, texture_batch):
-    vertices, faces = random_soup(0)
-    face_index, weights = fragments_of(vertices, faces, 10)
-    assert (face_index >= len(faces)).any() and (face_index < 0).any()
-    textures = uniform(texture_batch, len(faces), size, size, size, channels)
-
-    def fast(textures):
-        return nmr.ops.texture_cubes(textures, face_index, weights, None, EPS)
-
-    def slow(textures):
-        out = torch.zeros(*face_index.shape, channels).double()
-        for b, y, x in (face_index >= 0).nonzero().tolist():
-            cube = textures[b % texture_batch, face_index[b, y, x] % len(faces)]
-            out[b, y, x] = reference.texture_color(cube, weights[b, y, x], EPS)
-        return out
-
-    assert_close(*(value_and_gradients(function, textures) for function in (fast, slow)))
 
 
 @pytest.mark.parametrize("eps", [0.0, 1e-12, 0.5])
@@ -74,19 +52,3 @@ def test_interpolate_equals_the_formula(attribute_batch, corners_per_image, chan
 
     inputs = uniform(attribute_batch, 9, channels), weights
     assert_close(*(value_and_gradients(function, *inputs) for function in (fast, formula)))
-
-
-@pytest.mark.parametrize("asked", [0, 1])
-def test_interpolate_computes_only_the_gradients_asked_for(asked):
-    vertices, faces = random_soup(2)
-    face_index, weights = fragments_of(vertices, faces, 12)
-    inputs = [uniform(1, 36, 3), weights]
-
-    def interpolate(attributes, weights):
-        return nmr.ops.interpolate(attributes, faces, face_index, weights, None)
-
-    wanted = value_and_gradients(interpolate, *inputs)[1 + asked]
-    inputs[asked] = leaf_of(inputs[asked])
-    output = interpolate(*inputs)
-    output.backward(normal(*output.shape))
-    assert torch.equal(inputs[asked].grad, wanted) and inputs[1 - asked].grad is None

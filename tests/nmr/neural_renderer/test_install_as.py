@@ -7,9 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
 import nmr
 import nmr.neural_renderer as nr
@@ -166,28 +164,3 @@ def test_another_package_is_not_shadowed_in_silence(tmp_path, imported):
     nr.install_as(replace=True)
     assert importlib.import_module("neural_renderer") is nr
     assert importlib.import_module("neural_renderer.look").look is nr.look
-
-
-@pytest.fixture
-def mesh(tmp_path):
-    vertices, faces = nmr.icosphere(2)
-    nr.save_obj(str(tmp_path / "mesh.obj"), vertices * torch.tensor([0.5, 1.0, 0.5]), faces)
-    return str(tmp_path / "mesh.obj")
-
-
-def test_find_the_camera(mesh):
-    vertices, faces = (x[None] for x in nr.load_obj(mesh))
-    renderer = nr.Renderer(camera_mode="look_at", image_size=32)
-    renderer.eye = nr.get_points_from_angles(2.732, 30, -15)
-    reference = renderer(vertices, faces, mode="silhouettes").detach()
-    position = torch.nn.Parameter(torch.from_numpy(np.array([-0.3, 2.6, -2.6], dtype=np.float32)))
-    renderer.eye = position
-    optimizer = torch.optim.Adam(renderer.parameters(), lr=0.05)
-    losses = []
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss = torch.sum((renderer(vertices, faces, mode="silhouettes") - reference) ** 2)
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert min(losses) < 0.05 * losses[0]

@@ -60,18 +60,9 @@ def test_bake_images_of_one_row_or_column(shape, bilinear):
         assert_allclose(baked[(0, *(2 * (np.arange(3) == k)))], color, atol=1e-6)
 
 
-LINES = {
-    "numbers from the end, CRLF": "g x\r\nvn 0 0 1\r\nf -3//1 -2//1 -1//1\r\n",
-    "tabs": "f\t1 \t 2\t3\n\t\n",
-    "faces of one and two corners": "f 1 2\nf 1\nf 1 2 3 # f 1 2 2\n",
-    "texture coordinates that nobody reads": "vt a b\nvt\nf 1/7 2/8 3/9\n",
-}
-
-
-@pytest.mark.parametrize("lines", LINES.values(), ids=LINES)
-def test_lines_that_the_published_function_accepts(tmp_path, lines):
-    vertices, faces = nr.load_obj(write(tmp_path, a_obj=f"{TRIANGLE}{lines}v 9 9 9 1.0\n"), False)
-    assert faces.tolist() == [[0, 1, 2]] and vertices.shape == (4, 3)
+def test_texture_coordinates_that_nobody_reads_are_not_checked(tmp_path):
+    lines = "vt a b\nvt\nf 1/7 2/8 3/9\n"
+    assert nr.load_obj(write(tmp_path, a_obj=TRIANGLE + lines), False)[1].tolist() == [[0, 1, 2]]
 
 
 # What a line may not say is in test_obj.py.
