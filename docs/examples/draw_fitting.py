@@ -55,19 +55,23 @@ def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> d
     steps: of Adam, for each object.
     """
     views = nmr.LookAt.from_angles(
-        2.732, [-20.0, 30.0] * 12, [15.0 * k for k in range(24)], half_fov_deg=13.0
+        2.732,
+        [-20.0, 30.0] * 12,
+        [15.0 * k for k in range(24)],
+        half_fov_deg=13.0,
+        right_handed=True,
     )
-    turn = [30.0 - 360.0 * frame / frames for frame in range(frames)]
+    turn = [150.0 + 360.0 * frame / frames for frame in range(frames)]
     cameras = [
-        nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0) for azimuth in turn
+        nmr.LookAt.from_angles(2.732, 25.0, [azimuth], half_fov_deg=13.0, right_handed=True)
+        for azimuth in turn
     ]
     # slowly at first
     shown = [min(steps, round(steps * (2 * frame / frames) ** 2)) for frame in range(frames)]
     sphere_faces, columns, ious = nmr.icosphere(4)[1], [], {}
     for category, seed in OBJECTS.items():
         mesh = make_shape(category, np.random.default_rng([seed, 0, 0]))
-        # left-handed
-        vertices = torch.as_tensor(np.asarray(mesh.vertices) * (1, 1, -1), dtype=torch.float32)
+        vertices = torch.as_tensor(np.asarray(mesh.vertices), dtype=torch.float32)
         faces = torch.as_tensor(np.asarray(mesh.faces))
         masks = nmr.render_silhouette(vertices, faces, views, image_size=96)
         shapes = fit(masks, views, steps)

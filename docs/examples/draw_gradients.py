@@ -17,7 +17,7 @@ def two_balls() -> tuple[Tensor, Tensor, Tensor]:
     """A yellow ball in front of a blue one."""
     ball, faces = nmr.icosphere(4)
     vertices = torch.cat(
-        [0.45 * ball - torch.tensor([0.2, 0.1, 0.6]), 0.7 * ball + torch.tensor([0.3, 0.1, 0.6])]
+        [0.45 * ball + torch.tensor([-0.2, -0.1, 0.6]), 0.7 * ball + torch.tensor([0.3, 0.1, -0.6])]
     )
     colors = torch.tensor([[0.95, 0.75, 0.2], [0.25, 0.45, 0.8]]).repeat_interleave(len(ball), 0)
     return vertices, torch.cat([faces, faces + len(ball)]), colors
@@ -43,9 +43,9 @@ def main(output: Path = Path("output"), image_size: int = 192) -> dict[str, int]
     Returns the number of vertices that each gradient moves.
     """
     vertices, faces, colors = two_balls()
-    camera = nmr.LookAt([0.0, 0.0, -4.0], half_fov_deg=15.0)
+    camera = nmr.LookAt([0.0, 0.0, 4.0], half_fov_deg=15.0, right_handed=True)
     front = (torch.arange(len(vertices)) < len(vertices) // 2)[:, None]
-    grey = nmr.Lights(0.75, [0.35], [[-0.4, 0.6, -0.7]])
+    grey = nmr.Lights(0.75, [0.35], [[-0.4, 0.6, 0.7]])
 
     def draw(vertices: Tensor, colors: Tensor, **options) -> Tensor:
         settings = {"background": 0.9, "image_size": image_size, **options}

@@ -41,6 +41,7 @@ def main(
         vertices = shape.vertices @ mesh_to_object("y", "z").T
         truth = Surface(torch.tensor(vertices, dtype=torch.float32), torch.tensor(shape.faces))
         paint, _ = natural_look(vertices, shape.faces, rng, PALETTES[category])
+        # in learn3d's object frame, which is left-handed
         camera = nmr.LookAt.from_angles(2.732, elevation, [azimuth], half_fov_deg=15.0)
         colors, masks = photograph(*truth[:2], paint, camera, image_size=256)
         made = reconstruct_picture(model, colors[0], masks[0])

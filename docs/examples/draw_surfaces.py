@@ -27,7 +27,7 @@ def room() -> tuple[Tensor, Tensor, Tensor]:
         [0.7, 0.85, 0.7],
     ]
     ball, ball_faces = nmr.icosphere(3)
-    vertices = torch.cat([corners, 0.4 * ball + torch.tensor([0.5, -0.6, 1.2])])
+    vertices = torch.cat([corners, 0.4 * ball + torch.tensor([0.5, -0.6, -1.2])])
     colors = torch.cat(
         [
             torch.tensor(shades).repeat_interleave(2, 0),
@@ -46,9 +46,9 @@ def main(output: Path = Path("output"), image_size: int = 256) -> None:
 
     # Every wall reaches behind the eye: it is cut at the near plane.
     vertices, faces, colors = room()
-    lights = nmr.Lights(0.6, [0.4, 0.2], [[0.3, 1.0, -0.4], [-0.8, 0.2, -0.6]])
+    lights = nmr.Lights(0.6, [0.4, 0.2], [[0.3, 1.0, 0.4], [-0.8, 0.2, 0.6]])
     inside = {"colors": nmr.FaceColors(colors), "lights": lights}
-    camera = nmr.Look([-0.4, 0.1, -0.6], [0.25, -0.15, 1.0], half_fov_deg=40.0)
+    camera = nmr.Look([-0.4, 0.1, 0.6], [0.25, -0.15, -1.0], half_fov_deg=40.0, right_handed=True)
     write("room.png", nmr.render_rgb(vertices, faces, camera, image_size=image_size, **inside)[0])
 
     # The same view, twice as wide: pixels are square, and more is seen to the left and to the right.
@@ -61,7 +61,7 @@ def main(output: Path = Path("output"), image_size: int = 256) -> None:
 
     # From sharp to soft.
     ball, ball_faces = nmr.icosphere(2)
-    camera = nmr.LookAt([0.0, 0.0, -3.0], half_fov_deg=30.0)
+    camera = nmr.LookAt([0.0, 0.0, 3.0], half_fov_deg=30.0, right_handed=True)
     sizes = {"image_size": image_size // 2}
     soft = [
         nmr.render_soft_silhouette(ball, ball_faces, camera, sigma=s, **sizes)[0]

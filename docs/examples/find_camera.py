@@ -23,19 +23,21 @@ def main(
     Returns the distance of the best guess from the true camera, before and after; the chair has length 1.
     """
     chair = make_shape("chair", np.random.default_rng(seed))
-    # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
-    vertices = torch.tensor(chair.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0])
+    vertices = torch.tensor(chair.vertices, dtype=torch.float32)
     faces = torch.tensor(chair.faces)
     colors = nmr.FaceColors(torch.tensor([0.4, 0.62, 0.9]).expand(len(faces), 3))
 
     def silhouettes(eyes: Tensor) -> Tensor:
         return nmr.render_silhouette(
-            vertices, faces, nmr.LookAt(eyes, half_fov_deg=13.0), image_size=image_size
+            vertices,
+            faces,
+            nmr.LookAt(eyes, half_fov_deg=13.0, right_handed=True),
+            image_size=image_size,
         )
 
     def draw(eyes: Tensor) -> Tensor:
         """The images of eight guesses, in two rows: uint8 [height, width, 3]."""
-        camera = nmr.LookAt(eyes, half_fov_deg=13.0)
+        camera = nmr.LookAt(eyes, half_fov_deg=13.0, right_handed=True)
         # at the camera
         lights = nmr.Lights(0.4, 0.7, torch.nn.functional.normalize(eyes, dim=1).unsqueeze(1))
         rgb, alpha = nmr.render(
@@ -52,9 +54,11 @@ def main(
         sheet = torch.cat([torch.cat(list(row), dim=1) for row in tiles.split(4)])
         return (sheet.clamp(0, 1) * 255).round().byte()
 
-    true_eye = nmr.cameras.points_from_angles(2.8, 35.0, 155.0).float()
+    true_eye = nmr.cameras.points_from_angles(2.8, 35.0, 25.0).float()
     target = silhouettes(true_eye)
-    guesses = nmr.cameras.points_from_angles(3.3, 15.0, [45.0 * k for k in range(8)]).float()
+    guesses = nmr.cameras.points_from_angles(
+        3.3, 15.0, [180.0 - 45.0 * k for k in range(8)]
+    ).float()
     eyes = guesses.clone().requires_grad_()
     optimizer = torch.optim.Adam([eyes], lr=0.05)
     frames = []

@@ -23,10 +23,10 @@ def turned(radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """A surface of revolution with these radii [ROWS]: vertices [V, 3], faces [F, 3], uv [V, 2]."""
     v, u = torch.meshgrid(torch.linspace(0, 1, ROWS), torch.linspace(0, 1, COLUMNS), indexing="ij")
     r, angle = radius.unsqueeze(1), 2 * math.pi * u
-    vertices = torch.stack([r * angle.sin(), 1.3 * (v - 0.5), -r * angle.cos()], dim=-1).view(-1, 3)
+    vertices = torch.stack([r * angle.sin(), 1.3 * (v - 0.5), r * angle.cos()], dim=-1).view(-1, 3)
     a = (torch.arange(ROWS - 1)[:, None] * COLUMNS + torch.arange(COLUMNS - 1)).view(-1, 1)
     faces = torch.cat(
-        [a + torch.tensor([0, COLUMNS, COLUMNS + 1]), a + torch.tensor([0, COLUMNS + 1, 1])]
+        [a + torch.tensor([0, COLUMNS + 1, COLUMNS]), a + torch.tensor([0, 1, COLUMNS + 1])]
     )
     return vertices, faces, torch.stack([u, v], dim=-1).view(-1, 2)
 
@@ -55,7 +55,9 @@ def main(
         radius: Tensor, texture: Tensor, lamp: Tensor, shine: Tensor, azimuths_deg: list[float]
     ) -> Tensor:
         vertices, faces, uv = turned(radius)
-        camera = nmr.LookAt.from_angles(3.0, 25.0, azimuths_deg, half_fov_deg=15.0)
+        camera = nmr.LookAt.from_angles(
+            3.0, 25.0, azimuths_deg, half_fov_deg=15.0, right_handed=True
+        )
         colors = nmr.UVTexture(texture, uv, wrap="clamp", filter="mipmap")
         lights = nmr.Lights(
             0.35, 0.0, smooth=True, position=lamp, point=0.9, specular=shine, shininess=12.0
@@ -65,14 +67,14 @@ def main(
         )
 
     truth = 0.30 + 0.14 * (2.2 * math.pi * v - 0.6).sin() - 0.05 * v, glaze(size // 2)
-    truth = *truth, torch.tensor([0.8, 1.4, -1.2]), torch.tensor(0.35)
-    azimuths, unseen = [360 / views * k for k in range(views)], [15.0, 105.0, 195.0, 285.0]
+    truth = *truth, torch.tensor([0.8, 1.4, 1.2]), torch.tensor(0.35)
+    azimuths, unseen = [180 - 360 / views * k for k in range(views)], [165.0, 75.0, -15.0, -105.0]
     pictures, wanted = photographs(*truth, azimuths), photographs(*truth, unseen)
 
     guess = (
         torch.full((ROWS,), 0.3),
         torch.full_like(truth[1], 0.5),
-        torch.tensor([0.0, 1.0, -2.0]),
+        torch.tensor([0.0, 1.0, 2.0]),
         torch.tensor(0.1),
     )
     rates = 0.004, 0.03, 0.03, 0.01

@@ -21,8 +21,8 @@ SHAPES = (("car", 3), ("lamp", 3))  # category, seed
 def draw(vertices: list[Tensor], faces: list[Tensor], color: list[float]) -> Tensor:
     """The meshes next to each other: uint8 [height, width, 3]."""
     colors = nmr.FaceColors([torch.tensor(color).expand(len(f), 3) for f in faces])
-    lights = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, -0.4], [-0.7, -0.1, -0.6]])
-    camera = nmr.LookAt.from_angles(2.732, 25.0, 40.0, half_fov_deg=12.0)
+    lights = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, 0.4], [-0.7, -0.1, 0.6]])
+    camera = nmr.LookAt.from_angles(2.732, 25.0, 140.0, half_fov_deg=12.0, right_handed=True)
     images = nmr.render_rgb(
         vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=192
     )
@@ -37,16 +37,12 @@ def main(
     Returns 1 - IoU of the silhouettes, before and after.
     """
     goals = [make_shape(category, np.random.default_rng(seed)) for category, seed in SHAPES]
-    # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
-    goal_vertices = [
-        torch.tensor(g.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0])
-        for g in goals
-    ]
+    goal_vertices = [torch.tensor(g.vertices, dtype=torch.float32) for g in goals]
     goal_faces = [torch.tensor(g.faces) for g in goals]
     # One pose per image: all views of the first mesh, then all views of the second.
     azimuths = [360 / VIEWS * k for k in range(VIEWS)] * len(goals)
     camera = nmr.LookAt.from_angles(
-        2.732, [0.0, 35.0] * (len(azimuths) // 2), azimuths, half_fov_deg=12.0
+        2.732, [0.0, 35.0] * (len(azimuths) // 2), azimuths, half_fov_deg=12.0, right_handed=True
     )
 
     def silhouettes(vertices: list[Tensor], faces: list[Tensor]) -> Tensor:

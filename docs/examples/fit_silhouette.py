@@ -14,14 +14,14 @@ from torch import Tensor
 import nmr
 from learn3d.studio.shapes import make_shape
 
-LIGHTS = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, -0.4], [-0.7, -0.1, -0.6]])
+LIGHTS = nmr.Lights(0.45, [0.5, 0.25], [[0.3, 0.9, 0.4], [-0.7, -0.1, 0.6]])
 
 
 def draw(
     vertices: Tensor, faces: Tensor, azimuths_deg: list[float], color: list[float], size: int = 192
 ) -> Tensor:
     """Pictures of the mesh from several sides, next to each other: uint8 [height, width, 3]."""
-    camera = nmr.LookAt.from_angles(2.732, 25.0, azimuths_deg, half_fov_deg=12.0)
+    camera = nmr.LookAt.from_angles(2.732, 25.0, azimuths_deg, half_fov_deg=12.0, right_handed=True)
     colors = nmr.FaceColors(torch.tensor(color).expand(len(faces), 3))
     images = nmr.render_rgb(
         vertices, faces, camera, colors=colors, lights=LIGHTS, background=1.0, image_size=size
@@ -38,11 +38,14 @@ def main(
     Returns 1 - IoU of the silhouettes, before and after.
     """
     airplane = make_shape("airplane", np.random.default_rng(seed))
-    # Mesh files are right-handed; the world of LookAt is left-handed, as in the published renderer.
-    goal = torch.tensor(airplane.vertices, dtype=torch.float32) * torch.tensor([1.0, 1.0, -1.0])
+    goal = torch.tensor(airplane.vertices, dtype=torch.float32)
     goal_faces = torch.tensor(airplane.faces)
     camera = nmr.LookAt.from_angles(
-        2.732, [-30.0, 30.0] * 8, [22.5 * k for k in range(16)], half_fov_deg=12.0
+        2.732,
+        [-30.0, 30.0] * 8,
+        [22.5 * k for k in range(16)],
+        half_fov_deg=12.0,
+        right_handed=True,
     )
     target = nmr.render_silhouette(goal, goal_faces, camera, image_size=image_size)
 
@@ -63,14 +66,14 @@ def main(
         images = nmr.render_silhouette(vertices, faces, camera, image_size=image_size)
         losses.append(nmr.losses.soft_iou_loss(images, target))
         if step % (1 + (steps - 1) // 40) == 0:
-            side = [-60 + 120 * step / steps]
+            side = [240 - 120 * step / steps]
             pair = draw(goal, goal_faces, side, gray), draw(vertices.detach(), faces, side, blue)
             frames.append(torch.cat(pair, dim=1))
         optimizer.zero_grad()
         (losses[-1] + 3e-4 * nmr.losses.smoothness_loss(vertices, edges)).backward()
         optimizer.step()
 
-    sides = [-135.0, -45.0, 30.0, 100.0]
+    sides = [315.0, 225.0, 150.0, 80.0]
     comparison = torch.cat(
         [draw(goal, goal_faces, sides, gray), draw(vertices.detach(), faces, sides, blue)]
     )

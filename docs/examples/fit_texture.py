@@ -20,13 +20,13 @@ def vase(rows: int = 32, columns: int = 48) -> tuple[Tensor, Tensor, Tensor]:
     """A surface of revolution: vertices [V, 3], faces [F, 3] and uv [V, 2]; the first and last column coincide."""
     v, u = torch.meshgrid(torch.linspace(0, 1, rows), torch.linspace(0, 1, columns), indexing="ij")
     radius, angle = 0.30 + 0.16 * (2.2 * math.pi * v - 0.6).sin() - 0.05 * v, 2 * math.pi * u
-    # Seen from outside, u runs to the right: x is right, y up and z away from a viewer at azimuth 0.
+    # Seen from outside, u runs to the right: a viewer in front of +z has x to the right and y up.
     vertices = torch.stack(
-        [radius * angle.sin(), 1.3 * (v - 0.5), -radius * angle.cos()], dim=-1
+        [radius * angle.sin(), 1.3 * (v - 0.5), radius * angle.cos()], dim=-1
     ).view(-1, 3)
     a = (torch.arange(rows - 1)[:, None] * columns + torch.arange(columns - 1)).view(-1, 1)
     faces = torch.cat(
-        [a + torch.tensor([0, columns, columns + 1]), a + torch.tensor([0, columns + 1, 1])]
+        [a + torch.tensor([0, columns + 1, columns]), a + torch.tensor([0, 1, columns + 1])]
     )
     return vertices, faces, torch.stack([u, v], dim=-1).view(-1, 2)
 
@@ -53,20 +53,22 @@ def main(
     Returns the mean error of the colours in these views, before and after.
     """
     vertices, faces, uv = vase()
-    lights = nmr.Lights(0.7, 0.4, [0.4, 0.5, -0.8], smooth=True)
+    lights = nmr.Lights(0.7, 0.4, [0.4, 0.5, 0.8], smooth=True)
 
     def photograph(texture: Tensor, elevation_deg: list[float], azimuth_deg: list[float]) -> Tensor:
-        camera = nmr.LookAt.from_angles(3.0, elevation_deg, azimuth_deg, half_fov_deg=14.2)
+        camera = nmr.LookAt.from_angles(
+            3.0, elevation_deg, azimuth_deg, half_fov_deg=14.2, right_handed=True
+        )
         colors = nmr.UVTexture(texture, uv, wrap="clamp")
         return nmr.render_rgb(
             vertices, faces, camera, colors=colors, lights=lights, background=1.0, image_size=size
         )
 
-    azimuths = [360 / views * k for k in range(views)]
+    azimuths = [180 - 360 / views * k for k in range(views)]
     elevations = [(5.0, 40.0)[k % 2] for k in range(views)]
     truth = painting(3 * size // 4, 2 * size)
     pictures = photograph(truth, elevations, azimuths)
-    unseen = [20.0] * 4, [60.0, 150.0, 240.0, 330.0]
+    unseen = [20.0] * 4, [120.0, 30.0, -60.0, -150.0]
     wanted = photograph(truth, *unseen)
 
     texture = torch.full_like(truth, 0.5).requires_grad_()

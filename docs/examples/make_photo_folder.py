@@ -58,6 +58,7 @@ def main(
             for photo in range(photos):
                 azimuth, elevation = rng.uniform(-180, 180), rng.uniform(*elevation_deg)
                 distance = rng.uniform(2.8, 3.3)
+                # in learn3d's object frame, which is left-handed
                 camera = nmr.LookAt.from_angles(
                     [distance], [elevation], [azimuth], half_fov_deg=FOV_DEG / 2
                 )
