@@ -93,6 +93,12 @@ PICTURES = {
         "{folder}/views.png",
         ("docs/examples/draw_views.py",),
     ),
+    # tests/test_docs.py compares it with what README's code draws
+    "car.png": Picture(
+        "sed -n '/^```python/,/^```/{{//!p}}' README.md > {folder}/car.py; cd {folder}; python car.py",
+        "{folder}/car.png",
+        (),
+    ),
     "gradients.png": Picture(
         "python docs/examples/draw_gradients.py --output {folder}",
         "{folder}/gradients.png",
