@@ -30,7 +30,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def visit(browser) -> Iterator[Callable[..., Any]]:
-    """Opens the page of an address in a window of its own.
+    """Opens the page of an address in a window of its own. Meshes turn by themselves only if it is asked for.
 
     At the end of the test no page had an error, and none asked for anything from elsewhere.
     """
@@ -43,7 +43,11 @@ def visit(browser) -> Iterator[Callable[..., Any]]:
             if not request.url.startswith(own):
                 elsewhere.append(request.url)
 
-        contexts.append(browser.new_context(viewport={"width": width, "height": height}, **options))
+        options = {
+            "viewport": {"width": width, "height": height},
+            "reduced_motion": "reduce",
+        } | options
+        contexts.append(browser.new_context(**options))
         contexts[-1].set_default_timeout(PATIENCE)
         tab = contexts[-1].new_page()
         tab.on("console", lambda line: said.append(line.text) if line.type == "error" else None)

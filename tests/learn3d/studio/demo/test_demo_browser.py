@@ -142,7 +142,7 @@ def cut_out(tab: Any, folder: Path) -> np.ndarray:
 @pytest.mark.parametrize("width", [1280, 380])
 def test_a_whole_visit(packaged, visit, pixels, tmp_path, width) -> None:
     """A visitor presses every button, and takes every file home."""
-    tab = visit(packaged.address, width, reduced_motion="reduce", has_touch=width < 400)
+    tab = visit(packaged.address, width, has_touch=width < 400)
     press(tab, "sofa")()
     press(tab, "Cancel")()
     assert tab.get_by_text("Cancelled.").is_visible() and tab.locator(".busy").count() == 0
@@ -217,7 +217,7 @@ def test_a_whole_visit(packaged, visit, pixels, tmp_path, width) -> None:
 def test_a_picture_becomes_meshes_that_turn_and_can_be_kept(
     server, visit, pixels, blue, tmp_path
 ) -> None:
-    tab = visit(server.address)
+    tab = visit(server.address, reduced_motion="no-preference")
     answered(tab, lambda: tab.locator("#file").set_input_files(blue))
     seen = pixels(tab.locator("#picture"))
     assert (seen == BLUE).all(axis=2).mean() > 0.1, "the picture is not tinted"
