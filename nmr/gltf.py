@@ -3,12 +3,13 @@ Does not import torch, for processes without it.
 """
 
 import base64
+import contextlib
 import json
 import re
 import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple
-from urllib.parse import unquote
+from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 
@@ -18,7 +19,8 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _HARMLESS = re.compile(
     r"KHR_mesh_quantization|(KHR|EXT|MSFT)_(materials|texture|lights|animation|xmp)\w*"
 )
-_REFUSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "EXT_mesh_gpu_instancing")
+# Extensions whose data may stand beside plain data, which is then read.
+_COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 
 
 class GltfMaterial(NamedTuple):
@@ -77,7 +79,6 @@ def read_gltf(
         for primitive in mesh["primitives"]:
             if primitive.get("mode", 4) < 4 or "POSITION" not in primitive["attributes"]:
                 continue
-            _refuse(primitive)
             points = accessors.read(primitive["attributes"]["POSITION"])
             for weight, target in zip(weights, primitive.get("targets", []), strict=False):
                 if weight and "POSITION" in target:
@@ -132,13 +133,8 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
     return chunks[b"JSON"], chunks.get(b"BIN\0")
 
 
-def _refuse(item: dict[str, Any]) -> None:
-    """Raise ValueError if an object has an extension that holds its geometry."""
-    for name in _REFUSED:
-        if name in item.get("extensions", {}):
-            raise ValueError(
-                f"it uses the extension {name}, which is not supported; save it without"
-            )
+def _unsupported(name: str) -> ValueError:
+    return ValueError(f"it uses the extension {name}, which is not supported; save it without")
 
 
 class _Accessors:
@@ -161,7 +157,7 @@ class _Accessors:
         if "bufferView" in accessor:
             values = self._view(accessor["bufferView"], accessor.get("byteOffset", 0), kind, shape)
         elif sparse is None:
-            raise ValueError(f"accessor {number} has no data")
+            raise self._no_data(f"accessor {number}")
         else:
             values = np.zeros(shape, kind)
         if sparse is not None:
@@ -183,7 +179,6 @@ class _Accessors:
     def _view(self, number: int, offset: int, kind: str, shape: tuple[int, int]) -> np.ndarray:
         view = self.tree["bufferViews"][_index(number)]
         dtype = np.dtype(kind)
-        _refuse(view)
         width = shape[1] * dtype.itemsize
         stride = view.get("byteStride") or width
         offset = _index(offset)
@@ -198,8 +193,8 @@ class _Accessors:
         if number not in self.buffers:
             buffer = self.tree["buffers"][_index(number)]
             uri = buffer.get("uri")
-            if uri is None and self.binary is None:
-                raise ValueError(f"buffer {number} has no data")
+            if uri is None and (self.binary is None or number > 0):
+                raise self._no_data(f"buffer {number}")
             if uri is None:
                 data = self.binary
             else:
@@ -213,8 +208,19 @@ class _Accessors:
 
     def _content(self, uri: str) -> bytes:
         if uri.startswith("data:"):
-            return base64.b64decode(uri.partition(",")[2])
-        return self.read_other(unquote(uri))
+            kind, _, text = uri.partition(",")
+            data = unquote_to_bytes(text)
+            return base64.b64decode(data) if kind.endswith(";base64") else data
+        name = unquote(uri)
+        for other in (name, uri):  # some programs do not encode names, or write backslashes
+            with contextlib.suppress(FileNotFoundError):
+                return self.read_other(other)
+        return self.read_other(name.replace("\\", "/"))
+
+    def _no_data(self, what: str) -> ValueError:
+        """The error for data that are missing, or only there in compressed form."""
+        used = [name for name in self.tree.get("extensionsUsed", []) if name in _COMPRESSIONS]
+        return _unsupported(used[0]) if used else ValueError(f"{what} has no data")
 
     def material(self, number: int) -> GltfMaterial:
         material = self.tree["materials"][number]
@@ -280,7 +286,8 @@ def _places(tree: dict[str, Any]) -> dict[int, np.ndarray]:
         if number in places:
             raise ValueError(f"node {number} has several parents")
         node = nodes[_index(number)]
-        _refuse(node)
+        if (instances := "EXT_mesh_gpu_instancing") in node.get("extensions", {}):
+            raise _unsupported(instances)
         places[number] = parent @ _matrix(node)
         waiting += [(child, places[number]) for child in reversed(node.get("children", []))]
     return places

@@ -11,6 +11,9 @@ import numpy as np
 
 from nmr.obj import triangulate
 
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_NUMBER = rb"[-+]?(?:[\d.][-+.\de]*|nan|inf\w*)"
+_STL_VERTEX = re.compile(rb"\bvertex\s+(%b\s+%b\s+%b)(?!\S)" % (3 * (_NUMBER,)))
 Triangles = tuple[np.ndarray, np.ndarray]
 _PLY_TYPES = {
     "char": "i1",
@@ -34,47 +37,53 @@ _PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": "
 
 
 def read_stl(content: bytes) -> Triangles:
-    """Read an STL file, binary (bytes behind the last triangle are ignored) or text."""
-    count = int.from_bytes(content[80:84], "little")
-    is_text = content.lstrip()[:5].lower() == b"solid" and re.search(
-        rb"(?i)\bfacet\b|endsolid", content[: 2**16]
-    )
-    if len(content) == 84 + 50 * count or not is_text:
-        if len(content) < 84 + 50 * count or len(content) < 84:
+    """Read an STL file, binary (bytes behind the last triangle are ignored) or text.
+
+    A text begins with `solid`, and has no zero where a binary file has the high byte of its count
+    or its first triangle.
+    """
+    text = content.removeprefix(_BYTE_ORDER_MARK).lower()
+    if text.lstrip()[:5] == b"solid" and b"\0" not in content[:134]:
+        found = list(_STL_VERTEX.finditer(text))
+        facets = len(re.findall(rb"\bend\s*facet\b", text))
+        ends = [match.start() for match in re.finditer(rb"\bend\s*solid\b", text)]
+        if found and max(ends, default=0) < found[-1].start():
+            raise EOFError("its last solid does not end")
+        if len(found) != 3 * facets:
+            raise ValueError(
+                f"it has {facets} facets and {len(found)} corners; each facet needs three"
+            )
+        corners = np.fromstring(b" ".join(match[1] for match in found), sep=" ")
+    else:
+        count, rest = int.from_bytes(content[80:84], "little"), len(content) - 84
+        if count in (0, 2**32 - 1) and rest > 0 and rest % 50 == 0:  # not known when it was begun
+            count = rest // 50
+        if rest < 50 * count or rest < 0:
             raise EOFError(
                 f"it has {len(content)} bytes; its header promises {count} triangles of 50"
             )
         rows = np.frombuffer(content, "u1", 50 * count, 84).reshape(count, 50)
-        corners = rows[:, 12:48].copy().view("<f4").reshape(-1, 3)
-    else:
-        text = content.lower().replace(b"\r", b"\n")
-        lines = re.findall(rb"(?m)^\s*vertex\s+(.*)", text)
-        facets = len(re.findall(rb"(?m)^\s*facet\b", text))
-        if text.rfind(b"endsolid") < text.rfind(b"vertex"):
-            raise EOFError("its last solid does not end")
-        corners = np.fromstring(b" ".join(lines), sep=" ").reshape(-1, 3)
-        if len(corners) != 3 * facets or len(lines) != len(corners):
-            raise ValueError(
-                f"it has {facets} facets and {len(corners)} corners; each facet needs three"
-            )
-    return corners.astype(np.float64), np.arange(len(corners)).reshape(-1, 3)
+        corners = rows[:, 12:48].copy().view("<f4")
+    corners = corners.reshape(-1, 3).astype(np.float64)
+    return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
 def read_off(content: bytes) -> Triangles:
-    """Read an OFF file, also with colours, normals or texture coordinates behind the corners."""
-    lines = [line for line in re.sub(rb"#[^\r\n]*", b"", content).splitlines() if line.strip()]
-    head, *counts = lines[0].split() if lines else [b""]
-    head = head.removeprefix(b"\xef\xbb\xbf")
-    if not re.fullmatch(rb"(ST)?C?N?OFF", head := head.upper()) or b"BINARY" in counts:
+    """Read an OFF file, also with colours, normals or texture coordinates behind the corners, or
+    with its counts glued to the first word, as in ModelNet40.
+    """
+    text = re.sub(rb"#[^\r\n]*", b"", content.removeprefix(_BYTE_ORDER_MARK))
+    head = re.match(rb"(?i)\s*((?:ST)?C?N?OFF)(?=[\s\d])(?!\s+BINARY)", text)
+    if head is None:
         raise ValueError("it does not begin with OFF (or COFF, NOFF, STOFF), as a text file does")
-    first = 1
-    if not counts:
-        first = 2
-        counts = lines[1].split()
+    lines = [line for line in text[head.end() :].splitlines() if line.strip()]
+    counts = lines[0].split() if lines else []
+    if len(counts) < 2:
+        raise EOFError("it ends before its counts of corners and faces")
     num_vertices, num_faces = int(counts[0]), int(counts[1])
-    rows = lines[first : first + num_vertices + num_faces]
-    if len(rows) < num_vertices + num_faces and head == b"OFF":
-        rows = _off_rows(b" ".join(lines).split()[4:], num_vertices, num_faces)
+    rows = lines[1 : 1 + num_vertices + num_faces]
+    if len(rows) < num_vertices + num_faces and head[1].upper() == b"OFF":
+        rows = _off_rows(b" ".join(lines).split()[3:], num_vertices, num_faces)
     if len(rows) < num_vertices + num_faces:
         raise EOFError(
             f"it has {len(rows)} lines; its header promises {num_vertices} corners and {num_faces} faces"
@@ -105,7 +114,7 @@ def _off_rows(words: list[bytes], num_vertices: int, num_faces: int) -> list[byt
 
 def read_ply(content: bytes) -> Triangles:
     """Read a PLY file: the elements `vertex` and `face`; others are skipped."""
-    content = content.removeprefix(b"\xef\xbb\xbf")
+    content = content.removeprefix(_BYTE_ORDER_MARK)
     if not content.startswith(b"ply"):
         raise ValueError("it does not begin with the line `ply`")
     header = re.match(rb".*?[\r\n]end_header[ \t]*(?:\r\n|\n|\r)", content, re.DOTALL)

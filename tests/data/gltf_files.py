@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 
-COMPONENTS = {"f4": 5126, "i2": 5122, "u2": 5123, "u1": 5121}
+COMPONENTS = {"f4": 5126, "i2": 5122, "u2": 5123, "u4": 5125, "u1": 5121}
 WIDTHS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 
 

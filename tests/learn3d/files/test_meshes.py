@@ -275,10 +275,6 @@ REFUSED = {
         gltf(extensionsRequired=["ACME_shapes"]),
         "needs the extension ACME_shapes, which is not",
     ),
-    "packed.gltf": (
-        gltf(bufferViews=[BUFFER | {"extensions": {"EXT_meshopt_compression": {}}}]),
-        "EXT_meshopt_comp",
-    ),
     "many.gltf": (
         gltf(nodes=[{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]),
         "EXT_mesh_gpu_instancing",
