@@ -123,17 +123,39 @@ def test_a_second_interrupt_does_not_wait(tiny_config, run_folder, monkeypatch) 
         train(tiny_config(run_folder, preset=VANILLA))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"learning_rate": 1e-3}, "cannot resume with different options .*learning_rate"),
-        ({"iterations": 3}, "has taken 4 steps, more than the 3 asked for"),
-        ({"precision": "bf16"}, "precision: 'fp32' in the run, 'bf16' asked for"),
-    ],
-)
-def test_resume_refuses_other_options(
-    tiny_config, finished_run, options: dict, message: str
+def other_images(dataset: ViewDataset) -> ViewDataset:
+    images = dataset.images.copy()
+    images[20, 0, 30, 30] ^= 1
+    return dataclasses.replace(dataset, images=images)
+
+
+def other_poses(dataset: ViewDataset) -> ViewDataset:
+    poses = dataclasses.replace(dataset.poses, azimuth_deg=dataset.poses.azimuth_deg + 1)
+    return dataclasses.replace(dataset, poses=poses)
+
+
+#: What differs from the run, and what is said; functions change its data.
+REFUSED = {
+    "cannot resume with different options .*learning_rate": {"learning_rate": 1e-3},
+    "has taken 4 steps, more than the 3 asked for": {"iterations": 3},
+    "precision: 'fp32' in the run, 'bf16' asked for": {"precision": "bf16"},
+    "other training data: 72 images with the CRC-32": other_images,
+    "other training data: 72 images with the CRC": other_poses,
+    r"was trained on data of .*inverted=True.*, these are .*inverted=False": (
+        lambda dataset: dataclasses.replace(dataset, inverted=not dataset.inverted)
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_resume_refuses_other_options_and_data(
+    tiny_config, finished_run, monkeypatch, message: str
 ) -> None:
+    change = REFUSED[message]
+    if callable(change):
+        load = training.load_data
+        monkeypatch.setattr(training, "load_data", lambda *what: change(load(*what)))
+    options = {} if callable(change) else change
     with pytest.raises(ValueError, match=message):
         train(tiny_config(finished_run, **options), resume=True)
 
@@ -150,37 +172,6 @@ def test_resume_finds_its_data_in_another_folder(
     summary = train(tiny_config(finished_run, data=tmp_path / "moved"), resume=True)
     assert (summary.progress.step, summary.finished, summary.progress.best_step) == (4, True, 4)
     assert times() == before
-
-
-@pytest.mark.parametrize("change", ["images", "poses"])
-def test_resume_refuses_other_data(tiny_config, finished_run, monkeypatch, change: str) -> None:
-    load = training.load_data
-
-    def load_changed(config, split):
-        train_set = load(config, split)
-        images = train_set.images.copy()
-        images[20, 0, 30, 30] ^= 1
-        poses = dataclasses.replace(train_set.poses, azimuth_deg=train_set.poses.azimuth_deg + 1)
-        return dataclasses.replace(
-            train_set, **{change: {"images": images, "poses": poses}[change]}
-        )
-
-    monkeypatch.setattr(training, "load_data", load_changed)
-    with pytest.raises(ValueError, match="other training data: 72 images with the CRC-32"):
-        train(tiny_config(finished_run), resume=True)
-
-
-def test_resume_refuses_another_mirror_plane(tiny_config, finished_run, monkeypatch) -> None:
-    load = checkpoint.load
-
-    def load_changed(path):
-        tensors, metadata = load(path)
-        info = dataclasses.replace(metadata.info, mirror_plane_deg=7.5)
-        return tensors, dataclasses.replace(metadata, info=info)
-
-    monkeypatch.setattr(checkpoint, "load", load_changed)
-    with pytest.raises(ValueError, match=r"was trained on data of .*mirror_plane_deg=7\.5"):
-        train(tiny_config(finished_run), resume=True)
 
 
 def test_the_best_of_other_validation_images_is_forgotten(

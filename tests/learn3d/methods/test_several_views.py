@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import itertools
 from pathlib import Path
@@ -63,13 +62,6 @@ def test_loss_is_the_mean_over_both_shapes_in_both_views() -> None:
     assert [weight for weight, _ in values.values()] == [1.0, 0.001]
     assert values["projection"][1].item() == pytest.approx(sum(losses) / 4, abs=1e-6)
     assert values["smoothness"][1].item() == pytest.approx(smoothness, rel=1e-5)
-    before = copy.deepcopy(method.networks)
-    take_step(method, batch, 1)
-    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in method.optimizers.items()}
-    assert rates == pytest.approx({"encoder": 1e-4, "generator": 1e-4})
-    for name, network in method.networks.items():
-        pairs = zip(network.parameters(), before[name].parameters(), strict=True)
-        assert all((moved != old).any() for moved, old in pairs), name
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from fuzz_targets import StandIn
 from reader_checks import at_most
 from runs import check_same, metadata, same_tensors
 from safetensors.torch import save_file
@@ -123,19 +124,9 @@ def test_sizes_and_shapes_come_before_tensors_are_read(finished_run, tmp_path, m
     refused("does not fit: its networks have far more weights than it")
 
 
-class StandIn:
-    """As much of a method as a checkpoint asks for, with a step of Adam behind it."""
-
-    def __init__(self) -> None:
-        self.networks = {"encoder": torch.nn.Linear(3, 2)}
-        self.optimizer = torch.optim.Adam(self.networks["encoder"].parameters(), fused=True)
-        self.networks["encoder"](torch.ones(1, 3)).sum().backward()
-        self.optimizer.step()
-
-
 @pytest.mark.parametrize(
     "change",
-    [{"network.encoder.weight": torch.zeros(3, 2)}, {"network.encoder.more": torch.zeros(1)}],
+    [{"network.encoder.0.weight": torch.zeros(3, 2)}, {"network.encoder.more": torch.zeros(1)}],
 )
 def test_weights_that_do_not_fit(change: dict[str, torch.Tensor]) -> None:
     tensors = checkpoint.network_tensors(StandIn()) | change
@@ -154,10 +145,12 @@ def test_weights_that_do_not_fit(change: dict[str, torch.Tensor]) -> None:
 )
 def test_states_of_adam_that_do_not_fit(change: dict[str, torch.Tensor], message: str) -> None:
     """The fused kernel would read and write beyond a tensor that is too small."""
-    tensors = checkpoint.optimizer_tensors("encoder", StandIn().optimizer)
+    method = StandIn()
+    method.step()
+    tensors = checkpoint.optimizer_tensors("encoder", method.optimizers["encoder"])
     tensors |= {f"optimizer.encoder.{key}": value for key, value in change.items()}
     with pytest.raises(ValueError, match=f"a does not fit the optimizer encoder: {message}"):
-        checkpoint.restore_optimizer("encoder", StandIn().optimizer, tensors, Path("a"))
+        checkpoint.restore_optimizer("encoder", method.optimizers["encoder"], tensors, Path("a"))
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from runs import check_same
 from learn3d import training
 from learn3d.config import TrainConfig, config_to_dict
 from learn3d.runs import checkpoint
+from learn3d.terminal import INTERRUPTED
 from learn3d.training import train
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and SIGKILL")
@@ -98,22 +99,6 @@ def test_killed_at_any_place(server, uninterrupted, wanted: int) -> None:
         check_same(config.output, killed.output)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["last", "best"])
-def test_killed_in_the_middle_of_each_checkpoint(server, uninterrupted, name: str) -> None:
-    """Half of a file under its temporary name is removed when the run goes on."""
-    killed, _, things = uninterrupted
-    for place in range(things // 4, things):
-        config = dataclasses.replace(killed, output=killed.output.with_name(f"half-{name}-{place}"))
-        server(config, kill_at=place, half=True)
-        if (config.output / f".{name}.safetensors.partial").exists():
-            check_whole(config.output)
-            assert server(config, resume=True)["status"] == 0
-            check_same(config.output, killed.output)
-            return
-    raise AssertionError(f"no kill left half of {name}")
-
-
 def test_signals_at_any_time(server, uninterrupted) -> None:
     killed, seconds, _ = uninterrupted
     rng = random.Random(SEED)
@@ -134,7 +119,9 @@ def test_signals_at_any_time(server, uninterrupted) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_killed_at_any_time(uninterrupted, tmp_path, monkeypatch) -> None:
+def test_the_command_interrupted_and_killed_at_any_time(
+    uninterrupted, tmp_path, monkeypatch
+) -> None:
     monkeypatch.setattr(training, "PICTURE_ROWS", 8)  # as the command draws them
     # networks of the usual size
     gentle = dataclasses.replace(uninterrupted[0].settings, learning_rate=1e-4)
@@ -148,21 +135,32 @@ def test_the_command_killed_at_any_time(uninterrupted, tmp_path, monkeypatch) ->
     (run / "config.json").write_text(json.dumps(options))
     command = [sys.executable, TRAIN, "--output", run, "--resume"]
     rng = random.Random(SEED)
-    for lines in (0, 4, 9, None):  # metrics.jsonl has 15
+    # metrics.jsonl has 15 lines
+    for lines, stop in ((0, "SIGKILL"), (1, "SIGINT"), (4, "SIGKILL"), (9, "SIGKILL"), (None, "")):
         with subprocess.Popen(
-            command, stderr=subprocess.PIPE, env=environment(), text=True
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environment(),
+            text=True,
         ) as process:
             deadline = time.monotonic() + 600
+            metrics = run / "metrics.jsonl"
+            before = metrics.stat().st_mtime_ns if metrics.exists() else 0
             while lines is not None and process.poll() is None and time.monotonic() < deadline:
-                metrics = run / "metrics.jsonl"
-                if metrics.exists() and metrics.read_text().count("\n") >= lines:
+                written = metrics.exists() and metrics.stat().st_mtime_ns > before
+                if written and metrics.read_text().count("\n") >= lines:
                     time.sleep(rng.uniform(0, 0.1))
-                    process.kill()
+                    process.send_signal(getattr(signal, stop))
                     break
                 time.sleep(0.005)
-            _, said = process.communicate(timeout=600)
-        assert process.returncode in ((0,) if lines is None else (0, -signal.SIGKILL)), said
+            out, said = process.communicate(timeout=600)
         if process.returncode == 0:
+            assert out.startswith("finished at step 10")
             break
+        assert process.returncode == {"SIGKILL": -signal.SIGKILL, "SIGINT": INTERRUPTED}[stop], said
+        if stop == "SIGINT":
+            assert "stopped by SIGINT" in said and "--resume" in said
+            assert out.startswith("stopped at step ")
         check_whole(run)
     check_same(run, reference.output)

@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import skimage.color
 import torch
 from PIL import Image
 from tiny_networks import FixedMethod
@@ -15,10 +14,10 @@ from torch import Tensor
 import nmr
 from learn3d.evaluation import picture_grid
 from learn3d.methods.method import Grids, Meshes
-from learn3d.pictures import HEADER, MARGIN, TILE, azimuths_deg, draw_surface, natural_colors, orbit
+from learn3d.pictures import HEADER, MARGIN, TILE, azimuths_deg, natural_colors
 from learn3d.runs import checkpoint
 from learn3d.studio.tables import grids
-from learn3d.studio.tables.grids import common_zoom, comparison_grid, interpolate, magnify
+from learn3d.studio.tables.grids import comparison_grid, interpolate
 from learn3d.studio.tables.trained_models import TrainedModel, name_runs, open_runs
 
 pytest.importorskip("matplotlib")
@@ -93,31 +92,24 @@ def test_picture_grid_shows_inputs_targets_and_renderings(tiny_set, poses) -> No
     )
 
 
-@pytest.mark.parametrize("truth", [False, True])
-def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, truth) -> None:
+def test_methods_are_drawn_below_each_other_from_the_same_views(tiny_set, monkeypatch) -> None:
+    """Each row of a grid of two methods and the truth is that of a grid of one of them."""
+    monkeypatch.setattr(grids, "common_zoom", lambda *_: 1.4)
     samples, methods = torch.tensor([3, 40]), {"large": Ellipsoids(), "small": GridEllipsoids(0.5)}
     runs = [TrainedModel(name, method, tiny_set) for name, method in methods.items()]
-    batch = tiny_set.batch(samples)
-    grid = comparison_grid(runs, samples, truth=truth)
-    shown = [method.decode(method.encode(batch.images)).surfaces() for method in methods.values()]
-    if truth:
-        shown.insert(0, Grids(tiny_set.convention.to_object(batch.voxels.float())).surfaces())
-    poses = [tiny_set.poses[sample[None]] for sample in samples]
-    pairs = [(shapes[i], orbit(pose, TURNS)) for shapes in shown for i, pose in enumerate(poses)]
-    zoom = common_zoom(pairs, batch.masks)
-    assert zoom > 1 and grid.shape[0] == HEADER + 2 * len(shown) * STEP + MARGIN
-    for i, pose in enumerate(poses):
-        picture = magnify(natural_colors(batch.images.numpy()), zoom)[i]
-        assert np.array_equal(cell(grid, i * len(shown), 0), resized(picture))
-        for k, shapes in enumerate(shown):
-            row = i * len(shown) + k
-            views = draw_surface(shapes[i], orbit(pose, [0, 300], zoom=zoom), image_size=TILE)
-            assert np.array_equal(cell(grid, row, 1), views[0]) and np.array_equal(
-                cell(grid, row, 6), views[1]
-            )
-            assert (cell(grid, row, 0) == 255).all() == (k > 0), (
-                "the input stands in the first row alone"
-            )
+    both = comparison_grid(runs, samples, truth=True)
+    assert both.shape[0] == HEADER + 6 * STEP + MARGIN
+    alone = [comparison_grid([run], samples, truth=True) for run in runs]
+    for i in (0, 1):
+        assert not (cell(both, 3 * i, 0) == 255).all(), "the input"
+        for column in range(7):
+            rows = [cell(both, 3 * i + k, column) for k in range(3)]
+            assert np.array_equal(rows[0], cell(alone[0], 2 * i, column)), "the truth"
+            for k, grid in enumerate(alone, 1):
+                assert np.array_equal(rows[k], cell(grid, 2 * i + 1, column))
+        assert (cell(both, 3 * i + 1, 0) == 255).all(), "the input stands in the first row alone"
+        large, small = (cell(both, 3 * i + k, 1).min(2) < 250 for k in (1, 2))
+        assert large.sum() > 2 * small.sum() > 20
 
 
 def test_the_truth_must_be_known(tiny_set) -> None:
@@ -128,23 +120,20 @@ def test_the_truth_must_be_known(tiny_set) -> None:
 
 @pytest.mark.parametrize("method", [Ellipsoids(), GridEllipsoids()])
 def test_an_interpolation_goes_through_the_reconstructions_in_equal_steps(tiny_set, method) -> None:
-    samples = torch.tensor([3, 30, 60])
+    samples, decoded = torch.tensor([3, 30, 60]), []
+    decode = method.decode
+    method.decode = lambda codes: decoded.append(codes) or decode(codes)
     strip = interpolate(TrainedModel("a", method, tiny_set), samples)
-    batch = tiny_set.batch(samples)
-    assert strip.shape[0] == 3 * STEP + MARGIN
-    codes = method.encode(batch.images)
-    way = torch.stack(
-        [torch.lerp(codes[k // 4], codes[min(2, k // 4 + 1)], k % 4 / 4) for k in range(9)]
-    )
-    turns = [azimuth - float(azimuths_deg(batch.poses)[0]) for azimuth in (-135, -45)]
-    shapes = method.decode(way).surfaces()
-    zoom = common_zoom([(shape, orbit(batch.poses[:1], turns)) for shape in shapes], batch.masks)
-    for column, shape in enumerate(shapes):
-        views = draw_surface(shape, orbit(batch.poses[:1], turns, zoom=zoom), image_size=TILE)
-        for row in (0, 1):
-            shown = cell(strip, 1 + row, column, top=0, columns=9)
-            assert np.abs(shown.astype(int) - views[row]).mean() < 0.1
-        assert (cell(strip, 0, column, top=0, columns=9) < 250).any() == (column % 4 == 0)
+    del method.decode
+    codes = method.encode(tiny_set.batch(samples).images)
+    way = torch.cat(decoded)
+    torch.testing.assert_close(way[::4], codes)
+    torch.testing.assert_close(way.diff(dim=0)[:4], (codes[1] - codes[0]).expand(4, -1) / 4)
+    assert strip.shape[0] == 3 * STEP + MARGIN and len(way) == 9
+    for column in range(9):
+        tiles = [cell(strip, row, column, top=0, columns=9) < 250 for row in range(3)]
+        assert tiles[0].any() == (column % 4 == 0), "the inputs"
+        assert tiles[1].any() and tiles[2].any() and (tiles[1] != tiles[2]).any()
     with pytest.raises(ValueError, match="at least two images, got 1"):
         interpolate(TrainedModel("a", method, tiny_set), samples[:1])
 
@@ -195,25 +184,11 @@ def test_maps_are_coloured_by_the_azimuth_and_files_are_the_same_again(
     for position, color in zip(scatter.get_offsets(), scatter.get_facecolors(), strict=True):
         (index,) = np.flatnonzero((points == position).all(axis=1))
         assert np.allclose(color[:3], wheel[int(azimuths[index] / 360 * 256)], atol=1e-6)
-    written = tsne.save_tsne(runs, tmp_path / "new" / "maps.svg")
-    assert written == [tmp_path / "new" / "maps.png", tmp_path / "new" / "maps.svg"]
-    assert Image.open(written[0]).size > (800, 400)
-    text = written[1].read_text()
-    assert all(
-        words in text
-        for words in ("$\\bad$", "view told from the code: ", " % (chance 4 %)", "90°")
-    )
+    first, second = tsne.save_tsne(runs, tmp_path / "new" / "maps.svg")
+    assert (first.name, second.name) == ("maps.png", "maps.svg")
+    assert "view told from the code: " in second.read_text()
     tsne.save_tsne(runs, tmp_path / "again")
-    assert (tmp_path / "again.svg").read_text() == text
-
-
-def test_the_colours_of_the_wheel_can_be_told_apart_by_everyone() -> None:
-    lab = skimage.color.rgb2lab(tsne.cyclic_colors(72)[None])[0]
-    steps = np.linalg.norm(np.diff(lab, axis=0, append=lab[:1]), axis=1)
-    assert steps.max() < 8  # no jump, at the end neither
-    lightness_and_blue = lab[:, [0, 2]]  # the colours that remain without red-green vision
-    opposite = np.linalg.norm(lightness_and_blue - np.roll(lightness_and_blue, 36, axis=0), axis=1)
-    assert opposite.min() > 45 and lab[:, 0].max() < 85  # none vanishes on white
+    assert (tmp_path / "again.svg").read_bytes() == second.read_bytes()
 
 
 def test_categories_stand_below_each_other(tiny_set, tmp_path) -> None:

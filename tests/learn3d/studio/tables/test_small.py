@@ -10,8 +10,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
-import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +19,6 @@ import stub_work
 
 from learn3d import commands
 from learn3d.runs.baselines import BASELINES
-from learn3d.runs.checkpoint import load_metadata
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
 from learn3d.studio.tables import experiment
 from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS
@@ -88,55 +85,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_every_row_is_trained_measured_and_reported(folder: Path, name: str) -> None:
-    table, text = TABLES[name], (folder / "out" / f"{name}.md").read_text()
-    assert "Missing" not in text
-    lines = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines()]
-    for label, row in table.rows.items():
-        cells = {line[1]: line[2:] for line in lines if line[0] == label}
-        assert (f"paper ({row.about})" in cells) == bool(row.printed)
-        if row.variant is None:
-            assert len(cells) == 1, "a quoted row is not measured"
-            continue
-        files = sorted(folder.glob(f"out/runs/airplane/{row.variant}-seed?/test.json"))
+    assert "Missing" not in (folder / "out" / f"{name}.md").read_text()
+    for variant in filter(None, (row.variant for row in TABLES[name].rows.values())):
+        files = sorted(folder.glob(f"out/runs/airplane/{variant}-seed?/test.json"))
         results = [json.loads(file.read_text()) for file in files]
         assert len(results) == (PASCAL_SEEDS if name == "pascal" else 1)
+        steps = 2 * (BATCH_DIVISOR if VARIANTS[variant].small_batches_of else 1)
         for result in results:
-            for measure in (
-                "voxel_iou",
-                "voxel_iou_kato19",
-                "f_score",
-                "mmd",
-                "mmd_paper",
-                "chamfer_l1",
-            ):
-                assert (
-                    0
-                    <= result[measure]
-                    <= (1 if "iou" in measure or "score" in measure else math.inf)
-                ), label
+            assert result["iterations"] == result["curve"][-1][1] == steps
             assert result["voxel_iou"] > 0, "even an untrained shape overlaps with an airplane"
-            assert result["iterations"] == 2 * (
-                BATCH_DIVISOR if VARIANTS[row.variant].small_batches_of else 1
-            )
-            assert [point[1] for point in result["curve"]] == [result["iterations"]], (
-                "the last step is validated"
-            )
-            assert result["mmd_floor"] > 0
-            assert 0 <= result["voxel_iou_unclamped"] <= result["voxel_iou"] + 0.5
-            angles = dict(result["angles"])
-            assert table.layout == "pascal3d" or angles[0] > 0
-            assert all(0 <= iou <= 1 for iou in angles.values())
-        mean = sum(result[table.measure] for result in results) / len(results)
-        cell, mean_cell = cells["here (mmd)" if name == "mmd" else "here (kato18)"]
-        assert cell == mean_cell and cell.startswith(f"{mean:.3f}"), label
-        assert ("±" in cell) == (name == "pascal")
-        if name != "mmd":
-            low, high = map(float, re.search(r"\[(.*), (.*)\]", cell).groups())
-            assert low - 1e-3 <= mean <= high + 1e-3
-        in_list = {
-            line[1]: line[2:] for line in lines if line[0] == f"airplane/{row.variant}-seed0"
-        }
-        assert f"{results[0]['chamfer_l1']:.4f}" in in_list[f"step {results[0]['step']}"]
+            assert result["mmd"] > 0 and result["mmd_floor"] > 0
 
 
 @pytest.mark.parametrize("name", [name for name in TABLES if TABLES[name].measure == "voxel_iou"])
@@ -145,20 +103,3 @@ def test_tables_of_voxel_iou_have_the_baselines(folder: Path, name: str) -> None
     ious = [float(rows[baseline][2].split()[0]) for baseline in BASELINES]
     assert 0 < ious[2] < ious[1] <= 1, "the nearest training object is above a random one"
     assert ious[2] < ious[0] < 1, "so is the mean shape"
-
-
-def test_settings_of_rows_reach_their_runs(folder: Path) -> None:
-    wanted = {
-        "60x60": 6,
-        "30x30": 24,
-        "20x20": 54,
-        "20x15": 72,
-        "15x20": 72,
-        "15x15": 96,
-        "10x10": 216,
-    }
-    files = {
-        widths: folder / f"out/runs/airplane/bins-{widths}-seed0/best.safetensors"
-        for widths in wanted
-    }
-    assert {widths: load_metadata(file).info.num_views for widths, file in files.items()} == wanted
