@@ -96,11 +96,14 @@ def rows(name: str, part: str) -> list[list[str]]:
 
     part: a table of the file, or one made of others: "both" puts the difference under each method,
     "side" puts paper, here and difference of a single category side by side, "seeds" adds the mean difference over
-    seeds as a last column, "means" leaves the means over seeds of "poses", "measures" is made by `measures`.
+    seeds as a last column, "means" leaves the means over seeds of "poses", "measures" is made by `measures`,
+    "baselines" leaves the rows of the mean shape and the others.
     """
     tables = read(name)
     if part == "measures":
         return measures(tables)
+    if part == "baselines":
+        return [[row[0], *row[2:-1]] for row in tables["main"] if row[1] in ("", VOXELS)]
     if part == "seeds":
         header, *main = tables["main"]
         (title, *_, spread), *rest = tables["differences"]

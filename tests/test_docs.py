@@ -158,7 +158,10 @@ def test_presets_schedules_and_layouts_are_on_their_pages():
 
 
 def commands():
-    """The command lines `learn3d ...` in the blocks of all pages."""
+    """The command lines `learn3d ...` in the blocks of all pages, and in commands.sh."""
+    for line in (ROOT / "docs" / "results" / "commands.sh").read_text().splitlines():
+        if line.startswith("learn3d "):
+            yield pytest.param(shlex.split(line)[1:], id=line)
     for page in [*PAGES, *sorted((ROOT / "docs" / "methods").glob("*.md"))]:
         for block in re.findall(r"```sh\n(.*?)```", page.read_text(), flags=re.DOTALL):
             for line in block.replace("\\\n", " ").splitlines():

@@ -1,0 +1,56 @@
+# The commands that made the files of this folder, each with the table of docs/results.md that it fills.
+# Words in capitals are folders. Repeat `make-dataset` for each category. VPL ran with one seed, by a command of its own.
+
+# On Debian; then, for each category:
+python tools/free_meshes/fetch.py --output models
+
+learn3d make-dataset --output DATA --category airplane --source models/airplane --front z --augment 6
+
+# Table 1
+learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --iterations 2000 --seeds 3 --set clamp_to_cube=true vpl:lambda_discriminator=0.1
+
+# Table 1, longer
+learn3d experiment kato --data DATA --output LONG --category airplane,chair,table --methods Vanilla-AE Proposed --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500
+
+learn3d make-dataset --output CARS --category car --procedural 2000
+
+# Generated cars
+learn3d experiment kato --data CARS --output CARS_OUTPUT --category car --methods Vanilla-AE Proposed --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=1000
+
+# Generated cars, table 4
+learn3d experiment ablation --data CARS --output CARS_OUTPUT --category car --methods Proposed "w/o adversarial" --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=1000
+
+learn3d make-dataset --output CARS100 --category car --procedural 100 --augment 6
+
+# 100 generated cars
+learn3d experiment kato --data CARS100 --output CARS100_OUTPUT --category car --methods Vanilla-AE Proposed --iterations 2000 --seeds 1 --set clamp_to_cube=true validate_every=500
+
+# Table 2
+learn3d experiment prgan --data DATA --output OUTPUT --category airplane --iterations 2000 --methods PrGAN --batch-size 16 --set encoder_from_step=1201 encoder_learning_rate=0.001 discriminator_channels=32,64,128,256
+
+learn3d make-dataset --layout kar --views 12 --output KAR --category airplane --source models/airplane --front z --augment 6
+
+# Table 3
+learn3d experiment kar --data KAR --output OUTPUT --category airplane --methods Vanilla-AE Proposed --iterations 2000 --seeds 1 --set clamp_to_cube=true views_per_object=12 validate_every=1000
+
+# Table 4
+learn3d experiment ablation --data DATA --output OUTPUT --category airplane --iterations 2000 --set clamp_to_cube=true
+
+# Table 4, longer
+learn3d experiment ablation --data DATA --output FP32 --category airplane --methods Proposed "w/o adversarial" --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500 precision=fp32
+
+# Table 4, longer, bf16; airplanes without adversarial loss were left out
+learn3d experiment ablation --data DATA --output LONG --category airplane,chair --methods Proposed "w/o prior" "w/o adversarial" --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500
+
+# Table 6
+learn3d experiment mmd --data DATA --output OUTPUT --category airplane,chair,table --iterations 2000 --seeds 3 --set clamp_to_cube=true
+
+# Table 6, longer
+learn3d experiment mmd --data DATA --output LONG --category airplane,chair,table --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500
+
+# The mean shape and the nearest training object of each data set
+learn3d make-dataset --output AIRPLANES --category airplane --procedural 2000
+learn3d experiment kato --data AIRPLANES --output AIRPLANES_OUTPUT --category airplane --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data CARS --output CARS_OUTPUT --category car --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data CARS100 --output CARS100_OUTPUT --category car --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --methods Vanilla-AE Proposed --report-only
