@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ._images import write_png
@@ -246,11 +247,9 @@ def _material_lines(base: str, corners: Tensor, colors: UVTexture | Materials) -
     if isinstance(colors, UVTexture):
         images, shades, rows = [colors.image], None, colors.uv_faces
         rows = corners - 1 if rows is None else _rows(rows, "uv_faces", 3)
-        numbers = torch.zeros(len(corners), dtype=torch.int64)
+        numbers = torch.zeros(len(corners), dtype=torch.int64, device="cpu")
     else:
-        shades = torch.cat(
-            [colors.colors.detach().cpu(), torch.full((1, 3), GREY).to(colors.colors.dtype)]
-        )
+        shades = F.pad(colors.colors.detach().cpu(), (0, 0, 0, 1), value=GREY)
         images, rows = [*colors.images, None], colors.uv_faces
         numbers = _rows(colors.face_material.unsqueeze(1), "face_material", 1)[:, 0].long()
         numbers = numbers % len(shades)  # -1 is the last one, grey

@@ -315,7 +315,8 @@ def _nearest(a: Tensor, b: Tensor) -> Tensor:
         _, number = cKDTree(y.numpy()).query(x.numpy(), workers=torch.get_num_threads())
         return torch.from_numpy(number)
 
-    search = search_tree if cKDTree is not None and a.device.type == "cpu" else _search_all
+    in_host_memory = a.device.type == "cpu" and not torch._C._are_functorch_transforms_active()
+    search = search_tree if cKDTree is not None and in_host_memory else _search_all
     return torch.stack([search(x, y) for x, y in zip(a, b, strict=True)])
 
 

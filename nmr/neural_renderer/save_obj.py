@@ -130,6 +130,6 @@ def save_obj(
                 f"textures must be one per face, {len(faces)}, got {describe(textures)}"
             )
         image, uv = (torch.from_numpy(x.copy()) for x in create_texture_image(textures))
-        corners = torch.arange(3 * len(faces)).view(-1, 3)
+        corners = torch.arange(3 * len(faces), device="cpu").view(-1, 3)
         colors = nmr.UVTexture(image, uv.reshape(-1, 2), corners)
     nmr.save_obj(filename, vertices, faces, colors)

@@ -425,19 +425,31 @@ def test_the_table_has_every_public_function():
     assert not rows & WITHOUT_TENSORS
 
 
-def outcome(call, tensors, behind=()):
-    """The results, and the gradients of `behind`, if some of the results have one."""
+def results_of(call, tensors):
     results = call.function(**tensors)
-    results = list(results) if isinstance(results, tuple) else [results]
-    real = [x for x in results if x is not None and x.requires_grad]
-    upstream = [uniform(1, *x.shape, seed=9)[0].to(x.dtype) for x in real]
-    grads = (
-        torch.autograd.grad(real, behind, upstream, allow_unused=True, materialize_grads=True)
-        if real and behind
-        else ()
-    )
-    plain = [x.detach().as_subclass(torch.Tensor) for x in results if x is not None]
-    return plain + [x.as_subclass(torch.Tensor) for x in grads]
+    return [x for x in (results if isinstance(results, tuple) else (results,)) if x is not None]
+
+
+def loss_of(results):
+    """Every number with a weight of its own."""
+    real = [x for x in results if x.is_floating_point()]
+    weights = (uniform(1, *x.shape, seed=9)[0].to(x.dtype) for x in real)
+    return sum((x * weight).sum() for x, weight in zip(real, weights, strict=True))
+
+
+def gradients_of(results, behind):
+    """Those of `behind`, if some of the results have one."""
+    loss = loss_of(results) if behind else None
+    if not isinstance(loss, torch.Tensor) or not loss.requires_grad:
+        return [torch.zeros_like(x) for x in behind]
+    return list(torch.autograd.grad(loss, behind, allow_unused=True, materialize_grads=True))
+
+
+def outcome(call, tensors, behind=()):
+    """The results and gradients."""
+    results = results_of(call, tensors)
+    grads = gradients_of(results, behind)
+    return [x.detach().as_subclass(torch.Tensor) for x in results + grads]
 
 
 class Scaled(torch.autograd.Function):
@@ -527,18 +539,28 @@ def test_a_change_in_place_is_seen(name):
         root = leaf_of(x)
         wanted = outcome(call, call.tensors | {argument: root}, [root])
         given = root * 1
-        results = call.function(**call.tensors | {argument: given})
-        results = results if isinstance(results, tuple) else (results,)
-        real = [y for y in results if y is not None and y.requires_grad]
-        upstream = [uniform(1, *y.shape, seed=9)[0].to(y.dtype) for y in real]
+        results = results_of(call, call.tensors | {argument: given})
         given.mul_(0)
         try:
-            grads = torch.autograd.grad(real, root, upstream, allow_unused=True) if real else ()
+            grads = gradients_of(results, [root])
         except RuntimeError as error:
             assert "modified by an inplace operation" in str(error)
         else:
-            for grad in grads:
-                assert near([torch.zeros_like(x) if grad is None else grad], wanted[-1:]), argument
+            assert near(grads, wanted[-1:]), argument
+
+
+@EACH
+def test_torch_func_has_the_same_gradient(name):
+    call = CALLS[name]
+    for argument, x in call.tensors.items():
+        root = leaf_of(x) if x.is_floating_point() else x
+        results = results_of(call, call.tensors | {argument: root})
+        loss = loss_of(results)
+        if isinstance(loss, torch.Tensor) and loss.requires_grad:
+            grad = torch.func.grad(
+                lambda x, argument=argument: loss_of(results_of(call, call.tensors | {argument: x}))
+            )
+            assert near([grad(x)], gradients_of(results, [root])), argument
 
 
 def everything():
