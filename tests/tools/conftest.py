@@ -5,4 +5,4 @@ from pathlib import Path
 
 TOOLS = Path(__file__).parents[2] / "tools"
 HERE = Path(__file__).parent
-sys.path[:0] = map(str, (TOOLS, TOOLS / "free_meshes", HERE / "free_meshes"))
+sys.path.extend(map(str, (TOOLS, TOOLS / "free_meshes", HERE / "free_meshes")))

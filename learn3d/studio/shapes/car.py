@@ -161,15 +161,20 @@ def racing_car(
             part += arm.both_sides()
     if front_wing:
         half, z = 0.47 * width, 0.5 * length - draw(0.0, 0.1)
-        part += wing([(-half, 0.16, z, 0.35, 0.12), (half, 0.16, z, 0.35, 0.12)])
+        part += _plank(half, 0.16, z, 0.35)
         part += between((half - 0.03, 0.06, z - 0.4), (half, 0.34, z + 0.02)).both_sides()
         part += bar((0, 0.16, z - 0.2), (0, y + top[1] - 0.05, z - 0.3), 0.12)
     if rear_wing:
         half, high = 0.4 * width, y + draw(0.35, 0.75)
-        part += wing([(-half, high, rear - 0.1, 0.4, 0.12), (half, high, rear - 0.1, 0.4, 0.12)])
+        part += _plank(half, high, rear - 0.1, 0.4)
         part += between((half - 0.03, y, rear - 0.55), (half, high + 0.1, rear - 0.05)).both_sides()
         part += bar((0, y, rear), (0, high, rear - 0.3), 0.1)
     return part
+
+
+def _plank(half: float, y: float, z: float, chord: float) -> Part:
+    """A straight wing from x = -half to half, its front at z."""
+    return wing([(x, y, z, chord, 0.12) for x in (-half, half)])
 
 
 @recipe(width=(1.0, 1.8), tall=(0.18, 0.35))
@@ -193,7 +198,7 @@ def _spoiler(draw: Draw, body: SimpleNamespace, *, inset, high) -> Part:
     z = inset - body.length / 2
     y = body.shoulder + high
     stay = box((0.05, high + 0.3, 0.14), (0.7 * half, y - high / 2 - 0.13, z - 0.13))
-    return wing([(-half, y, z, 0.3, 0.12), (half, y, z, 0.3, 0.12)]) + stay.both_sides()
+    return _plank(half, y, z, 0.3) + stay.both_sides()
 
 
 def _hull(body: SimpleNamespace) -> Part:

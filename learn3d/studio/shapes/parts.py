@@ -249,10 +249,11 @@ def wing(sections: Sequence[Sequence[float]], upright: bool = False) -> Part:
 def _loft_faces(rings: int, size: int, ends: str) -> np.ndarray:
     """Faces int64 [F, 3] of a loft: `rings` rings of `size` points, then two centres of a fan."""
     a = np.arange(rings * size).reshape(rings, size)
-    b, c = np.roll(a, -1, 1), np.roll(a, -1, 0)
-    d = np.roll(b, -1, 0)
-    sides = np.array([[a, b, d], [a, d, c]])[:, :, : rings if ends == "ring" else -1]
-    faces = [np.moveaxis(sides, 1, -1).reshape(-1, 3)]
+    b = np.roll(a, -1, 1)  # the next point of the same ring
+    c, d = np.roll(a, -1, 0), np.roll(b, -1, 0)  # the same points of the next ring
+    bands = rings if ends == "ring" else rings - 1  # the last ring may have no next one
+    halves = (a, b, d), (a, d, c)  # of the quadrilaterals between two rings
+    faces = [np.stack(corners, -1)[:bands].reshape(-1, 3) for corners in halves]
     if ends == "fan":
         center = np.full(size, rings * size)
         faces += [np.c_[center, b[0], a[0]], np.c_[center + 1, a[-1], b[-1]]]
