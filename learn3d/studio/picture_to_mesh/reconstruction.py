@@ -226,6 +226,11 @@ def _read(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours uint8 [H,W,3] and a checked mask uint8 [H,W]: from the file, from `mask_path`, or found in the image."""
     colors, mask = read_photo(path, mask_path, optional=True)
+    if max(colors.shape[:2]) < MASK_SIZE:
+        size = f"{colors.shape[1]}x{colors.shape[0]} pixels"
+        note(
+            f"note: {path} has {size}, fewer than the {MASK_SIZE} of training; expect a rough shape"
+        )
     searched = mask is None or box is not None  # a box counts even if the file has transparency
     doubt = None
     if searched:

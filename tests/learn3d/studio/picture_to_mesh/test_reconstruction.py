@@ -95,6 +95,16 @@ def test_specks_change_neither_kind_nor_outline(
     assert made[0].silhouette_iou == pytest.approx(made[1].silhouette_iou, abs=0.02)
 
 
+def test_a_picture_of_few_pixels_is_said(tmp_path, capsys) -> None:
+    for side in (20, 64):
+        picture = np.zeros((side, side, 4), np.uint8)
+        picture[5:15, 5:15] = 255
+        Image.fromarray(picture).save(tmp_path / f"{side}.png")
+        _read(tmp_path / f"{side}.png")
+    said = capsys.readouterr().err
+    assert "20.png has 20x20 pixels, fewer than the 64 of training" in said and "64.png" not in said
+
+
 def test_results_never_replace_the_images(finished_run, tmp_path) -> None:
     picture = np.zeros((64, 64, 4), np.uint8)
     picture[20:40, 10:50] = 255
