@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +21,6 @@ from learn3d.pictures import TILE, Surface, draw_surface, grid_surface, natural_
 # The picture grid of a training
 TURNS_DEG = (0, 60, 120, 180, 240, 300)  # views of a shape, counted from the input's view
 AROUND = [f"+{turn}°" for turn in TURNS_DEG[1:]]
-#: A function that aligns the predicted shapes of a batch with the true ones; see `evaluate`.
-Align = Callable[[Meshes | Grids, Batch, ViewDataset], Meshes | Grids]
 
 CODES_PER_VIEW = 512
 SURFACE_POINTS = 2000
@@ -80,7 +78,6 @@ def evaluate(
     *,
     max_images: int | None = None,
     detailed: bool = False,
-    align: Align | None = None,
     batch_size: int = 256,
 ) -> Evaluation:
     """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
@@ -96,7 +93,6 @@ def evaluate(
     and its floor (`shuffle_views`), the IoU of silhouettes by angle (`images_by_angle`), and
     Chamfer-L1 and F-score between 2,000 points on each surface. If the data set has no points, the
     truth is the surface of its voxels, which limits distances to about 1/32.
-    align: turns or moves the predicted shapes of a batch before they are compared.
     """
     samples = spread_samples(
         dataset.object_ids, dataset.view_ids, len(dataset) if max_images is None else max_images
@@ -117,9 +113,6 @@ def evaluate(
             code = method.encode(batch.images)
             shapes = method.decode(code)
             unclamped = shapes.without_clamp() if isinstance(shapes, Meshes) else None
-            if align is not None:
-                shapes = align(shapes, batch, dataset)
-                unclamped = unclamped and align(unclamped, batch, dataset)
             measured = (
                 {} if dataset.voxels is None else _compare_voxels(shapes, batch, dataset, detailed)
             )

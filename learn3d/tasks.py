@@ -16,7 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,6 +117,21 @@ def run_tasks(tasks: Sequence[Task], workers: Workers) -> list[str]:
                 note("stopping: running tasks save their state")
                 stop.set()
     return failed
+
+
+def make_missing(tasks: Mapping[Path, Task], workers: Workers, things: str) -> int:
+    """Run the tasks whose files, the keys, do not exist.
+
+    Returns the exit status of a command: 0 if all files exist then, 1 if a task failed, 130 after
+    a signal. `things` names the files in the message.
+    """
+    left = [task for path, task in tasks.items() if not path.is_file()]
+    note(f"{len(tasks)} {things}, {len(left)} to be made")
+    failed = run_tasks(left, workers)
+    if missing := sum(not path.is_file() for path in tasks):
+        note(f"{missing} of {len(tasks)} {things} are missing; the same command makes them")
+        return 1 if failed else INTERRUPTED
+    return 0
 
 
 @contextlib.contextmanager

@@ -9,8 +9,8 @@ from learn3d.data.conventions import IMAGE_SIZE, SET_FILE, has_shards, shards_fo
 from learn3d.data.layouts import Layout, check_folder, check_options, load_dataset, reader
 from learn3d.files.writing import check_target, write_json
 from learn3d.settings import Count, split_names
-from learn3d.tasks import Task, Workers, run_tasks
-from learn3d.terminal import INTERRUPTED, align, note, say
+from learn3d.tasks import Task, Workers, make_missing
+from learn3d.terminal import align, say
 
 
 class CheckDataset(Command):
@@ -110,16 +110,10 @@ class ConvertDataset(Command):
                     continue
                 few = self.views_per_object if split == "train" else None
                 arguments = (self.layout, self.data, category, split, folder, self.image_size, few)
-                tasks[folder] = Task(
+                tasks[folder / SET_FILE] = Task(
                     f"{category} {split}", convert_split, arguments, folder.with_suffix(".log")
                 )
-        failed = run_tasks(list(tasks.values()), self.workers)
-        if missing := [folder for folder in tasks if not (folder / SET_FILE).is_file()]:
-            note(
-                f"{len(missing)} of {len(tasks)} splits are missing; the same command converts them"
-            )
-            return 1 if failed else INTERRUPTED
-        return 0
+        return make_missing(tasks, self.workers, "splits")
 
 
 def convert_split(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from vectors import load_vector
 import nmr
 from learn3d import evaluation
 from learn3d.data.conventions import KAR, KATO, PASCAL3D
-from learn3d.data.dataset import Batch, ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import (
     ANGLES_DEG,
     NO_MMD,
@@ -235,12 +234,6 @@ def test_the_clamp_counts_in_one_of_two_ious(tiny_set) -> None:
     assert both["voxel_iou_unclamped"] == without["voxel_iou"] == without["voxel_iou_unclamped"]
     assert both["voxel_iou"] > both["voxel_iou_unclamped"] + 0.1, "an open shape has no inside"
 
-    def align(shapes: Meshes, *_: object) -> Meshes:
-        return dataclasses.replace(shapes, vertices=shapes.vertices - torch.tensor([0.1, 0, 0]))
-
-    aligned = evaluate(Clamped(clamped), dataset, detailed=True, align=align).means
-    assert aligned["voxel_iou_unclamped"] == 1, "both shapes are aligned"
-
 
 def test_views_are_shuffled_within_objects() -> None:
     generator = torch.Generator().manual_seed(1)
@@ -296,23 +289,6 @@ def test_meshes_beyond_the_grid_are_counted(tiny_set) -> None:
     )
     assert opened.sum() < 0.7 * whole.sum(), "an open shape has no inside"
     assert evaluate(Constant(beyond), tiny_set).means["hollow"] == 1
-
-
-def test_shapes_may_be_aligned_before_they_are_compared(tiny_set) -> None:
-    def turned(vertices: torch.Tensor, degrees: float) -> torch.Tensor:
-        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        return vertices @ torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
-
-    shape = egg()
-    dataset = with_truth(tiny_set, shape)
-    method = Constant(Meshes(turned(shape.vertices, 60.0), shape.faces))
-    assert evaluate(method, dataset, max_images=4).voxel_iou < 0.7
-
-    def align(shapes: Meshes, batch: Batch, of: ViewDataset) -> Meshes:
-        assert of is dataset and len(batch) == len(shapes.vertices)
-        return dataclasses.replace(shapes, vertices=turned(shapes.vertices, -60.0))
-
-    assert evaluate(method, dataset, max_images=4, align=align).voxel_iou > 0.99
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import DatasetConfig, Item, check, fit_to_box, split_items
 from learn3d.studio.make_data.writers import WRITERS
 from learn3d.studio.make_data.writers.writer import RenderedObject, write_png
-from learn3d.tasks import Task, run_tasks
-from learn3d.terminal import INTERRUPTED, is_watched, note, say, stop_on_signal
+from learn3d.tasks import Task, make_missing
+from learn3d.terminal import is_watched, note, say, stop_on_signal
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
 MAX_LISTED = 100  # skipped meshes in the text of a report; the card has all of them
@@ -211,14 +211,9 @@ def make_shards(config: DatasetConfig) -> int:
             tasks[path] = Task(
                 f"{split} {number}", make_shard, (config, path, number, part, threads), log
             )
-    missing = [task for path, task in tasks.items() if not path.is_file()]
-    note(
-        f"{config.category}: {len(tasks)} shards, {len(missing)} to be made; logs: {folder / '*.log'}"
-    )
-    failed = run_tasks(missing, config.workers)
-    if count := sum(not path.is_file() for path in tasks):
-        note(f"{count} shards are missing; the same command makes them")
-        return 1 if failed else INTERRUPTED
+    note(f"{config.category}: logs are in {folder / '*.log'}")
+    if status := make_missing(tasks, config.workers, "shards"):
+        return status
     lists = [
         read_json(path.with_suffix(LIST), 2**28, "the list of a shard's meshes") for path in tasks
     ]

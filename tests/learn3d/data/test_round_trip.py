@@ -14,7 +14,7 @@ from fuzz_targets import SETTINGS
 from lopsided_meshes import write_meshes
 
 import nmr
-from learn3d.commands import data
+from learn3d import tasks
 from learn3d.data import shards
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.disk_array import DiskArray
@@ -107,7 +107,7 @@ def test_masks_cameras_and_voxels(made):
 
 def test_shards_keep_batches(made, tmp_path, command, monkeypatch):
     monkeypatch.setattr(shards, "SHARD_BYTES", 1)  # one object in each
-    monkeypatch.setattr(data, "run_tasks", stub_work.run_tasks_here)
+    monkeypatch.setattr(tasks, "run_tasks", stub_work.run_tasks_here)
     words = ("--data", made.folder, "--layout", made.layout, "--output", tmp_path)
     status, _, said = command("convert-dataset", *words)
     assert status == 0, said

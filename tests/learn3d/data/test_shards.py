@@ -19,7 +19,7 @@ from runs import same_tensors
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from learn3d.commands import data
+from learn3d import tasks
 from learn3d.data import shards
 from learn3d.data.conventions import SET_FILE, shards_folder
 from learn3d.data.disk_array import DiskArray
@@ -34,7 +34,7 @@ from learn3d.training import train
 def small_shards(monkeypatch):
     """One object in each shard, converted in this process."""
     monkeypatch.setattr(shards, "SHARD_BYTES", 1)
-    monkeypatch.setattr(data, "run_tasks", stub_work.run_tasks_here)
+    monkeypatch.setattr(tasks, "run_tasks", stub_work.run_tasks_here)
 
 
 def same_networks(folder, other) -> None:

@@ -13,6 +13,7 @@ import torch
 from steps import TINY, make_method
 
 import nmr
+from learn3d import tasks
 from learn3d.data.dataset import (
     DEPTH_REACH,
     Batch,
@@ -77,7 +78,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> ViewDataset:
         "val": 1,
     }
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render, "run_tasks", stub_work.run_tasks_here)
+        patch.setattr(tasks, "run_tasks", stub_work.run_tasks_here)
         assert render.make_shards(render.DatasetConfig(output=folder, shards=True, **options)) == 0
     return load_dataset("around", folder, "table", "train")
 

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import stub_work
 import torch
 from lopsided_meshes import write_meshes
 
+from learn3d import tasks
 from learn3d.data.conventions import has_shards
 from learn3d.data.layouts import load_dataset
 from learn3d.studio.make_data import render
@@ -44,7 +44,7 @@ def config(tmp_path, monkeypatch) -> DatasetConfig:
 @pytest.fixture
 def here(monkeypatch) -> None:
     """Shards are made in this process: starting Python and torch takes seconds."""
-    monkeypatch.setattr(render, "run_tasks", stub_work.run_tasks_here)
+    monkeypatch.setattr(tasks, "run_tasks", stub_work.run_tasks_here)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -105,53 +105,6 @@ def test_bad_meshes_are_listed_and_another_list_of_meshes_is_refused(
     (folder / "a.obj").rename(folder / "zzz.obj")
     with pytest.raises(ValueError, match="were made with another list of meshes"):
         render.make_shards(config)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
-@pytest.mark.parametrize("where", ["here", "cluster"])
-def test_killed_workers_change_nothing(where, config, here, monkeypatch, request) -> None:
-    """A worker that makes shards is killed five times; the call goes on, and ends with the same bytes."""
-    config = dataclasses.replace(config, procedural=12)
-    whole = dataclasses.replace(config, output=config.output.with_name("whole"))
-    assert render.make_shards(whole) == 0
-    monkeypatch.undo()
-    monkeypatch.setattr(render, "OBJECTS_PER_SHARD", 2)
-    workers = request.getfixturevalue("cluster") if where == "cluster" else Workers(2)
-    killed, done = set(), threading.Event()
-
-    def kill_five() -> None:
-        while len(killed) < 5 and not done.is_set():
-            time.sleep(0.5)
-            for pid in find_workers(where)[:1]:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-                    killed.add(pid)
-
-    thread = threading.Thread(target=kill_five)
-    thread.start()
-    try:
-        assert render.make_shards(dataclasses.replace(config, workers=workers)) == 0
-    finally:
-        done.set()
-        thread.join()
-    assert len(killed) == 5
-    assert contents(config.output) == contents(whole.output)
-    assert not list(config.output.rglob(".*"))
-
-
-def find_workers(where: str) -> list[int]:
-    """Processes that make a shard on this machine, or workers of the cluster with such a process."""
-    psutil = pytest.importorskip("psutil")
-    found = []
-    for process in psutil.process_iter():
-        with contextlib.suppress(psutil.Error):
-            if "tasks._child" in " ".join(process.cmdline()) and process.cwd() == os.getcwd():
-                # an orphan's is not a worker
-                worker = process if where == "here" else process.parent()
-                if where == "here" or "multiprocessing" in " ".join(worker.cmdline()):
-                    found.append(worker.pid)
-    return found
 
 
 @pytest.mark.slow
