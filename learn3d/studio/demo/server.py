@@ -136,10 +136,14 @@ class JobQueue:
             with contextlib.suppress(asyncio.CancelledError):
                 job(send)
 
+        def leave(_: object = None) -> None:
+            with contextlib.suppress(ValueError):
+                self._line.remove(ticket)
+
         self._line.insert(self._turn(address), ticket)
         try:
             while not (self.closed() or (work and work.done() and not messages)):
-                ahead = self._line.index(ticket)
+                ahead = self._line.index(ticket) if ticket in self._line else 0
                 if ahead and ahead != place:
                     yield _json_line({"place": ahead})
                 place = ahead
@@ -149,11 +153,12 @@ class JobQueue:
                         yield line[start : start + _PIECE]
                 if not ahead and work is None:
                     work = asyncio.get_running_loop().run_in_executor(self._thread, run_job)
+                    work.add_done_callback(leave)  # the next one need not wait for a slow reader
                 await (asyncio.wait([work], timeout=_TICK) if work else asyncio.sleep(_TICK))
             if not self.closed():
                 await work  # raises the job's error
         finally:
-            self._line.remove(ticket)
+            leave()
             if work:
                 work.cancel()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import socket
@@ -101,6 +102,16 @@ def test_what_is_no_picture_is_refused_in_a_sentence(client, server, box, change
 def test_a_box_that_cannot_be_is_an_error_of_the_picture(client, box, where) -> None:
     (said,) = messages(client.post(f"{box.address}&box={where}", content=box.content))
     assert "box" in said["error"]
+
+
+def test_a_slow_reader_holds_nobody_up() -> None:
+    async def visit() -> list[bytes]:
+        jobs = serving.JobQueue()
+        slow = jobs.run(lambda send: [send({"step": step}) for step in range(3)], "slow")
+        assert await anext(slow) == b'{"step": 0}\n'  # and reads no further
+        return [line async for line in jobs.run(lambda send: send({"step": 0}), "next")]
+
+    assert asyncio.run(asyncio.wait_for(visit(), 60))[-1] == b'{"step": 0}\n'
 
 
 def test_words_of_a_visitor_reach_the_terminal_written_out(monkeypatch, capsys) -> None:
