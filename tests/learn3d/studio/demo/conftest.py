@@ -1,4 +1,4 @@
-"""The real command `learn3d demo`, with two runs or with the package's model, and the address of its page."""
+"""The real command `learn3d demo`, with two runs, one, or the package's model, and the address of its page."""
 
 from __future__ import annotations
 
@@ -46,8 +46,10 @@ def serving(folder: Path, *words: object) -> Iterator[Server]:
     with subprocess.Popen(list(map(str, command)), cwd=folder, **pipes) as process:
         line = process.stdout.readline()
         assert "the page is at" in line, (folder / "errors.txt").read_text()
-        yield Server(process, line.split()[4], folder / "errors.txt")
-        process.kill()
+        try:
+            yield Server(process, line.split()[4], folder / "errors.txt")
+        finally:
+            process.kill()
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,13 @@ def server(finished_run, tmp_path_factory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("demo")
     shutil.copytree(finished_run, folder / "other")
     with serving(folder, "--run", finished_run, folder / "other") as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def single(finished_run, tmp_path_factory) -> Iterator[Server]:
+    """With one run: it answers in half the time."""
+    with serving(tmp_path_factory.mktemp("single"), "--run", finished_run) as server:
         yield server
 
 

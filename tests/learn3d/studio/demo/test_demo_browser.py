@@ -236,9 +236,9 @@ def test_the_meshes_of_two_runs_turn_beside_the_outlined_picture(
     assert moves(tab, pixels, canvas.last, pixels(canvas.last)), "it turns by itself"
 
 
-def test_the_outline_is_corrected_by_brushes_and_a_box(server, visit, tmp_path) -> None:
+def test_the_outline_is_corrected_by_brushes_and_a_box(single, visit, tmp_path) -> None:
     two = boxes(tmp_path / "two.png", (slice(40, 160), BLUE), (slice(190, 260), GREEN))
-    tab = visit(server.address)
+    tab = visit(single.address)
     answered(tab, lambda: tab.locator("#file").set_input_files(two))
 
     def part(columns: slice) -> float:
@@ -270,9 +270,9 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(server, visit, tmp_path) 
 
 
 def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(
-    server, visit, pixels, blue, tmp_path
+    single, visit, pixels, blue, tmp_path
 ) -> None:
-    tab = visit(server.address)
+    tab = visit(single.address)
     (tmp_path / "broken.png").write_bytes(b"no picture")
     tab.locator("#file").set_input_files(blue)
     tab.get_by_text("Finding the").first.wait_for()
@@ -308,15 +308,16 @@ def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(
         assert high > 1.5 * max(red, low), "the dropped picture and its mesh are green"
 
 
-def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(server, browser) -> None:
+def test_an_interrupt_ends_it_while_the_page_is_open_and_busy(single, browser) -> None:
     tab = browser.new_page()
-    tab.goto(server.address)
+    tab.set_default_timeout(10 * AT_ONCE)
+    tab.goto(single.address)
     tab.get_by_role("button", name="sofa").click()
     tab.locator(".view > canvas").first.wait_for()
     tab.get_by_role("button", name="chair").click()
     assert tab.get_by_role("button", name="chair").get_attribute("aria-pressed") == "true"
-    server.process.send_signal(signal.SIGINT)
-    assert server.process.wait(timeout=60) in (0, 130), "a second or two on an idle machine"
+    single.process.send_signal(signal.SIGINT)
+    assert single.process.wait(timeout=60) in (0, 130), "a second or two on an idle machine"
     tab.close()
-    errors = server.errors.read_text()
+    errors = single.errors.read_text()
     assert "Traceback" not in errors and "ERROR" not in errors, errors
