@@ -115,11 +115,13 @@ def iou(one: np.ndarray, other: np.ndarray) -> float:
     return float((one & other).sum() / (one | other).sum())
 
 
-def boxes(path: Path, *placed: tuple[slice, tuple[int, int, int]]) -> Path:
+def boxes(
+    path: Path, *placed: tuple[slice, tuple[int, int, int]], rows: slice = slice(60, 140)
+) -> Path:
     """A picture 300 x 200 of boxes on grey, each with its columns and its colour."""
     image = np.full((200, 300, 3), 200, np.uint8)
     for columns, color in placed:
-        image[60:140, columns] = color
+        image[rows, columns] = color
     Image.fromarray(image).save(path)
     return path
 
@@ -287,7 +289,7 @@ def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(
     both = boxes(tmp_path / "two.png", (slice(80, 220), BLUE), (slice(240, 290), (0, 0, 0)))
     answered(tab, lambda: tab.locator("#file").set_input_files(both))
     assert tab.get_by_text("away from the object").is_visible()
-    wide = boxes(tmp_path / "wide.png", (slice(0, 300), BLUE))
+    wide = boxes(tmp_path / "wide.png", (slice(0, 300), BLUE), rows=slice(92, 108))
     answered(tab, lambda: tab.locator("#file").set_input_files(wide))
     assert "touches 2 sides" in tab.locator("#doubt").inner_text(), "a doubt beside the mesh"
     green = boxes(tmp_path / "green.png", (slice(80, 220), GREEN))
