@@ -5,7 +5,6 @@ raises EOFError if the file is cut short, and ValueError or another error if it 
 """
 
 import re
-import struct
 
 import numpy as np
 
@@ -167,77 +166,50 @@ def _ply_element(
     end = EOFError(f"it ends within its {count} elements `{name}`")
     if count < 0 or count * max(sum(types[0].itemsize for _, types in columns), 1) > len(body) - at:
         raise end
-    try:
-        starts, sizes = _ply_rows(body, at, count, [types for _, types in columns])
-    except struct.error:
-        raise end from None
-    found = {}
-    offsets = starts[:-1]
-    if starts[-1] > len(body):
-        raise end
-    content = np.frombuffer(body, np.uint8)
-    same = count > 0 and not np.ptp(sizes, axis=1).any()
-    for (column, types), lengths in zip(columns, sizes, strict=True):
-        item = types[-1].itemsize
-        offsets = offsets + (types[0].itemsize if len(types) > 1 else 0)
-        if same:
-            strides = (int(starts[1] - starts[0]), item)
-            values = np.ndarray(
-                (count, lengths[0]), types[-1], body, int(offsets[0]), strides
-            ).ravel()
-        else:
-            bytes_of = np.repeat(offsets - item * (np.cumsum(lengths) - lengths), lengths)
-            bytes_of = bytes_of + item * np.arange(len(bytes_of))
-            values = content[bytes_of[:, None] + np.arange(item)].view(types[-1])[:, 0]
-        found[column] = (values, lengths)
-        offsets = offsets + item * lengths
-    return found, int(starts[-1])
-
-
-def _ply_rows(
-    body: bytes, at: int, count: int, columns: list[list[np.dtype]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where each row starts and the last one ends, int64 [count + 1], and the lengths of its
-    lists [columns, count].
-    """
-
-    def row(at: int) -> tuple[int, list[int]]:
-        lengths = []
-        for types in columns:
+    start, rows, parts = at, [], [[] for _ in columns]
+    for number in range(count):
+        rows.append([])
+        for (_, types), part in zip(columns, parts, strict=True):
             length = 1
             if len(types) > 1:
-                length = int(
-                    struct.unpack_from(
-                        types[0].byteorder.replace("|", "=") + types[0].char, body, at
-                    )[0]
-                )
+                if at + types[0].itemsize > len(body):
+                    raise end
+                length = int(np.frombuffer(body, types[0], 1, at)[0])
                 at += types[0].itemsize
             if length < 0:
                 raise ValueError("a list has a negative length")
-            lengths.append(length)
+            rows[-1].append(length)
+            part.append(body[at : at + length * types[-1].itemsize])
             at += length * types[-1].itemsize
-        return at, lengths
+        if at > len(body):
+            raise end
+        if number == 0 and (at - start) * count <= len(body) - start:
+            table = np.frombuffer(body, _ply_layout(columns, rows[0]), count, start)
+            if all(
+                (table[key] == table[key][0]).all() for key in table.dtype.names if key[0] == "n"
+            ):
+                lengths = [np.full(count, length) for length in rows[0]]
+                values = [table[f"v{k}"].ravel() for k in range(len(columns))]
+                at = start + (at - start) * count
+                break
+    else:
+        lengths = np.array(rows, np.int64).reshape(count, -1).T if columns and count else parts
+        values = [
+            np.frombuffer(b"".join(part), types[-1])
+            for part, (_, types) in zip(parts, columns, strict=True)
+        ]
+    names = [column for column, _ in columns]
+    return dict(zip(names, zip(values, lengths, strict=True), strict=True)), at
 
-    if count:
-        size = row(at)[0] - at
-        starts = at + size * np.arange(count + 1)
-        lengths = np.array(row(at)[1], np.int64)
-        same = starts[-1] <= len(body)
-        offset = at
-        for types, length in zip(columns, lengths, strict=True):
-            if same and len(types) > 1:
-                same = bool((np.ndarray(count, types[0], body, offset, (size,)) == length).all())
-                offset += types[0].itemsize
-            offset += length * types[-1].itemsize
-        if same:
-            return starts, np.broadcast_to(lengths[:, None], (len(lengths), count))
-    starts = [at]
-    rows = []
-    for _ in range(count):
-        at, lengths = row(at)
-        starts.append(at)
-        rows.append(lengths)
-    return np.array(starts), np.array(rows, np.int64).reshape(count, len(columns)).T
+
+def _ply_layout(columns: list[tuple[str, list[np.dtype]]], lengths: list[int]) -> np.dtype:
+    """The type of rows whose lists have these lengths: n0, n1 ... are the lengths, v0, v1 ... the
+    values.
+    """
+    fields = []
+    for k, ((_, types), length) in enumerate(zip(columns, lengths, strict=True)):
+        fields += [(f"n{k}", kind) for kind in types[:-1]] + [(f"v{k}", types[-1], (length,))]
+    return np.dtype(fields)
 
 
 def _cut(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> Triangles:
