@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+import torch
+from torch import nn
+
 from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.methods import create_method
 from learn3d.methods.method import Losses, Method, MethodSettings
@@ -33,6 +36,15 @@ def make_method(
     settings = dataclasses.replace(settings, **changes)
     options = {"device": "cpu", "precision": "fp32", "seed": seed, "schedule": schedule}
     return create_method(settings, info, **options)
+
+
+def changed(networks: nn.ModuleDict, before: nn.ModuleDict) -> set[str]:
+    """The names of the networks with other parameters than before."""
+    return {
+        name
+        for name, network in networks.items()
+        if not all(map(torch.equal, network.parameters(), before[name].parameters()))
+    }
 
 
 def backpropagate(method: Method, batch: Batch, step: int) -> Losses:

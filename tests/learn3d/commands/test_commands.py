@@ -217,7 +217,11 @@ def test_mistakes_are_one_clear_line_before_a_model_is_loaded(
             "report needs the package plotly,.*pip install '.\\[report\\]'",
             1,
         ),
-        (MemoryError("out of memory"), "error: out of memory", 1),
+        (
+            MemoryError("out of memory"),
+            r"error: there is too little memory; .*\(out of memory\)",
+            1,
+        ),
         (KeyboardInterrupt(), "interrupted", INTERRUPTED),
     ],
 )

@@ -7,7 +7,7 @@ import dataclasses
 
 import pytest
 import torch
-from steps import make_method
+from steps import changed, make_method
 from torch import Tensor, nn
 
 import nmr
@@ -35,13 +35,6 @@ def make_batch(count: int = 3, poses: LookAtPoses | RotationPoses | None = None)
     images = torch.zeros(count, 4, 64, 64, dtype=torch.uint8)
     images[:, 3] = (255 * masks).to(torch.uint8)
     return Batch(images, masks, poses, views, torch.arange(count), 0 * views, None)
-
-
-def changed(method: PrGAN, before: nn.ModuleDict) -> set[str]:
-    """The names of the networks with other parameters."""
-    now = dict(method.networks.named_parameters())
-    changed = [name for name, p in before.named_parameters() if not torch.equal(p, now[name])]
-    return {name.split(".")[0] for name in changed}
 
 
 def test_every_view_is_drawn_from_an_equal_share_of_v() -> None:
@@ -73,7 +66,7 @@ def test_each_step_changes_its_network_only(
     before = copy.deepcopy(method.networks)
     losses = take_step(method, make_batch(), step)
     assert name in losses
-    assert changed(method, before) == {network}
+    assert changed(method.networks, before) == {network}
     if name == "encoder":  # the averages of the generator's batch norms stay, too
         state = before["generator"].state_dict()
         assert all(
@@ -90,7 +83,7 @@ def test_discriminator_rests_while_it_is_too_good(monkeypatch: pytest.MonkeyPatc
         before = copy.deepcopy(method.networks)
         losses = take_step(method, make_batch(), 1)
         assert ("discriminator" in losses) is not rests
-        assert changed(method, before) == (
+        assert changed(method.networks, before) == (
             {"generator"} if rests else {"generator", "discriminator"}
         )
 
