@@ -52,7 +52,7 @@ _LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
 _CARS = _LONG.replace("airplane", "car")
 _CURVES = ("pilot-airplanes=generated", "baselines-generated-airplanes=generated")
 _CURVES += ("kato-cars=generated", "ablation-cars=generated", "baselines-generated-cars=generated")
-_CURVES += ("kato-5000", "ablation-5000-bf16")
+_CURVES += ("kato-5000", "ablation-5000-bf16", "baselines-debian")
 _FUNCTIONS = (
     "silhouette",
     "rgb",

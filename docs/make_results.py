@@ -74,16 +74,18 @@ def measures(tables: dict[str, list[list[str]]]) -> list[list[str]]:
 def add_baselines(lines: list[list[str]], part: str, name: str) -> None:
     """Append the rows of the mean shape and the other baselines of a file to a table.
 
-    Differences to the first method have no interval, as its objects are not in the file.
+    Differences to the table's baseline have no interval, as its objects are not in the file.
     """
     header, *found = read(name)["main"]
     for label, source, *values in found:
         if source != VOXELS:
             continue
         by_column = dict(zip(header[2:], values, strict=True))
+        if part != "side" and header[2:] != lines[0][2:]:
+            by_column.pop("mean")  # it is over other categories
         if part == "side":
             value = by_column["mean"]
-            ours = next(row[2] for row in lines[1:] if row[2] != "-")
+            ours = next(row[2] for row in lines[1:] if not row[3])
             difference = float(value.split()[0]) - float(ours.split()[0])
             lines.append([label, "-", value, f"{difference:+.3f}", *[""] * (len(lines[0]) - 4)])
         else:

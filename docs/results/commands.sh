@@ -54,3 +54,4 @@ learn3d experiment kato --data AIRPLANES --output AIRPLANES_OUTPUT --category ai
 learn3d experiment kato --data CARS --output CARS_OUTPUT --category car --methods Vanilla-AE Proposed --report-only
 learn3d experiment kato --data CARS100 --output CARS100_OUTPUT --category car --methods Vanilla-AE Proposed --report-only
 learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data DATA --output OUTPUT --category airplane --methods Vanilla-AE Proposed --report-only
