@@ -209,7 +209,7 @@ function present(meshes) {
   $("views").replaceChildren();
   $("downloads").replaceChildren();
   $("downloads").hidden = $("smooth").hidden = false;
-  for (const text of new Set(meshes.map((made) => made.doubt).filter(Boolean))) addDoubt(text);
+  for (const text of new Set(meshes.map((made) => made.doubt).filter(Boolean))) addDoubt(`${text[0].toUpperCase()}${text.slice(1)}.`);
   const { name } = stage.picture;
   views = meshes.map((made) => {
     const label = meshes.length > 1 ? ` ${made.label}` : "", view = new View(made, label);
@@ -295,7 +295,8 @@ function offer(label, file, make) {
 showNothing();
 fetch("about").then((response) => response.json()).then((about) => {
   ({ side } = about);
-  for (const each of about.kinds)
+  $("ask").hidden = about.kinds.length < 2;
+  for (const each of about.kinds.length < 2 ? [] : about.kinds)
     makeButton(each, () => setKind(each), $("kinds")).ariaLabel = `It is a${/^[aeiou]/.test(each) ? "n" : ""} ${each}`;
   $("smooth").onclick = setSmooth;
   $("kinds").append($("smooth"));
