@@ -342,6 +342,7 @@ VALUES = [
     ("image must be .* got 3", lambda: rgb(nmr.UVTexture(IMAGE.expand(3, -1, -1, -1), UV))),
     ("uv_faces must have one row per face .80", lambda: rgb(nmr.UVTexture(IMAGE, UV, F[:3]))),
     ("uv_faces refer to row 41, but uv has 5 rows", lambda: nmr.UVTexture(IMAGE, UV[:5], F)),
+    ("uv_faces is -1 .*; nmr.Materials draws", lambda: nmr.UVTexture(IMAGE, UV, F - 1)),
     (
         "colors must have one size, as the meshes do",
         lambda: rgb(nmr.VertexColors([V, V[:5]]), BATCH),
@@ -421,10 +422,6 @@ VALUES = [
         lambda: losses.laplacian_loss(V, TABLE[:, :3]),
     ),
     ("edges refer to vertex 42, but a mesh has 42", lambda: losses.laplacian_loss(V, TABLE + 1)),
-    (
-        "edges refer to vertex 42, but a mesh has 42 vertices",
-        lambda: losses.smoothness_loss(V, TABLE + 10),
-    ),
     ("at least one mesh", lambda: losses.volume_loss(BATCH[:0], F)),
     ("at least one edge", lambda: losses.normal_consistency_loss(V, TABLE[:0])),
     ("finite length >= 0, got -1; leave it out", lambda: losses.edge_length_loss(V, TABLE, -1)),

@@ -1,6 +1,7 @@
 """Meshes of several materials: what is drawn, and what OBJ and glTF files keep of them."""
 
 import io
+import json
 import math
 
 import numpy as np
@@ -140,3 +141,59 @@ def test_an_image_that_is_no_image(tmp_path):
     (tmp_path / "a.glb").write_bytes(square_glb(b"no image"))
     with pytest.raises(ValueError, match="the image of material 'a' cannot be read"):
         nmr.Materials.from_mesh(nmr.load_gltf(tmp_path / "a.glb"))
+
+
+def made(colors=COLORS, images=IMAGES, numbers=NUMBERS, uv=UV, uv_faces=UV_FACES):
+    return nmr.Materials(colors, images, numbers, uv, uv_faces)
+
+
+MISTAKES = {
+    "one colour for each": (lambda: made(colors=COLORS[None]), r"colors must be a tensor \[M, C\]"),
+    "one image for each": (lambda: made(images=IMAGES[:2]), "images must be a list of 3, .* got 2"),
+    "whole numbers": (lambda: made(numbers=UV), "face_material must be an integer tensor"),
+    "known materials": (
+        lambda: made(numbers=NUMBERS + 1),
+        "face_material refer to row 3, but colors",
+    ),
+    "places in the image": (lambda: made(uv=None), "images need uv and uv_faces"),
+    "channels": (
+        lambda: made(images=[UV, None, None]),
+        r"images\[0\] must be a tensor \[H, W, 3\]",
+    ),
+    "a mesh as vertices": (
+        lambda: nmr.render_rgb(nmr.mesh_files.MeshFile(*[None] * 7), CAMERA),
+        "got a mesh file; write .*colors=nmr.Materials.from_mesh",
+    ),
+    "ending": (lambda: nmr.save_obj("a.ply", VERTICES, FACES), "filename must end in .obj"),
+    "one mesh": (lambda: nmr.save_obj("a.obj", VERTICES[None], FACES), "those of one mesh"),
+    "colours": (
+        lambda: nmr.save_obj("a.obj", VERTICES, FACES, UV),
+        "nmr.VertexColors, UVTexture or",
+    ),
+    "vertices": (
+        lambda: nmr.save_obj("a.obj", VERTICES, FACES, nmr.VertexColors(COLORS)),
+        "colors must be one per vertex, 42, got 3",
+    ),
+    "faces": (lambda: nmr.save_obj("a.obj", VERTICES, FACES[:9], MATERIALS), "those of 9 faces"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    call, said = MISTAKES[name]
+    with pytest.raises((TypeError, ValueError), match=said):
+        call()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_gltf_file_refers_to_its_folder_alone(tmp_path):
+    accessor = {"componentType": 5126, "type": "VEC3", "count": 1, "bufferView": 0}
+    tree = {"asset": {"version": "2.0"}, "nodes": [{"mesh": 0}], "accessors": [accessor]}
+    tree |= {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
+    tree |= {"bufferViews": [{"byteLength": 12}]}
+    for name, kind in (("../a.bin", ValueError), ("b.bin", FileNotFoundError)):
+        tree["buffers"] = [{"byteLength": 12, "uri": name}]
+        (tmp_path / "a.gltf").write_text(json.dumps(tree))
+        with pytest.raises(kind, match="outside of its folder" if kind is ValueError else "b.bin"):
+            nmr.load_gltf(tmp_path / "a.gltf")
