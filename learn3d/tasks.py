@@ -158,7 +158,23 @@ def _executor(workers: Workers) -> Iterator[tuple[concurrent.futures.Executor, A
             f"no Dask scheduler answers at {workers.cluster} ({error}); {advice}"
         ) from None
     with client, client.get_executor(pure=False) as executor:
+        _check_versions(client)
         yield executor, Event(client=client)
+
+
+def _check_versions(client: Any) -> None:
+    """Raise OSError if the scheduler or a worker has another version of Dask: such a worker ends
+    at its first task, and the command would wait for it.
+    """
+    found = client.get_versions()
+    places = {"this process": found["client"], "the scheduler": found["scheduler"]}
+    versions = {
+        place: about["packages"]["distributed"]
+        for place, about in (places | found["workers"]).items()
+    }
+    if len(set(versions.values())) > 1:
+        named = ", ".join(f"{version} in {place}" for place, version in versions.items())
+        raise OSError(f"the versions of Dask's package distributed differ: {named[:500]}")
 
 
 def run_task(task: bytes, log: Path, folder: str, stop: Any) -> tuple[int, str]:

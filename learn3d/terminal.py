@@ -17,7 +17,9 @@ INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 #: Control characters, characters that change the direction of text, and surrogates, which cannot be encoded.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 #: What torch says in a RuntimeError if there is too little memory.
-_NO_MEMORY = re.compile("bad_alloc|DefaultCPUAllocator|out of memory|an't allocate memory")
+_NO_MEMORY = re.compile(
+    "bad_alloc|DefaultCPUAllocator|out of memory|an't allocate memory|can't start new thread"
+)
 
 
 def without_traceback(main: Callable[P, int]) -> Callable[P, int]:

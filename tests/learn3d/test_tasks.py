@@ -11,13 +11,14 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import stub_steps
 from dask_cluster import dask_cluster
 
 from learn3d import tasks
-from learn3d.tasks import Task, Workers, run_tasks
+from learn3d.tasks import Task, Workers, _check_versions, run_tasks
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 
@@ -112,11 +113,24 @@ def test_a_scheduler_that_is_missing_or_ends(tmp_path, capsys) -> None:
     wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
 
 
+def test_another_version_of_dask_is_refused() -> None:
+    def about(version: str) -> dict[str, dict[str, str]]:
+        return {"packages": {"distributed": version}}
+
+    found = {"client": about("2"), "scheduler": about("2"), "workers": {"tcp://a:1": about("2")}}
+    client = SimpleNamespace(get_versions=lambda: found)
+    _check_versions(client)
+    found["workers"]["tcp://b:1"] = about("1")
+    with pytest.raises(OSError, match=r"distributed differ: .*2 in tcp://a:1, 1 in tcp://b:1"):
+        _check_versions(client)
+
+
 def test_tasks_stop_when_their_parent_is_killed(tmp_path) -> None:
     code = f"""
 import sys
 sys.path[:0] = {sys.path!r}
 from pathlib import Path
+from types import SimpleNamespace
 import stub_steps
 from learn3d.tasks import ONE_WORKER, Task, run_tasks
 folder = Path({str(tmp_path)!r})

@@ -68,10 +68,11 @@ def test_errors_are_a_line_and_mistakes_of_ours_are_not_hidden(error: Exception,
     [
         MemoryError(),
         RuntimeError("std::bad_alloc"),
+        RuntimeError("can't start new thread"),
         RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate\n7 bytes."),
         torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"),
     ],
-    ids=range(4),
+    ids=range(5),
 )
 def test_too_little_memory_is_a_line_whoever_notices_it(error: Exception, capsys) -> None:
     @without_traceback
