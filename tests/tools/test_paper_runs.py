@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from learn3d.studio.commands import Experiment, MakeDataset
-from learn3d.studio.tables.plan import name_run, plan_runs
+from learn3d.studio.tables.plan import plan_runs
 
 SCRIPT = Path(__file__).parents[2] / "tools" / "paper_runs.sh"
 # records its arguments, and leaves the files that the script looks for
@@ -56,7 +56,7 @@ def test_every_command_plans_runs_and_the_first_ones_matter_most(tmp_path) -> No
         if words[0] == "experiment":
             request = Experiment.parse("experiment", words[1:])
             assert request.workers.jobs == 2
-            runs += [f"{name_run(run)} {run.iterations}" for run in plan_runs(request)]
+            runs += [f"{run.name} {run.config.iterations}" for run in plan_runs(request)]
     order = list(dict.fromkeys(runs))
     airplane = ("vanilla", "proposed", "without-adversarial", "without-prior")
     assert order[:4] == [f"airplane/{name}-seed0 20000" for name in airplane]
