@@ -15,6 +15,7 @@ from composing import Composer, draw_object
 from learn3d.data.masks import keep_object, mask_box
 from learn3d.pictures import save_png, tile
 from learn3d.studio.picture_to_mesh.cutting import Box, find_outline
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, CutOptions
 from learn3d.studio.shapes import CATEGORIES, make_shape
 
 SIZES = ((480, 360), (400, 400), (360, 480))  # width and height in pixels
@@ -83,7 +84,12 @@ def iou(found: np.ndarray, mask: np.ndarray) -> float:
     return float(((found > 127) & mask).sum() / ((found > 127) | mask).sum())
 
 
-def main(images: int = 40, seed: int = 2, sheet: Path | None = None) -> None:
+def main(
+    images: int = 40,
+    seed: int = 2,
+    sheet: Path | None = None,
+    options: CutOptions = DEFAULTS.cut,
+) -> None:
     """Print the share of outlines with an IoU above 0.85, found without a hand and with a box.
 
     The objects are generated, before drawn rooms and photographs out of scikit-image and
@@ -94,7 +100,9 @@ def main(images: int = 40, seed: int = 2, sheet: Path | None = None) -> None:
     kinds, values, shown = [], [], []
     for number, scene in enumerate(scenes(images, seed)):
         box = scene.box(np.random.default_rng([seed, number, 1]))
-        found = [keep_object(find_outline(scene.colors, each).mask)[0] for each in (None, box)]
+        found = [
+            keep_object(find_outline(scene.colors, each, options).mask)[0] for each in (None, box)
+        ]
         values.append([iou(mask, scene.mask) for mask in found])
         kinds.append(scene.kind)
         shown += [_draw(scene.colors, mask) for mask in found]

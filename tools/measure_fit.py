@@ -15,28 +15,29 @@ from learn3d.data.poses import wrap_deg
 from learn3d.pictures import photograph
 from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
-from learn3d.studio.picture_to_mesh.fit import fit, predict
-from learn3d.studio.picture_to_mesh.reconstruction import (
-    enlarge,
-    load_model,
-    recognize,
-    reduce_mask,
-)
-from learn3d.studio.picture_to_mesh.templates import fit_template
+from learn3d.studio.picture_to_mesh.fit import fit, frame_target, predict
+from learn3d.studio.picture_to_mesh.make import load_model, match_templates
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, Options
 
 COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,azimuth,kind,warned".split(
     ","
 )
 
 
-def main(models: Path, category: str, run: Path | None = None, images: int = 48) -> None:
+def main(
+    models: Path,
+    category: str,
+    run: Path | None = None,
+    images: int = 48,
+    options: Options = DEFAULTS,
+) -> None:
     """Print a line for each category: means over `images` pictures of the meshes in the folder models/CATEGORY.
 
     The meshes have y up and the front towards +z. Pictures have 256x256 pixels, everyday colours,
     and random ones of Kato's 24 cameras. Columns: IoU of mask and silhouette of the predicted
     shape, the fitted one and the template, their voxel IoUs (kato18), the share of pictures whose
     azimuth is right within 20 degrees, whose template has the right category, and with a warning.
-    The model (default: the package's) must have templates.
+    The model (default: the package's) must have templates. options: of the fit and the templates.
     """
     model = load_model(run)
     print(f"{'':12}", *(f"{column:>20}" for column in COLUMNS))
@@ -51,15 +52,19 @@ def main(models: Path, category: str, run: Path | None = None, images: int = 48)
             colors, lights = natural_look(vertices.numpy(), mesh.faces, rng)
             look = {"image_size": 256, "lights": lights}
             (rgb,), (alpha,) = photograph(vertices, mesh.faces, colors, pose.cameras(), **look)
-            framed = enlarge(rgb, alpha)
-            mask = reduce_mask(framed[3])
-            predicted = predict(model.method, torch.from_numpy(model.prepare(rgb, alpha)), mask)
-            guesses = fit_template(model.templates, model.categories, predicted, framed, mask)
-            template, kind = next(guesses)
+            outline = frame_target(rgb, alpha).outline()
+            image = torch.from_numpy(model.prepare(rgb, alpha))
+            predicted = predict(model.method, image, outline, options=options.fit)
+            matched = match_templates(model, predicted, (rgb, alpha), options=options)
+            template, kind, warning = matched[0]
             boxed = template._replace(
                 vertices=torch.from_numpy(fit_to_box(template.vertices.numpy()))
             )
-            shapes = (predicted.shape, fit(model.method, predicted, mask), boxed)
+            shapes = (
+                predicted.shape,
+                fit(model.method, predicted, outline, options=options.fit),
+                boxed,
+            )
             truth = KATO.voxelize(vertices[None], torch.from_numpy(mesh.faces))
             grids = [
                 KATO.voxelize(shape.vertices[None].clamp(-0.499, 0.499), shape.faces)
@@ -70,7 +75,7 @@ def main(models: Path, category: str, run: Path | None = None, images: int = 48)
             right = (
                 float(error_deg.abs()) < 20,
                 kind == name,
-                recognize(model, predicted.code[0])[1] is not None,
+                warning is not None,
             )
             rows.append((*(shape.iou for shape in shapes), *voxels, *right))
         print(f"{name:12}", *(f"{value:20.3f}" for value in np.mean(rows, axis=0)), flush=True)

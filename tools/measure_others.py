@@ -17,7 +17,7 @@ from learn3d.files.formats import RawMesh
 from learn3d.pictures import photograph
 from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
-from learn3d.studio.picture_to_mesh.reconstruction import load_model, recognize
+from learn3d.studio.picture_to_mesh.make import load_model, recognize
 from learn3d.studio.shapes import make_shape
 
 SEED = 77  # of generated objects, other ones than the model was trained on

@@ -13,10 +13,7 @@ import nmr
 from learn3d.data.conventions import mesh_to_object
 from learn3d.pictures import Surface, draw_around, photograph, save_png, tile
 from learn3d.studio.make_data.looks import PALETTES, natural_look
-from learn3d.studio.picture_to_mesh.reconstruction import (
-    load_model,
-    reconstruct_picture,
-)
+from learn3d.studio.picture_to_mesh.make import load_model, reconstruct_picture
 from learn3d.studio.picture_to_mesh.write import export_mesh
 from learn3d.studio.shapes import CATEGORIES, make_shape
 

@@ -13,9 +13,9 @@ from learn3d.pictures import save_png
 from learn3d.settings import Count
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset, make_shards
 from learn3d.studio.picture_to_mesh.export import export
+from learn3d.studio.picture_to_mesh.make import load_model
 from learn3d.studio.picture_to_mesh.reconstruction import (
     cut_out_pictures,
-    load_model,
     reconstruct_dataset,
     reconstruct_files,
 )
@@ -152,6 +152,9 @@ class Reconstruct(OnDataset):
     guesses: Count = 1
     """Largest number of different shapes for each image file, the best first; a model without
     templates makes one."""
+    smooth: bool = False
+    """Inflate the outline of each image file to a smooth shape instead, for objects of other
+    kinds."""
     model: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """Run folder (or checkpoint file) of the trained model. If not given: the small model of the
     package."""
@@ -186,14 +189,14 @@ class Reconstruct(OnDataset):
             raise ValueError("give either image files, or --data with --indices")
         if self.box is not None and (len(self.images) > 1 or self.masks):
             raise ValueError("--box is for one photograph, without --masks")
-        own = ("masks", "box", "crop", "guesses")  # options for image files
+        own = ("masks", "box", "crop", "guesses", "smooth")  # options for image files
         self.refuse(*(("--data", *own) if self.data else ("image files", "split", "indices")))
         check_target(self.output, "--output", folder=True)
         if self.data is not None:
             options = self.pick("indices") | {"refined": bool(self.refine)}
             paths = reconstruct_dataset(self.model, self.output, mesh_format=self.format, **options)
         else:
-            names = ("images", "which", "category", "masks", "crop", "box", "guesses")
+            names = ("images", "which", "category", "masks", "crop", "box", "guesses", "smooth")
             options = {name: getattr(self, name) for name in names}
             options["refined"] = self.refine is not False
             paths = reconstruct_files(self.model, self.output, mesh_format=self.format, **options)

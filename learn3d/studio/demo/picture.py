@@ -16,13 +16,9 @@ from learn3d.networks.encoders import CENTRED_SIZE
 from learn3d.pictures import photograph
 from learn3d.studio.make_data.looks import PALETTES, natural_look
 from learn3d.studio.picture_to_mesh.cutting import Box, Outline, correct, find_outline
-from learn3d.studio.picture_to_mesh.fit import HALF_FOV_DEG as FITTED_HALF_FOV_DEG
-from learn3d.studio.picture_to_mesh.reconstruction import (
-    Model,
-    Reconstruction,
-    reconstruct_guesses,
-)
-from learn3d.studio.picture_to_mesh.write import mesh_bytes
+from learn3d.studio.picture_to_mesh.fit import LENS_HALF_FOV_DEG
+from learn3d.studio.picture_to_mesh.make import Model, reconstruct_guesses
+from learn3d.studio.picture_to_mesh.write import Reconstruction, mesh_bytes
 from learn3d.studio.shapes import make_shape
 
 SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
@@ -145,7 +141,7 @@ def _camera(made: Reconstruction) -> dict[str, Any]:
         "axes": [right.tolist(), up.tolist(), [x, y, z]],
         "distance": float(made.view.log_distance.exp()),
         "shift": made.view.shift[0].tolist(),
-        "focus": 0.5 / math.tan(math.radians(FITTED_HALF_FOV_DEG)),
+        "focus": 0.5 / math.tan(math.radians(LENS_HALF_FOV_DEG)),
         "size": CENTRED_SIZE,
     }
 

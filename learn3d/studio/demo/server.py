@@ -40,7 +40,7 @@ from learn3d.studio.demo.picture import (
     make_meshes,
     unpack,
 )
-from learn3d.studio.picture_to_mesh.reconstruction import Model, load_model
+from learn3d.studio.picture_to_mesh.make import Model, load_model
 from learn3d.terminal import plain, say
 
 MOST_BYTES = 5 * SIDE**2  # largest body of a request

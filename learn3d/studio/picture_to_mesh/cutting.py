@@ -10,105 +10,168 @@ from scipy import ndimage
 from scipy.special import expit
 
 from learn3d.data.masks import keep_object
-from learn3d.studio.picture_to_mesh.outline_network import find_object
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, CutOptions
+from learn3d.studio.picture_to_mesh.outline_network import find_object, place_view
+from learn3d.terminal import note
 
-SIDE = 384  # longer side in pixels of the picture for GrabCut
-PLAIN = 0.9  # least share of the border with one colour in pictures with a plain background
-EVEN = 0.06  # largest difference from this colour, in 0 .. 1; walls and floors differ by more
-TOLERANCE = 0.12  # largest difference from the background's colour, in 0 .. 1
-JPEG_NOISE = 6  # levels by which compression changes the background near an object
-# A hole of the mask shows the background if more than this share of it has the background's colour.
-PLAIN_HOLE = 0.5
-# Its least and largest size, as a share of the object; larger holes are often white table tops.
-HOLES = 0.001, 0.4
 KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
-_ROUNDS = 3  # of GrabCut
-_AROUND = 16  # width in pixels of the region around the strokes that GrabCut sees
-_CERTAIN = 0.995  # probability from which GrabCut does not decide
-_BOXED = 0.2  # share of a box's view with which GrabCut starts if the network finds nothing there
-_SMALL_HOLE = 0.002  # smaller holes are filled, as a share of the object
-_TOUCHED = 0.03  # share of a side of the picture, from which the object touches it
-_RECTANGLE = 0.9  # share of its box that an upright rectangle fills
-_PARTS = 3  # parts that may be the object
-_PART = 0.1  # their least area, over that of the largest
-_RAGGED = 600  # squared length of an outline over its area, in pixels; a thin-legged chair has 200
-_SURE = 0.6  # least soft IoU of a mask and its probabilities
+REMBG = "isnet-general-use"  # a free network of rembg; its own default may only be used for a fee
 
 Box = tuple[int, int, int, int]  # x and y of the upper left corner, width, height, in pixels
 
 
 class Outline(NamedTuple):
-    """An object that was searched in a photograph."""
+    """An object that was searched in a picture."""
 
     mask: np.ndarray  # uint8 [H, W], 0 or 255
     how: str  # how it was found: "by ..."
-    doubt: str | None = None  # a reason to ask for a box, None if there is none
+    doubt: str | None = None  # a reason to doubt it, None if there is none
 
 
-def find_outline(colors: np.ndarray, box: Box | None = None) -> Outline:
-    """Find the object in a photograph uint8 [H, W, 3], and other things beside it.
+def find_outline(
+    colors: np.ndarray, box: Box | None = None, options: CutOptions = DEFAULTS.cut
+) -> Outline:
+    """Find the object in a picture uint8 [H, W, 3], and other things beside it.
 
-    With a box: see `cut_out`. If there is no box and the background is plain, the object is
-    everything that differs from the border's colour. Otherwise rembg finds it if it is installed,
-    and if not, see `cut_out`. Raises ValueError as `cut_out` does, or if rembg fails.
+    A thin frame around the picture is left out. With a box, or if the background is not plain,
+    rembg finds the object if it is installed, or else `cut_out` does. On a plain background the
+    object is everything that differs from the border's colour. Raises ValueError as `cut_out`
+    does.
     """
     if box is not None:
-        return Outline(cut_out(colors, box)[0], "by a network and GrabCut in the box")
-    doubt = None
-    if is_plain(colors):
-        whole = threshold_mask(colors)
-        mask = _without_frame(colors, whole)
+        check_box(box, *colors.shape[1::-1])
+        mask, how, doubt = _cut_out(colors, box, options)
+        return Outline(mask, f"{how} in the box", doubt or _box_doubt(mask, box, options))
+    inner = peel_frame(colors, options)
+    part, doubt = colors[inner], None
+    if is_plain(part, options):
+        whole = threshold_mask(part, options)
+        found = _without_frame(part, whole, options)
         how = "as all that differs from the plain background"
-        if mask is not whole:
+        if found is not whole:
             how = f"{how} but for an upright rectangle, probably a picture on the wall"
-    elif importlib.util.find_spec("rembg") is not None:
-        mask = _ask_rembg(colors)
-        how = "by rembg, which loads its weights from the internet at its first use"
     else:
-        mask, sureness = cut_out(colors)
-        how = "by a network and GrabCut"
-        doubt = "the network is not sure of its outline" if sureness < _SURE else None
-    return Outline(mask, how, find_doubt(keep_object(mask)[0]) or doubt)
+        found, how, doubt = _cut_out(part, None, options)
+    mask = np.zeros(colors.shape[:2], np.uint8)
+    mask[inner] = found
+    return Outline(mask, how, find_doubt(keep_object(mask)[0], options) or doubt)
 
 
-def find_doubt(mask: np.ndarray) -> str | None:
+def peel_frame(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> tuple[slice, slice]:
+    """Rows and columns within a frame of one colour around a plain background; all if there is no such frame."""
+    different = np.abs(colors.astype(int) - colors[0, 0]).max(2) > 255 * options.even
+    inner = []
+    for axis in (1, 0):
+        lines = np.flatnonzero(different.any(axis))
+        inner.append(slice(lines[0], lines[-1] + 1) if len(lines) else slice(None))
+    part = colors[tuple(inner)]
+    widest = options.frame * min(different.shape)
+    missing = max(
+        max(each.start or 0, side - (each.stop or side))
+        for each, side in zip(inner, different.shape, strict=True)
+    )
+    if part.shape == colors.shape or missing > widest or not is_plain(part, options):
+        return slice(None), slice(None)
+    background = np.median(part[[0, -1]].reshape(-1, 3), axis=0)
+    is_frame = np.abs(background - colors[0, 0]).max() > 255 * options.tolerance
+    object_there = (
+        0 < np.count_nonzero(threshold_mask(part, options)) < part.shape[0] * part.shape[1]
+    )
+    return tuple(inner) if is_frame and object_there else (slice(None), slice(None))
+
+
+def _cut_out(
+    colors: np.ndarray, box: Box | None, options: CutOptions
+) -> tuple[np.ndarray, str, str | None]:
+    """The mask of the main object, or of the one in a box; how it was found, and a doubt."""
+    failed = ""
+    if importlib.util.find_spec("rembg") is not None:
+        try:
+            mask = _ask_rembg(colors, box)
+            return mask, f"by rembg ({REMBG})", _disagreement(colors, mask, box, options)
+        except Exception as error:  # weights that cannot be loaded, a version without this network
+            failed = f", as rembg fails ({error})"
+    mask, sureness = cut_out(colors, box, options)
+    doubt = "the network is not sure of its outline" if sureness < options.sure else None
+    return mask, f"by a network and GrabCut{failed}", doubt if box is None else None
+
+
+def _disagreement(
+    colors: np.ndarray, mask: np.ndarray, box: Box | None, options: CutOptions
+) -> str | None:
+    """A doubt if the package's network sees another object than rembg."""
+    (left, top, right, bottom), logits = find_object(colors, box and _corners(box))
+    size = right - left, bottom - top
+    seen = np.asarray(Image.fromarray(logits).resize(size, Image.Resampling.BILINEAR)) > 0
+    found = mask[top:bottom, left:right] > 127
+    both, either = np.count_nonzero(seen & found), np.count_nonzero(seen | found)
+    return "two networks see different outlines" if both < options.agreed * either else None
+
+
+def _box_doubt(mask: np.ndarray, box: Box, options: CutOptions) -> str | None:
+    """A doubt if the object is much smaller than its box."""
+    rows, columns = (np.count_nonzero((mask > 127).any(axis)) for axis in (1, 0))
+    small = rows * columns < options.fills * box[2] * box[3]
+    return "its outline fills little of the box" if small else None
+
+
+def _corners(box: Box) -> Box:
+    x, y, width, height = box
+    return x, y, x + width, y + height
+
+
+def find_doubt(mask: np.ndarray, options: CutOptions = DEFAULTS.cut) -> str | None:
     """A reason why a mask uint8 [H, W] is probably no object, None if there is none."""
     height, width = mask.shape
-    scale = min(1.0, SIDE / max(height, width))
+    scale = min(1.0, options.side / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     inside = np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX)) > 127
     sides = sum(
-        line.mean() > _TOUCHED for line in (inside[0], inside[-1], inside[:, 0], inside[:, -1])
+        line.mean() > options.touched
+        for line in (inside[0], inside[-1], inside[:, 0], inside[:, -1])
     )
     if sides > 1:
         return f"its outline touches {sides} sides of the picture"
     length = np.count_nonzero(inside & ~ndimage.binary_erosion(inside))
-    return "its outline is ragged" if length**2 > _RAGGED * np.count_nonzero(inside) else None
+    return (
+        "its outline is ragged" if length**2 > options.ragged * np.count_nonzero(inside) else None
+    )
 
 
 @functools.lru_cache(1)
 def _rembg_session() -> Any:
     import rembg
 
-    return rembg.new_session()
+    note(
+        f"rembg cuts out photographs with {REMBG}: 180 MB, loaded from the internet if not there yet"
+    )
+    return rembg.new_session(REMBG)
 
 
-def _ask_rembg(colors: np.ndarray) -> np.ndarray:
+def _ask_rembg(colors: np.ndarray, box: Box | None) -> np.ndarray:
     import rembg
 
-    try:
-        mask = rembg.remove(Image.fromarray(colors), session=_rembg_session(), only_mask=True)
-    except OSError as error:  # the weights cannot be loaded, for example
-        raise ValueError(
-            f"rembg does not cut the object out ({error}); give a box or a mask"
-        ) from error
-    return 255 * (np.asarray(mask) > 127).astype(np.uint8)
+    height, width = colors.shape[:2]
+    left, top, right, bottom = place_view(_corners(box or (0, 0, width, height)), width, height)
+    part = Image.fromarray(colors[top:bottom, left:right])
+    found = rembg.remove(part, session=_rembg_session(), only_mask=True)
+    mask = np.zeros((height, width), np.uint8)
+    mask[top:bottom, left:right] = 255 * (np.asarray(found) > 127)
+    return mask if box is None else _within(mask, box)
 
 
-def is_plain(colors: np.ndarray) -> bool:
+def _within(mask: np.ndarray, box: Box) -> np.ndarray:
+    """The mask, 0 outside the box."""
+    left, top, right, bottom = _corners(box)
+    kept = np.zeros_like(mask)
+    kept[top:bottom, left:right] = mask[top:bottom, left:right]
+    return kept
+
+
+def is_plain(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> bool:
     """Whether the border of a picture uint8 [H, W, 3] has one colour, except for a tenth of its pixels."""
     _, of_border = _differences(colors)
-    return bool((of_border < 255 * EVEN).mean() > PLAIN)
+    return bool((of_border < 255 * options.even).mean() > options.plain)
 
 
 def _differences(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,28 +181,45 @@ def _differences(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.abs(colors - background).max(axis=-1), np.abs(border - background).max(axis=-1)
 
 
-def threshold_mask(colors: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
+def threshold_mask(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> np.ndarray:
     """Mask an object on a plain background: uint8 [H, W], 0 or 255.
 
     colors: uint8 [H, W, 3]. The background colour is the median of the border. A pixel belongs to
-    the object if a channel differs from it by more than `tolerance` (0 .. 1). Holes are filled,
+    the object if a channel differs from it by more than the tolerance. Holes are filled,
     but for some with the colour of the background, such as the gaps between the rungs of a chair.
     """
     difference, noise = _differences(colors)
-    found = difference > 255 * tolerance
+    found = difference > 255 * options.tolerance
     inside = ndimage.binary_fill_holes(found)
     holes, count = ndimage.label(inside & ~found)
     numbers = np.arange(1, count + 1)
     plain = (
-        ndimage.mean(difference <= max(JPEG_NOISE, np.percentile(noise, 90)), holes, numbers)
-        > PLAIN_HOLE
+        ndimage.mean(
+            difference <= max(options.jpeg_noise, np.percentile(noise, 90)), holes, numbers
+        )
+        > options.plain_hole
     )
     share = ndimage.sum(holes > 0, holes, numbers) / max(1, inside.sum())
-    seen_through = plain & (share > HOLES[0]) & (share < HOLES[1])
+    seen_through = plain & (share > options.holes[0]) & (share < options.holes[1])
     return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
 
 
-def cut_out(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, float]:
+def check_box(box: Box, width: int, height: int) -> None:
+    """Raise ValueError if a box exceeds or fills a picture."""
+    x, y, w, h = box
+    if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
+        raise ValueError(
+            f"the box {box} (x, y, width, height) must lie within the {width}x{height} pixels"
+        )
+    if w == width and h == height:
+        raise ValueError(
+            "the box covers the whole picture; leave some background around the object"
+        )
+
+
+def cut_out(
+    colors: np.ndarray, box: Box | None = None, options: CutOptions = DEFAULTS.cut
+) -> tuple[np.ndarray, float]:
     """The mask uint8 [H, W], 0 or 255, of the main object of a photograph or of a box, and its sureness.
 
     colors: uint8 [H, W, 3]. Pixels outside the box are background. A network finds the object
@@ -148,73 +228,67 @@ def cut_out(colors: np.ndarray, box: Box | None = None) -> tuple[np.ndarray, flo
     the box exceeds or fills the picture.
     """
     height, width = colors.shape[:2]
-    x, y, w, h = box or (0, 0, width, height)
-    if w < 2 or h < 2 or x < 0 or y < 0 or x + w > width or y + h > height:
-        raise ValueError(
-            f"the box {box} (x, y, width, height) must lie within the {width}x{height} pixels"
-        )
-    if box is not None and w == width and h == height:
-        raise ValueError(
-            "the box covers the whole picture; leave some background around the object"
-        )
-    view, logits = find_object(colors, None if box is None else (x, y, x + w, y + h))
+    if box is not None:
+        check_box(box, width, height)
+    view, logits = find_object(colors, box and _corners(box))
     if box is not None and logits.max() < 0:  # the box says that something is there
-        logits = logits - np.quantile(logits, 1 - _BOXED)
+        logits = logits - np.quantile(logits, 1 - options.boxed)
     left, top, right, bottom = view
     part = Image.fromarray(colors).crop(view)
-    part.thumbnail((SIDE, SIDE), Image.Resampling.BOX)
+    part.thumbnail((options.side, options.side), Image.Resampling.BOX)
     finer = Image.fromarray(logits).resize(part.size, Image.Resampling.BILINEAR)
     chance = expit(np.asarray(finer))
-    unsure = np.abs(chance - 0.5) < _CERTAIN - 0.5
-    inside = _only_object(_grab_cut(np.asarray(part), chance > 0.5, unsure))
+    unsure = np.abs(chance - 0.5) < options.certain - 0.5
+    inside = _only_object(_grab_cut(np.asarray(part), chance > 0.5, unsure, options), options)
     sureness = np.minimum(chance, inside).sum() / np.maximum(chance, inside).sum()
     larger = Image.fromarray(255 * inside.astype(np.uint8)).resize(
         (right - left, bottom - top), Image.Resampling.BILINEAR
     )
     mask = np.zeros((height, width), np.uint8)
     mask[top:bottom, left:right] = 255 * (np.asarray(larger) > 127)
-    if box is not None:
-        within = np.zeros_like(mask)
-        within[y : y + h, x : x + w] = 255
-        mask &= within
-    return mask, float(sureness)
+    return mask if box is None else _within(mask, box), float(sureness)
 
 
-def _parts(inside: np.ndarray) -> list[np.ndarray]:
+def _parts(inside: np.ndarray, options: CutOptions) -> list[np.ndarray]:
     """The largest connected regions of a mask, bool [H, W]: the object may be smaller than a picture on the wall."""
     regions, _ = ndimage.label(inside, np.ones((3, 3)))
     areas = np.bincount(regions.ravel())
     areas[0] = 0
-    largest = np.argsort(-areas)[:_PARTS]
-    return [regions == number for number in largest if areas[number] > _PART * areas.max()]
+    largest = np.argsort(-areas)[: options.parts]
+    return [regions == number for number in largest if areas[number] > options.part * areas.max()]
 
 
-def _only_object(inside: np.ndarray) -> np.ndarray:
+def _only_object(inside: np.ndarray, options: CutOptions) -> np.ndarray:
     """A mask, bool [H, W], without specks and without small holes."""
     filled = ndimage.binary_fill_holes(inside)
     holes, _ = ndimage.label(filled & ~inside)
-    small = np.bincount(holes.ravel()) < _SMALL_HOLE * max(1, np.count_nonzero(filled))
+    small = np.bincount(holes.ravel()) < options.small_hole * max(1, np.count_nonzero(filled))
     small[0] = False
     return keep_object(255 * (inside | small[holes]).astype(np.uint8))[0] > 127
 
 
-def _without_frame(colors: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _without_frame(colors: np.ndarray, mask: np.ndarray, options: CutOptions) -> np.ndarray:
     """The mask uint8 [H, W], or another part of it if the largest is an upright rectangle and less probable."""
-    parts = _parts(mask > 127)
-    if len(parts) < 2 or not _is_rectangle(parts[0]):
+    parts = _parts(mask > 127, options)
+    if len(parts) < 2 or not _is_rectangle(parts[0], options):
         return mask
     (left, top, right, bottom), _ = find_object(colors)
     best = max(parts, key=lambda part: np.count_nonzero(part[top:bottom, left:right]))
     return mask if best is parts[0] else 255 * best.astype(np.uint8)
 
 
-def _is_rectangle(inside: np.ndarray) -> bool:
+def _is_rectangle(inside: np.ndarray, options: CutOptions) -> bool:
     """Whether a mask, bool [H, W], fills its box."""
     extent = np.count_nonzero(inside.any(axis=0)) * np.count_nonzero(inside.any(axis=1))
-    return np.count_nonzero(inside) > _RECTANGLE * extent
+    return np.count_nonzero(inside) > options.rectangle * extent
 
 
-def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.ndarray:
+def correct(
+    colors: np.ndarray,
+    mask: np.ndarray,
+    strokes: np.ndarray,
+    options: CutOptions = DEFAULTS.cut,
+) -> np.ndarray:
     """A mask uint8 [H, W], 0 or 255, corrected by strokes uint8 [H, W].
 
     Each pixel of the strokes is KEEP (as in the mask), OBJECT, BACKGROUND or OPEN (GrabCut
@@ -225,13 +299,16 @@ def correct(colors: np.ndarray, mask: np.ndarray, strokes: np.ndarray) -> np.nda
     if unsure.any():
         rows, columns = (np.flatnonzero(unsure.any(axis=axis)) for axis in (1, 0))
         part = tuple(
-            slice(max(0, line[0] - _AROUND), line[-1] + 1 + _AROUND) for line in (rows, columns)
+            slice(max(0, line[0] - options.around), line[-1] + 1 + options.around)
+            for line in (rows, columns)
         )
-        inside[part] = _grab_cut(colors[part], inside[part], unsure[part])
+        inside[part] = _grab_cut(colors[part], inside[part], unsure[part], options)
     return 255 * inside.astype(np.uint8)
 
 
-def _grab_cut(colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray) -> np.ndarray:
+def _grab_cut(
+    colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray, options: CutOptions
+) -> np.ndarray:
     """GrabCut (Rother et al. 2004): decide again which of the pixels `unsure` are inside of an object, bool [H, W]."""
     try:
         import cv2
@@ -250,7 +327,7 @@ def _grab_cut(colors: np.ndarray, inside: np.ndarray, unsure: np.ndarray) -> np.
         labels,
         None,
         *models,
-        _ROUNDS,
+        options.rounds,
         cv2.GC_INIT_WITH_MASK,
     )
     return labels % 2 == 1

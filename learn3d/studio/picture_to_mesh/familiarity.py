@@ -15,7 +15,7 @@ from learn3d.networks.encoders import CODE_SIZE
 
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
-MOST = 0.82  # distance above which a picture is unknown if no other objects were learnt
+FAR = 0.82  # distance above which a picture is unknown if no other objects were learnt
 OTHER = 2.0  # logit of the network above which a picture is unknown
 NEAR = 0.55  # distance to a category below which a picture is of it, whatever the network says
 # names of the tensors of `KnownCodes` in a checkpoint
@@ -54,14 +54,15 @@ class KnownCodes(NamedTuple):
         """The category whose codes are nearest to a code [C]."""
         return int(self._distances(code).argmin())
 
-    def distance(self, code: Tensor) -> float:
-        """The distance of a code [C] to the nearest category."""
-        return float(self._distances(code).min())
+    def distance(self, code: Tensor, kind: int | None = None) -> float:
+        """The distance of a code [C] to the nearest category, or to the category `kind`."""
+        distances = self._distances(code)
+        return float(distances.min() if kind is None else distances[kind])
 
     def is_strange(self, code: Tensor) -> bool:
         """Whether a code [C] is of no category: by its distance to the centres, and by the network if it was learnt."""
         if self.hidden is None:
-            return float(_distance(code, self.kinds.flatten(0, 1))) > MOST
+            return float(_distance(code, self.kinds.flatten(0, 1))) > FAR
         if self.distance(code) < NEAR:
             return False
         hidden, output = self.hidden.float(), self.output.float()

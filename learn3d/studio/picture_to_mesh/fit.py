@@ -7,30 +7,28 @@ like the mask.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.optim.adam import adam
 
 import nmr
 from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.framing import frame
 from learn3d.data.poses import wrap_deg
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import CENTRED_SIZE
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, FitOptions
 
-HALF_FOV_DEG = 11.0  # half the field of view of a normal lens; the picture's own is unknown
+LENS_HALF_FOV_DEG = 11.0  # of a normal lens; the picture's own is unknown
 AZIMUTHS = 24  # azimuth cells from -180 degrees on, whose centres are tried
-ELEVATIONS_DEG = (0.0, 12.0, 25.0, 40.0, 55.0)  # elevations that are tried with each azimuth
-STARTS = 6  # best of these views, from which the camera is optimised
-STEPS = 25
-BELIEF = 0.05  # weight of the log-probability of a view, relative to the IoU
-CODE_STEPS, VERTEX_STEPS = 45, 45
-PULL = 0.1  # weight of the squared relative distance between the code and the predicted one
-SMOOTHNESS = 3e-4  # weight of the smoothness loss
-STIFFNESS = 10.0  # weight of the Laplacian loss of the vertices' displacements
+TARGET_SIZE = 256  # side of a target in pixels
 # Units of the parts of a view as variables: a step moves the outline about equally far for each.
 _SCALES = (60.0, 60.0, 1.0, 1.0)
 #: Options of torch's function `adam`. Its class Adam would import torch._dynamo, which takes a second.
@@ -43,9 +41,25 @@ _ADAM = {
     "maximize": False,
 }
 
-Meshes = Tensor | Sequence[Tensor]
+Shapes = Tensor | Sequence[Tensor]
 # called with the name of each stage and the share (0 .. 1) that is done
-Progress = Callable[[str, float], object]
+Report = Callable[[str, float], object]
+
+
+class Target(NamedTuple):
+    """A framed picture of an object, on white: what a shape should look like."""
+
+    pixels: Tensor  # float32 [4, S, S] in 0 .. 1: R, G, B and mask
+
+    def outline(self, size: int = MASK_SIZE) -> Tensor:
+        """The mask float32 [size, size]."""
+        return F.adaptive_avg_pool2d(self.pixels[3:], size)[0]
+
+
+def frame_target(colors: np.ndarray, mask: np.ndarray) -> Target:
+    """The target of a picture uint8 [H, W, 3] with its mask uint8 [H, W]."""
+    framed = frame(colors, mask, TARGET_SIZE, object_size=CENTRED_SIZE, inverted=False)
+    return Target(torch.from_numpy(framed).float() / 255)
 
 
 class View(NamedTuple):
@@ -80,37 +94,41 @@ class View(NamedTuple):
             self.elevation_deg,
             self.azimuth_deg,
             up=up,
-            half_fov_deg=HALF_FOV_DEG,
+            half_fov_deg=LENS_HALF_FOV_DEG,
         )
 
-    def place(self, vertices: Meshes) -> Meshes:
+    def place(self, vertices: Shapes) -> Shapes:
         """Vertices [N, V, 3] or N tensors [V_n, 3], moved by `shift`."""
         moves = (self.shift[:, :, None] * self.axes()[:, :2]).sum(1)
         if isinstance(vertices, Tensor):
             return vertices + moves[:, None]
         return [shape + move for shape, move in zip(vertices, moves, strict=True)]
 
-    def silhouettes(self, vertices: Meshes, faces: Meshes) -> Tensor:
-        """Silhouettes float32 [N, 64, 64] of shapes [N, V, 3], [1, V, 3] or N tensors [V_n, 3]."""
-        return nmr.render_silhouette(
-            self.place(vertices), faces, self.cameras(), image_size=MASK_SIZE
-        )
+    def silhouettes(self, vertices: Shapes, faces: Shapes, size: int = MASK_SIZE) -> Tensor:
+        """Silhouettes float32 [N, S, S] of shapes [N, V, 3], [1, V, 3] or N tensors [V_n, 3]."""
+        return nmr.render_silhouette(self.place(vertices), faces, self.cameras(), image_size=size)
 
-    def ious(self, vertices: Meshes, faces: Meshes, mask: Tensor) -> Tensor:
-        """Soft IoU [N] of a mask [64, 64] and the `silhouettes` of shapes."""
-        silhouettes = self.silhouettes(vertices, faces)
-        both = (silhouettes * mask).sum((1, 2))
-        return both / (silhouettes + mask - silhouettes * mask).sum((1, 2)).clamp(min=1e-6)
+    def ious(self, vertices: Shapes, faces: Shapes, outline: Tensor) -> Tensor:
+        """Soft IoU [N] of an outline [S, S] and the `silhouettes` of shapes."""
+        return soft_ious(self.silhouettes(vertices, faces, len(outline)), outline)
 
     def select(self, rows: Tensor) -> View:
         """The views `rows`."""
         return View(*(part[rows] for part in self))
 
 
-def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> View:
-    """Cameras in N directions, angles [N], at which vertices [V, 3] are framed like pictures."""
-    zero, tangent = torch.zeros(len(azimuth_deg)), math.tan(math.radians(HALF_FOV_DEG))
-    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(zero), 2), zero)
+def soft_ious(images: Tensor, outline: Tensor) -> Tensor:
+    """Soft IoU [N] of images [N, S, S] and an outline [S, S]."""
+    both = (images * outline).sum((1, 2))
+    return both / (images + outline - images * outline).sum((1, 2)).clamp(min=1e-6)
+
+
+def frame_view(
+    vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor, roll_deg: float = 0.0
+) -> View:
+    """Cameras in N directions, angles [N], at which vertices [V, 3] or [N, V, 3] are framed like pictures."""
+    zero, tangent = torch.zeros(len(azimuth_deg)), math.tan(math.radians(LENS_HALF_FOV_DEG))
+    view = View(azimuth_deg, elevation_deg, zero, torch.zeros(len(zero), 2), zero + roll_deg)
     points = vertices @ view.axes().transpose(1, 2)
     distance, shift = torch.full_like(zero, 1.0 / tangent), view.shift
     for _ in range(6):
@@ -124,39 +142,51 @@ def frame_view(vertices: Tensor, azimuth_deg: Tensor, elevation_deg: Tensor) -> 
 
 @torch.no_grad()
 def find_view(
-    vertices: Tensor, faces: Tensor, mask: Tensor, probabilities: Tensor | None = None
+    vertices: Tensor,
+    faces: Tensor,
+    outline: Tensor,
+    probabilities: Tensor | None = None,
+    roll_deg: float = 0.0,
+    options: FitOptions = DEFAULTS.fit,
 ) -> tuple[View, float]:
-    """Find the view in which the silhouette of a shape [V, 3], [F, 3] is most like a framed mask [64, 64].
+    """Find the view in which the silhouette of a shape [V, 3], [F, 3] is most like a framed outline [64, 64].
 
     The best of a grid of views, with azimuths more than 20 degrees apart, are optimised.
     probabilities: float32 [AZIMUTHS], the probability of each azimuth cell from -180 degrees on;
-    None if unknown. Returns the view and the soft IoU of silhouette and mask.
+    None if unknown. roll_deg: of all views. Returns the view and the soft IoU of silhouette and
+    outline.
     """
+    believed = functools.partial(belief, probabilities=probabilities, weight=options.belief)
     azimuths = -180 + (torch.arange(AZIMUTHS) + 0.5) * (360 / AZIMUTHS)
-    grid = torch.cartesian_prod(azimuths, torch.tensor(ELEVATIONS_DEG))
-    view = frame_view(vertices, grid[:, 0], grid[:, 1])
-    scores = view.ious(vertices[None], faces, mask) + belief(view.azimuth_deg, probabilities)
+    grid = torch.cartesian_prod(azimuths, torch.tensor(options.elevations_deg))
+    view = frame_view(vertices, grid[:, 0], grid[:, 1], roll_deg)
+    scores = view.ious(vertices[None], faces, outline) + believed(view.azimuth_deg)
     chosen = []
     for row in scores.argsort(descending=True).tolist():
         if all(wrap_deg(grid[row, 0] - grid[other, 0]).abs() > 20 for other in chosen):
             chosen.append(row)
-    starts = view.select(torch.tensor(chosen[:STARTS]))
+    starts = view.select(torch.tensor(chosen[: options.starts]))
     view = minimize(
-        lambda view: -view.ious(vertices[None], faces, mask).sum(), starts, STEPS, (0.03,)
+        lambda view: -view.ious(vertices[None], faces, outline).sum(),
+        starts,
+        options.steps,
+        (0.03,),
     )
-    ious = view.ious(vertices[None], faces, mask)
-    best = (ious + belief(view.azimuth_deg, probabilities)).argmax()[None]
+    ious = view.ious(vertices[None], faces, outline)
+    best = (ious + believed(view.azimuth_deg)).argmax()[None]
     return view.select(best), float(ious[best])
 
 
-def belief(azimuth_deg: Tensor, probabilities: Tensor | None) -> Tensor:
+def belief(
+    azimuth_deg: Tensor, probabilities: Tensor | None, weight: float = DEFAULTS.fit.belief
+) -> Tensor:
     """Bonus float32 [N] to the IoU at azimuths [N] for the probabilities of `find_view`, interpolated between cells."""
     if probabilities is None:
         return torch.zeros_like(azimuth_deg)
     position = (azimuth_deg + 180) / (360 / AZIMUTHS) - 0.5
     low, part = position.floor().long() % AZIMUTHS, position - position.floor()
     log = probabilities.clamp(min=1e-4).log()
-    return BELIEF * (log[low] * (1 - part) + log[(low + 1) % AZIMUTHS] * part)
+    return weight * (log[low] * (1 - part) + log[(low + 1) % AZIMUTHS] * part)
 
 
 @torch.no_grad()
@@ -178,20 +208,28 @@ def minimize(
         found = View(*changed, view.roll_deg)
         return found._replace(elevation_deg=found.elevation_deg.clamp(-30, 85))
 
-    values, rates = [*parts, *variables], [*[rates[0]] * len(parts), *rates[1:]]
-    moments = [(torch.zeros_like(value), torch.zeros_like(value)) for value in values]
+    rates = [*[rates[0]] * len(parts), *rates[1:]]
+    descend(lambda: loss(current()), [*parts, *variables], rates, steps)
+    return current()
+
+
+@torch.no_grad()
+def descend(
+    loss: Callable[[], Tensor], variables: Sequence[Tensor], rates: Sequence[float], steps: int
+) -> None:
+    """Change variables so that they minimise a loss, by Adam with learning rates that fall to a tenth in the end."""
+    moments = [(torch.zeros_like(value), torch.zeros_like(value)) for value in variables]
     for step in range(steps):
         with torch.enable_grad():
-            gradients = torch.autograd.grad(loss(current()), values)
+            gradients = torch.autograd.grad(loss(), variables)
         for value, gradient, (mean, square), rate in zip(
-            values, gradients, moments, rates, strict=True
+            variables, gradients, moments, rates, strict=True
         ):
             now = {
                 "state_steps": [torch.tensor(float(step))],
                 "lr": rate * (1 - 0.9 * step / steps),
             }
             adam([value], [gradient], [mean], [square], [], **now, **_ADAM)
-    return current()
 
 
 class Fit(NamedTuple):
@@ -212,36 +250,49 @@ class Prediction(NamedTuple):
 
 
 @torch.no_grad()
-def predict(method: MeshMethod, image: Tensor, mask: Tensor) -> Prediction:
-    """The shape of a stored image uint8 [4, S, S] and its view, from the framed mask float32 [64, 64].
+def predict(
+    method: MeshMethod,
+    image: Tensor,
+    outline: Tensor,
+    roll_deg: float = 0.0,
+    options: FitOptions = DEFAULTS.fit,
+) -> Prediction:
+    """The shape of a stored image uint8 [4, S, S] and its view, from the framed outline float32 [64, 64].
 
-    If the method predicts azimuths, they decide between views with similar outlines.
+    If the method predicts azimuths, they decide between views with similar outlines. roll_deg: the
+    camera's angle about its axis, by which the image was turned back.
     """
     code, found = method.encode(image[None]), method.view_probabilities(image[None])
     (vertices,), azimuths = method.generator(code), None if found is None else found[0]
-    shape = Fit(vertices, method.faces, *find_view(vertices, method.faces, mask, azimuths))
-    return Prediction(code, azimuths, shape)
+    view = find_view(vertices, method.faces, outline, azimuths, roll_deg, options)
+    return Prediction(code, azimuths, Fit(vertices, method.faces, *view))
 
 
 @torch.no_grad()
 def fit(
-    method: MeshMethod, predicted: Prediction, mask: Tensor, progress: Progress = lambda *_: None
+    method: MeshMethod,
+    predicted: Prediction,
+    outline: Tensor,
+    report: Report = lambda *_: None,
+    options: FitOptions = DEFAULTS.fit,
 ) -> Fit:
-    """Fit a predicted shape to its framed mask float32 [64, 64]: the code, then the vertices, each with the camera."""
-    progress("shape", 0.3)
+    """Fit a predicted shape to its framed outline float32 [64, 64]: the code, then the vertices, with the camera."""
+    report("shape", 0.3)
     start, code = predicted.code, predicted.code.clone().requires_grad_()
     size = start.square().sum().clamp(min=1e-6)
 
     def loss(view: View, vertices: Tensor) -> Tensor:
-        fitted = 1 - view.ious(vertices, method.faces, mask).sum()
-        return fitted + SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
+        fitted = 1 - view.ious(vertices, method.faces, outline).sum()
+        return fitted + options.smoothness * nmr.losses.smoothness_loss(vertices, method.edges)
 
     def code_loss(view: View) -> Tensor:
-        return loss(view, method.generator(code)) + PULL * (code - start).square().sum() / size
+        return (
+            loss(view, method.generator(code)) + options.pull * (code - start).square().sum() / size
+        )
 
     rate = 0.07 * float(start.square().mean().sqrt())
-    view = minimize(code_loss, predicted.shape.view, CODE_STEPS, (0.01, rate), code)
-    progress("surface", 0.7)
+    view = minimize(code_loss, predicted.shape.view, options.code_steps, (0.01, rate), code)
+    report("surface", 0.7)
     decoded = method.generator(code)
     move = torch.zeros_like(decoded).requires_grad_()
 
@@ -251,8 +302,10 @@ def fit(
     def vertex_loss(view: View) -> Tensor:
         vertices = moved()
         fitted = loss(view, vertices)
-        return fitted + STIFFNESS * nmr.losses.laplacian_loss(vertices - decoded, method.edges)
+        return fitted + options.stiffness * nmr.losses.laplacian_loss(
+            vertices - decoded, method.edges
+        )
 
-    view = minimize(vertex_loss, view, VERTEX_STEPS, (0.003, 0.004), move)
+    view = minimize(vertex_loss, view, options.vertex_steps, (0.003, 0.004), move)
     vertices = moved()
-    return Fit(vertices[0], method.faces, view, float(view.ious(vertices, method.faces, mask)))
+    return Fit(vertices[0], method.faces, view, float(view.ious(vertices, method.faces, outline)))

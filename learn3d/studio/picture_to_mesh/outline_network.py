@@ -22,7 +22,7 @@ NARROW = 0.6  # least ratio of a view's shorter side to its longer one, before i
 WEIGHTS = Path(__file__).with_name("outlines.safetensors")  # made by tools/train_outlines.py
 
 Place = tuple[float, float, float, float]  # left, top, right, bottom in pixels
-View = tuple[int, int, int, int]  # the same, of a part of a picture
+Part = tuple[int, int, int, int]  # the same, of a part of a picture
 
 
 class OutlineNetwork(nn.Module):
@@ -68,7 +68,7 @@ def load_outline_network() -> OutlineNetwork:
     return network.eval()
 
 
-def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[View, np.ndarray]:
+def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[Part, np.ndarray]:
     """Find the main object of a picture uint8 [H, W, 3]: a view around it, and the logits [S, S] of that view.
 
     With a box, it is the object that fills the box. Otherwise the network looks at the whole
@@ -83,7 +83,7 @@ def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[View, np.
     return view, _look(colors, view)
 
 
-def place_view(place: Place, width: float, height: float) -> View:
+def place_view(place: Place, width: float, height: float) -> Part:
     """The part of a picture that the network sees: the object's place and `MARGIN` around it, within the picture."""
     left, top, right, bottom = place
     wide, high = (1 + 2 * MARGIN) * (right - left), (1 + 2 * MARGIN) * (bottom - top)
@@ -97,7 +97,7 @@ def place_view(place: Place, width: float, height: float) -> View:
     )
 
 
-def _place(logits: np.ndarray, view: View) -> Place:
+def _place(logits: np.ndarray, view: Part) -> Place:
     """The box of the object in a view: of the regions above half of the largest probability, the one with most."""
     inside = expit(logits)
     regions, count = ndimage.label(inside > min(0.5, inside.max() / 2))
@@ -114,7 +114,7 @@ def _place(logits: np.ndarray, view: View) -> Place:
 
 
 @torch.no_grad()
-def _look(colors: np.ndarray, view: View, box: Place | None = None) -> np.ndarray:
+def _look(colors: np.ndarray, view: Part, box: Place | None = None) -> np.ndarray:
     """Logits [S, S] of a part of a picture; the object may be anywhere in it, or in the box.
 
     They are the mean over several sizes and over mirror images.

@@ -9,6 +9,7 @@ import nmr
 from learn3d.data.poses import Poses
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.method import Meshes, Method
+from learn3d.studio.picture_to_mesh.fit import descend
 
 STEPS_OF_CODES = 40
 STEPS_OF_VERTICES = 40
@@ -35,28 +36,27 @@ def refine(method: Method, images: Tensor, masks: Tensor, poses: Poses) -> Meshe
         with method.autocast():
             return method.generator(codes.to(method.device, non_blocking=True)).float().cpu()
 
-    @torch.enable_grad()
-    def descend(
+    def fitted(
         start: Tensor, shape: Callable[[Tensor], Tensor], learning_rate: float, steps: int
     ) -> Tensor:
         """The variables after some steps; `shape` computes vertices from them."""
         values = start.clone().requires_grad_()
-        optimizer = torch.optim.Adam([values], lr=learning_rate)
-        for _ in range(steps):
+
+        def loss() -> Tensor:
             vertices = shape(values)
             silhouettes = nmr.render_silhouette(
                 vertices, method.faces, poses.cameras(), image_size=masks.shape[-1]
             )
-            fit = nmr.losses.soft_iou_loss(silhouettes, masks)
-            loss = fit + WEIGHT_OF_SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
-            (values.grad,) = torch.autograd.grad(loss, values)
-            optimizer.step()
+            apart = nmr.losses.soft_iou_loss(silhouettes, masks)
+            return apart + WEIGHT_OF_SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
+
+        descend(loss, [values], [learning_rate], steps)
         return values.detach()
 
     codes = method.encode(images).cpu()
     symmetrized = method.generator.symmetrized
-    codes = descend(
+    codes = fitted(
         codes, decode, CODE_LEARNING_RATE * float(codes.square().mean().sqrt()), STEPS_OF_CODES
     )
-    vertices = descend(decode(codes), symmetrized, VERTEX_LEARNING_RATE, STEPS_OF_VERTICES)
+    vertices = fitted(decode(codes), symmetrized, VERTEX_LEARNING_RATE, STEPS_OF_VERTICES)
     return Meshes(symmetrized(vertices), method.faces)

@@ -12,7 +12,7 @@ from trimesh.smoothing import filter_taubin
 import nmr
 from learn3d.pictures import grid_surface
 
-CELLS = 128  # cells along each side of the grid of `outer_surface`
+RESOLUTION = 128  # cells along each side of the grid of `outer_surface`
 _LEVEL = 0.15  # share of a cell that is filled at the surface
 _SHRINKAGE = 0.8  # cells by which the surface is moved inwards
 
@@ -39,11 +39,11 @@ def outer_surface(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """
     low, high = vertices.amin(0), vertices.amax(0)
     centre, side = (low + high) / 2, 1.1 * float((high - low).max())
-    solid = nmr.voxelize((vertices - centre) / side + 0.5, faces, size=2 * CELLS)
+    solid = nmr.voxelize((vertices - centre) / side + 0.5, faces, size=2 * RESOLUTION)
     share = gaussian_filter(F.avg_pool3d(solid.float(), 2)[0].numpy(), 0.7)
     points, triangles, *_ = grid_surface(torch.from_numpy(share), level=_LEVEL, box=side)
     points = smooth(points, triangles, rounds=12)
-    return points + centre - _SHRINKAGE * side / CELLS * nmr.vertex_normals(
+    return points + centre - _SHRINKAGE * side / RESOLUTION * nmr.vertex_normals(
         points, triangles
     ), triangles
 

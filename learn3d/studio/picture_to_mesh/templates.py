@@ -1,4 +1,4 @@
-"""Templates: generated shapes. The one that fits a picture best is stretched and bent until its outline matches.
+"""Templates: generated shapes. The best for a picture are stretched, bent until their outlines match, and ranked.
 
 A template has the thin legs, gaps and straight edges that a deformed sphere cannot have. A model
 knows the codes of its templates; the shapes themselves are made again from their numbers.
@@ -6,8 +6,10 @@ knows the codes of its templates; the shapes themselves are made again from thei
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,38 +26,27 @@ from torch import Tensor
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
-from learn3d.data.dataset import MASK_SIZE, ViewDataset
+from learn3d.data.dataset import ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import CODE_SIZE
+from learn3d.studio.picture_to_mesh.coloring import clash
 from learn3d.studio.picture_to_mesh.fit import (
     Fit,
     Prediction,
-    Progress,
+    Target,
     View,
     belief,
+    frame_view,
     minimize,
+    soft_ious,
 )
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, MatchOptions
 from learn3d.studio.shapes import CATEGORIES, numbered_shape
 
 SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates
 COUNT = 1000  # templates of each category
 AXES = 24  # principal axes of the codes that are kept
-CANDIDATES = 128  # templates with the nearest codes, which are made and compared with the picture
-KEPT = 16  # best of them, which are stretched
-DIFFERENT = 0.5  # voxel IoU below which two shapes are different guesses
-VOXELS = 0.5  # weight of the IoU with the predicted shape; that of the outline is 1
-NEARNESS = 0.5  # weight of the codes' cosine
-EDGES = 0.15  # weight of the distance of two outlines in pixels
-FARTHEST = 6.0  # largest distance of outlines that counts
-LINES = 0.15  # weight of the distance of two pictures' lines in pixels of 64
-LINE_SIZE = 128  # side in pixels of the pictures whose lines are compared
-LINE_CONTRAST = 0.03  # change of a colour from pixel to pixel that makes a line
-LINE_BEND = 0.5  # sum of the normal's changes from pixel to pixel that makes one
-STRETCHING = 1.0  # weight of unequal factors along the axes
-STRETCH_STEPS = 30
-LATTICE = 4  # points of the lattice along each axis
-BENDING = 1.5  # weight of their moves
-BENDING_STEPS = 40
+WIDTH = 64  # pixels in which distances of outlines and lines are measured
 # maps most generated shapes to themselves, in the object frame
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
 # names of the tensors in a checkpoint
@@ -81,9 +72,9 @@ class Templates(NamedTuple):
         return self.numbers.shape == shape[:2] and self.codes.shape == shape and 0 not in shape
 
     def nearest(
-        self, code: Tensor, categories: Sequence[str], category: str | None = None
+        self, code: Tensor, categories: Sequence[str], category: str | None, count: int
     ) -> tuple[list[tuple[str, int]], Tensor]:
-        """The `CANDIDATES` shapes with codes nearest to a code [C]: category and number of each, and the cosines.
+        """The `count` shapes with codes nearest to a code [C]: category and number of each, and the cosines.
 
         category: only its shapes are taken; None for those of all categories.
         """
@@ -94,10 +85,10 @@ class Templates(NamedTuple):
             others = torch.tensor([name != category for name in categories])
             cosines[others] = -math.inf
         cosines = cosines.flatten()
-        best = cosines.topk(min(CANDIDATES, int(cosines.isfinite().sum())))
-        count = self.numbers.shape[1]
+        best = cosines.topk(min(count, int(cosines.isfinite().sum())))
+        of_kind = self.numbers.shape[1]
         names = [
-            (categories[row // count], int(self.numbers.flatten()[row]))
+            (categories[row // of_kind], int(self.numbers.flatten()[row]))
             for row in best.indices.tolist()
         ]
         return names, best.values
@@ -144,6 +135,7 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
     )
 
 
+@functools.lru_cache(512)
 def template(category: str, number: int) -> tuple[Tensor, Tensor]:
     """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame."""
     shape = numbered_shape(category, SEED, number)
@@ -155,94 +147,124 @@ def template(category: str, number: int) -> tuple[Tensor, Tensor]:
 
 
 class Candidates(NamedTuple):
-    """Shapes that a picture may show, and how likely they are."""
+    """N shapes that a picture may show."""
 
-    shapes: list[Tensor]  # N tensors float32 [V_n, 3]
-    faces: list[Tensor]  # N tensors int64 [F_n, 3]
+    shapes: list[Tensor]  # float32 [V_n, 3]
+    faces: list[Tensor]  # int64 [F_n, 3]
     kinds: list[str]  # their categories
-    prior: Tensor  # float32 [N]: likeness to the predicted shape and of the codes
+    views: View  # the picture's cameras, if it shows them
+    prior: Tensor  # float32 [N]: how likely they are, whatever their outlines
 
     def select(self, rows: Sequence[int]) -> Candidates:
         """The candidates `rows`."""
         lists = ([values[row] for row in rows] for values in self[:3])
-        return Candidates(*lists, self.prior[list(rows)])
+        return Candidates(*lists, self.views.select(torch.tensor(rows)), self.prior[list(rows)])
+
+    def voxels(self) -> Tensor:
+        """Their voxels, bool [N, 32, 32, 32]."""
+        return torch.cat([_voxels(*mesh) for mesh in zip(self.shapes, self.faces, strict=True)])
 
 
+def join(parts: Sequence[Candidates]) -> Candidates:
+    """All candidates in one."""
+    lists = (list(itertools.chain(*each)) for each in list(zip(*parts, strict=True))[:3])
+    views = View(*map(torch.cat, zip(*(part.views for part in parts), strict=True)))
+    return Candidates(*lists, views, torch.cat([part.prior for part in parts]))
+
+
+@torch.no_grad()
 def find_candidates(
     templates: Templates,
     categories: Sequence[str],
     predicted: Prediction,
+    outline: Tensor,
     category: str | None = None,
+    level: bool = False,
+    options: MatchOptions = DEFAULTS.match,
 ) -> Candidates:
-    """The templates with codes nearest to the predicted one.
+    """The templates with codes nearest to the predicted one that fit an outline [64, 64] best, stretched.
 
-    category: the only one whose templates are taken, None if unknown.
+    Three numbers rank a template: the likeness of its outline in the predicted view, its voxel IoU
+    with the predicted shape, and the cosine of the two codes. category: the only one whose
+    templates are taken, None if unknown. level: take as many templates of each category, seen at
+    elevation 0 from four sides.
     """
-    names, nearness = templates.nearest(predicted.code[0], categories, category)
+    kinds = categories if level and category is None else [category]
+    count = options.candidates // len(kinds)
+    nearest = [templates.nearest(predicted.code[0], categories, kind, count) for kind in kinds]
+    names = [name for each, _ in nearest for name in each]
+    nearness = torch.cat([cosines for _, cosines in nearest])
     shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))
-    voxels = torch.cat([_voxels(*mesh) for mesh in zip(shapes, faces, strict=True)])
+    views = predicted.shape.view.select(torch.zeros(len(names), dtype=torch.int64))
+    found = Candidates(shapes, faces, [name for name, _ in names], views, nearness)
+    voxels = found.voxels()
     alike = nmr.metrics.voxel_iou(voxels, _voxels(*predicted.shape[:2]).expand_as(voxels))
-    prior = VOXELS * alike.float() + NEARNESS * nearness
-    return Candidates(shapes, faces, [name for name, _ in names], prior)
+    prior = options.voxels * alike.float() + options.nearness * nearness
+    found = found._replace(prior=prior)
+    if level:
+        found = _seen_level(found)
+    scores = likeness(found, outline, options) + found.prior
+    best = scores.topk(min(options.kept, len(scores))).indices.tolist()
+    found = stretch(found.select(best), outline, options)
+    if level:  # an azimuth that was predicted for a doubtful picture says nothing of these cameras
+        return found
+    believed = belief(found.views.azimuth_deg, predicted.azimuths)
+    return found._replace(prior=found.prior + believed)
+
+
+def _seen_level(found: Candidates) -> Candidates:
+    """Each candidate from the front, from behind and from both sides, at elevation 0."""
+    sides = torch.tensor([-90.0, 0.0, 90.0, 180.0])
+    views = [frame_view(shape, sides, torch.zeros(4)) for shape in found.shapes]
+    rows = [row for row in range(len(views)) for _ in sides]
+    return found.select(rows)._replace(views=View(*map(torch.cat, zip(*views, strict=True))))
 
 
 @torch.no_grad()
-def fit_template(
-    templates: Templates,
-    categories: Sequence[str],
-    predicted: Prediction,
-    picture: np.ndarray,
-    mask: Tensor,
-    progress: Progress = lambda *_: None,
-    *,
-    category: str | None = None,
-    guesses: int = 1,
-) -> Iterator[tuple[Fit, str]]:
-    """Fit templates to a framed picture: up to `guesses` different ones, the best first, with categories.
+def bend_best(
+    found: Candidates, target: Target, guesses: int = 1, options: MatchOptions = DEFAULTS.match
+) -> list[tuple[Fit, str]]:
+    """Bend the best of stretched candidates, and rank them: up to `guesses` different ones, the best first, with kinds.
 
-    picture: R, G, B and mask, uint8 [4, 256, 256]. mask: the same mask, float32 [64, 64].
-    Three numbers rank a candidate: the likeness of its outline in the predicted view, its voxel
-    IoU with the predicted shape, and the cosine of the two codes. The best are stretched along
-    the axes, and the lines inside of their outlines count, too. Of these the best is bent, and
-    those whose voxel IoU with a better one is below `DIFFERENT`. category: see `find_candidates`.
+    They are ranked by outline, inner lines, and colours that differ between parts that are mirror
+    images.
     """
-    progress("shape", 0.3)
-    found = find_candidates(templates, categories, predicted, category)
-    views = predicted.shape.view.select(torch.zeros(len(found.shapes), dtype=torch.int64))
-    scores = likeness(views, found.shapes, found.faces, mask) + found.prior
-    best = scores.topk(min(KEPT, len(scores))).indices
-    found = found.select(best.tolist())
-    progress("stretch", 0.5)
-    views, shapes, cost = stretch(views.select(best), found.shapes, found.faces, mask)
-    scores = likeness(views, shapes, found.faces, mask) + belief(
-        views.azimuth_deg, predicted.azimuths
-    )
-    scores -= LINES * compare_lines(views, shapes, found.faces, picture)
-    order = (scores + found.prior - cost).argsort(descending=True).tolist()
-    progress("surface", 0.8)
-    for row in _choose_different(
-        [_voxels(shapes[row], found.faces[row]) for row in order], guesses
-    ):
-        row = order[row]
-        view, vertices = bend(
-            views.select(torch.tensor([row])), shapes[row], found.faces[row], mask
-        )
+    scores = likeness(found, target.outline(), options) + found.prior
+    scores -= options.lines * compare_lines(found, target, options)
+    rows = spread_out(scores, found.voxels(), options.bent, options.alike)
+    found = bend(found.select(rows), target.outline(), options)
+    scores = likeness(found, target.outline(options.ranked_size), options) + found.prior
+    scores -= options.lines * compare_lines(found, target, options)
+    meshes = list(zip(found.shapes, found.faces, strict=True))
+    views = [found.views.select(torch.tensor([row])) for row in range(len(meshes))]
+    clashes = [clash(*each, target, MIRROR) for each in zip(meshes, views, strict=True)]
+    scores -= options.colors * torch.tensor(clashes)
+    made = []
+    for row in spread_out(scores, found.voxels(), guesses, options.alike):
+        (vertices, faces), view = meshes[row], views[row]
         size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
         view = view._replace(
             log_distance=view.log_distance + math.log(size), shift=size * view.shift
         )
         vertices = size * vertices
-        iou = float(view.ious(vertices[None], found.faces[row], mask))
-        yield Fit(vertices, found.faces[row], view, iou), found.kinds[row]
+        iou = float(view.ious(vertices[None], faces, target.outline()))
+        made.append((Fit(vertices, faces, view, iou), found.kinds[row]))
+    return made
 
 
-def _choose_different(voxels: list[Tensor], count: int) -> list[int]:
-    """Up to `count` of N shapes. Each differs from all before it."""
-    chosen = [0]
-    for row in range(1, len(voxels)):
-        alike = [float(nmr.metrics.voxel_iou(voxels[row], voxels[other])) for other in chosen]
-        if len(chosen) < count and max(alike) < DIFFERENT:
-            chosen.append(row)
+def spread_out(scores: Tensor, voxels: Tensor, count: int, alike: float) -> list[int]:
+    """Up to `count` of N shapes with high scores [N] and different voxels [N, s, s, s], the best first.
+
+    A shape costs `alike` times its largest voxel IoU with those before it.
+    """
+    left, chosen = scores.clone(), []
+    largest = torch.zeros_like(scores)
+    for _ in range(min(count, len(scores))):
+        row = int((left - alike * largest).argmax())
+        chosen.append(row)
+        left[row] = -math.inf
+        overlap = nmr.metrics.voxel_iou(voxels, voxels[row].expand_as(voxels)).float()
+        largest = torch.maximum(largest, overlap)
     return chosen
 
 
@@ -250,114 +272,118 @@ def _voxels(vertices: Tensor, faces: Tensor) -> Tensor:
     return nmr.voxelize(0.998 * vertices[None].clamp(-0.5, 0.5) + 0.5, faces)
 
 
-def likeness(views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor) -> Tensor:
-    """How alike the outlines of N shapes and of a mask [64, 64] are: their IoU less the distance of their edges, [N].
+def likeness(found: Candidates, outline: Tensor, options: MatchOptions) -> Tensor:
+    """How alike the outlines of N shapes and of a picture [S, S] are: their IoU less the distance of their edges, [N].
 
     By the IoU alone a solid back is better than slats beside the true ones.
     """
-    outline, near_wanted = _edges(mask)
-    drawn = map(_edges, views.silhouettes(shapes, faces))
-    apart = [(near_wanted[edge].mean() + near[outline].mean()) / 2 for edge, near in drawn]
-    return views.ious(shapes, faces, mask) - EDGES * torch.tensor(apart).float()
+    drawn = found.views.silhouettes(found.shapes, found.faces, len(outline))
+    edge, near_wanted = _edges(outline, options)
+    apart = [
+        (near_wanted[own].mean() + near[edge].mean()) / 2
+        for own, near in (_edges(image, options) for image in drawn)
+    ]
+    return soft_ious(drawn, outline) - options.edges * torch.tensor(apart).float()
 
 
-def _edges(silhouette: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels on the edge of a silhouette [64, 64], and the distance of each pixel to them, at most `FARTHEST`."""
+def _edges(silhouette: Tensor, options: MatchOptions) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels on the edge of a silhouette [S, S], and the distance of each pixel to them."""
     inside = np.pad(silhouette.numpy() > 0.35, 1)
     inside[0, 0] = True  # in the margin: there is always an edge
     edge = inside & ~binary_erosion(inside)
-    return edge, _near(edge)
+    return edge, _near(edge, options)
 
 
-def compare_lines(
-    views: View, shapes: list[Tensor], faces: list[Tensor], picture: np.ndarray
-) -> Tensor:
-    """The mean distance of the lines of N shapes and of a picture uint8 [4, 256, 256], [N], in pixels of 64.
+def compare_lines(found: Candidates, target: Target, options: MatchOptions) -> Tensor:
+    """The mean distance of the lines of N shapes and of a picture, [N].
 
     They show arms, slats, drawers and corners within an outline. A shape's lines are its
     silhouette and its creases, a picture's are thin lines along which its colours change.
     """
-    lines = _lines_of(picture)
-    near_lines = _near(lines)
+    lines = _lines_of(target, options)
+    near_lines = _near(lines, options)
     normals = nmr.render_normals(
-        views.place(shapes), faces, views.cameras(), image_size=LINE_SIZE
+        found.views.place(found.shapes),
+        found.faces,
+        found.views.cameras(),
+        image_size=options.ranked_size,
     ).numpy()
     down, across = (np.abs(np.diff(normals, axis=axis, append=0)).sum(3) for axis in (1, 2))
     apart = [
-        _mean(near_lines[crease]) + _mean(_near(crease)[lines])
-        for crease in np.maximum(down, across) > LINE_BEND
+        _mean(near_lines[crease], options) + _mean(_near(crease, options)[lines], options)
+        for crease in np.maximum(down, across) > options.line_bend
     ]
-    return torch.tensor(apart) * (MASK_SIZE / LINE_SIZE)
+    return torch.tensor(apart).float()
 
 
-def _lines_of(picture: np.ndarray) -> np.ndarray:
-    """The pixels on the lines of a picture uint8 [4, S, S], bool [LINE_SIZE, LINE_SIZE]."""
-    colors = gaussian_filter(picture[:3] / np.float32(255), (0, 1.5, 1.5))
+def _lines_of(target: Target, options: MatchOptions) -> np.ndarray:
+    """The pixels on the lines of a picture, bool [S, S]."""
+    colors = gaussian_filter(target.pixels[:3].numpy(), (0, 1.5, 1.5))
     change = np.sqrt(sum(sobel(colors, axis) ** 2 for axis in (1, 2)).sum(0)) / 8
-    change = change.reshape(LINE_SIZE, len(change) // LINE_SIZE, LINE_SIZE, -1).max((1, 3))
-    return (change > LINE_CONTRAST) & (change >= 0.8 * maximum_filter(change, 3))
+    size = options.ranked_size
+    change = change.reshape(size, len(change) // size, size, -1).max((1, 3))
+    return (change > options.line_contrast) & (change >= 0.8 * maximum_filter(change, 3))
 
 
-def _near(lines: np.ndarray) -> np.ndarray:
-    """The distance of each pixel to lines, at most `FARTHEST`."""
-    return np.minimum(distance_transform_edt(~lines), FARTHEST)
+def _near(lines: np.ndarray, options: MatchOptions) -> np.ndarray:
+    """The distance of each pixel to lines [S, S], in pixels of 64, at most `farthest`."""
+    return np.minimum(WIDTH / len(lines) * distance_transform_edt(~lines), options.farthest)
 
 
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if len(values) else FARTHEST
+def _mean(values: np.ndarray, options: MatchOptions) -> float:
+    return float(values.mean()) if len(values) else options.farthest
 
 
-def stretch(
-    views: View, shapes: list[Tensor], faces: list[Tensor], mask: Tensor
-) -> tuple[View, list[Tensor], Tensor]:
-    """Stretch N shapes along the three axes until they have the outline of a mask [64, 64] in N views.
-
-    Returns the fitted views, the shapes, and how unequal the factors are, [N].
-    """
-    logs = torch.zeros(len(shapes), 3).requires_grad_()
+def stretch(found: Candidates, outline: Tensor, options: MatchOptions) -> Candidates:
+    """Stretch N shapes along the three axes until they have an outline [64, 64]; unequal factors cost."""
+    logs = torch.zeros(len(found.shapes), 3).requires_grad_()
 
     def stretched() -> list[Tensor]:
-        return [shape * factor for shape, factor in zip(shapes, logs.exp(), strict=True)]
+        return [shape * factor for shape, factor in zip(found.shapes, logs.exp(), strict=True)]
 
     def costs() -> Tensor:
-        return STRETCHING * (logs - logs.mean(1, keepdim=True)).square().sum(1)
+        return options.stretching * (logs - logs.mean(1, keepdim=True)).square().sum(1)
 
     def loss(views: View) -> Tensor:
         size = 0.1 * logs.square().sum(1)
-        return (costs() + size - views.ious(stretched(), faces, mask)).sum()
+        return (costs() + size - views.ious(stretched(), found.faces, outline)).sum()
 
-    views = minimize(loss, views, STRETCH_STEPS, (0.02, 0.02), logs)
-    return views, stretched(), costs()
+    views = minimize(loss, found.views, options.stretch_steps, (0.02, 0.02), logs)
+    return found._replace(shapes=stretched(), views=views, prior=found.prior - costs())
 
 
-def bend(view: View, vertices: Tensor, faces: Tensor, mask: Tensor) -> tuple[View, Tensor]:
-    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and the shape with them."""
-    low, high = vertices.amin(0), vertices.amax(0)
-    place = (vertices - low) / (high - low).clamp(min=1e-3)
-    x, y, z = (
-        torch.stack(
-            [
-                math.comb(LATTICE - 1, k) * t**k * (1 - t) ** (LATTICE - 1 - k)
-                for k in range(LATTICE)
-            ],
-            1,
-        )
-        for t in place.unbind(1)
-    )
-    weights = torch.einsum("va,vb,vc->vabc", x, y, z)
-    lattice = torch.zeros(LATTICE, LATTICE, LATTICE, 3).requires_grad_()
+def bend(found: Candidates, outline: Tensor, options: MatchOptions) -> Candidates:
+    """Free-form deformation (Sederberg and Parry 1986): the points of a lattice move, and N shapes with them.
+
+    Unequal moves cost.
+    """
+    count = options.lattice
+    weights = [_lattice_weights(shape, count) for shape in found.shapes]
+    lattice = torch.zeros(len(weights), count, count, count, 3).requires_grad_()
 
     def moves() -> Tensor:
-        return (lattice + lattice.flip(0) @ MIRROR) / 2
+        return (lattice + lattice.flip(1) @ MIRROR) / 2
 
-    def bent() -> Tensor:
-        return vertices + torch.einsum("vabc,abcd->vd", weights, moves())
+    def bent() -> list[Tensor]:
+        parts = zip(found.shapes, weights, moves().flatten(1, 3), strict=True)
+        return [shape + weight @ move for shape, weight, move in parts]
 
-    def loss(view: View) -> Tensor:
-        rough = (
-            sum(moves().diff(dim=axis).square().sum() for axis in range(3))
-            + 0.1 * moves().square().sum()
-        )
-        return BENDING * rough - view.ious(bent()[None], faces, mask).sum()
+    def costs() -> Tensor:
+        rough = sum(moves().diff(dim=axis).square().flatten(1).sum(1) for axis in (1, 2, 3))
+        return options.bending * (rough + 0.1 * moves().square().flatten(1).sum(1))
 
-    return minimize(loss, view, BENDING_STEPS, (0.005, 0.01), lattice), bent()
+    def loss(views: View) -> Tensor:
+        return (costs() - views.ious(bent(), found.faces, outline)).sum()
+
+    views = minimize(loss, found.views, options.bending_steps, (0.005, 0.01), lattice)
+    return found._replace(shapes=bent(), views=views, prior=found.prior - costs())
+
+
+def _lattice_weights(vertices: Tensor, count: int) -> Tensor:
+    """Bernstein polynomials [V, count^3] of vertices [V, 3] in their box: how far each moves with each point."""
+    low, high = vertices.amin(0), vertices.amax(0)
+    place = (vertices - low) / (high - low).clamp(min=1e-3)
+    powers = torch.arange(count)
+    chosen = torch.tensor([math.comb(count - 1, k) for k in range(count)])
+    along = chosen * place[..., None] ** powers * (1 - place[..., None]) ** (count - 1 - powers)
+    return torch.einsum("va,vb,vc->vabc", *along.unbind(1)).flatten(1)

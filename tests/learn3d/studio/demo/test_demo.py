@@ -17,11 +17,11 @@ from learn3d.data.conventions import mesh_to_object
 from learn3d.data.masks import keep_object
 from learn3d.pictures import Surface
 from learn3d.studio.demo import picture as pictures
-from learn3d.studio.picture_to_mesh import reconstruction
+from learn3d.studio.picture_to_mesh import make
 from learn3d.studio.picture_to_mesh.cutting import threshold_mask
 from learn3d.studio.picture_to_mesh.export import export
 from learn3d.studio.picture_to_mesh.fit import View
-from learn3d.studio.picture_to_mesh.reconstruction import load_model
+from learn3d.studio.picture_to_mesh.make import load_model
 from learn3d.studio.picture_to_mesh.write import Reconstruction
 
 
@@ -144,7 +144,7 @@ def test_pictures_full_of_holes_cost_at_most_twice_as_much() -> None:
 def test_the_packages_own_model_is_the_default(
     finished_run, tmp_path, monkeypatch, command
 ) -> None:
-    monkeypatch.setattr(reconstruction, "SMALL_MODEL", tmp_path / "small.safetensors")
+    monkeypatch.setattr(make, "SMALL_MODEL", tmp_path / "small.safetensors")
     (tmp_path / "car.png").write_bytes(pictures.example("car"))
     words = ("reconstruct", tmp_path / "car.png", "--output", tmp_path / "out")
     status, _, error = command(*words)

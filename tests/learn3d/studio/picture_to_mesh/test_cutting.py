@@ -142,7 +142,7 @@ def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -
     noise[50:70] = (200, 30, 30)
     Image.fromarray(noise).save(tmp_path / "disc.png")
     status, _, said = command(*words)
-    assert status == 1 and "no object was found" in said and "Give --box or --masks" in said
+    assert status == 0 and "warning: disc: its outline touches 2 sides of the picture" in said
     status, _, said = command(*words, "--box", 10, 45, 100, 30)
     assert status == 0, said
 
@@ -188,9 +188,14 @@ def test_doubtful_outlines(room) -> None:
 class Rembg:
     """A stand-in for the package: everything red is the object."""
 
-    failure: OSError | None = None
+    failure: Exception | None = None
+    sessions: list[str]
 
-    def new_session(self) -> Rembg:
+    def __init__(self) -> None:
+        self.sessions = []
+
+    def new_session(self, name: str) -> Rembg:
+        self.sessions.append(name)
         return self
 
     def remove(self, photo: Image.Image, session: Rembg, only_mask: bool) -> Image.Image:
@@ -203,37 +208,45 @@ class Rembg:
         )
 
 
-def test_rembg_is_used_if_installed_and_says_so(
-    room, finished_run, tmp_path: Path, monkeypatch, command
-) -> None:
-    colors, inside = room
-    rembg = Rembg()
-    rembg.__spec__ = ModuleSpec("rembg", None)
-    monkeypatch.setitem(sys.modules, "rembg", rembg)
+@pytest.fixture
+def rembg(monkeypatch) -> Rembg:
+    stand_in = Rembg()
+    stand_in.__spec__ = ModuleSpec("rembg", None)
+    monkeypatch.setitem(sys.modules, "rembg", stand_in)
     cutting._rembg_session.cache_clear()
+    yield stand_in
+    cutting._rembg_session.cache_clear()
+
+
+def test_rembg_is_used_if_installed_and_says_so(rembg, room, capsys) -> None:
+    colors, inside = room
     outline = find_outline(colors)
     assert overlap(outline.mask, inside) > 0.99 and outline.doubt is None
-    Image.fromarray(colors).save(tmp_path / "table.png")
-    words = (
-        "reconstruct",
-        tmp_path / "table.png",
-        "--run",
-        finished_run,
-        "--output",
-        tmp_path / "out",
-    )
-    status, _, said = command(*words)
-    assert (
-        status == 0
-        and "by rembg, which loads its weights from the internet at its first use" in said
-    )
-    rembg.failure = OSError("no route to host")
-    status, _, said = command(*words)
-    assert (
-        status == 1
-        and "rembg does not cut the object out (no route to host); give a box or a mask" in said
-    )
-    cutting._rembg_session.cache_clear()
+    assert outline.how == "by rembg (isnet-general-use)"
+    assert "isnet-general-use: 180 MB, loaded from the internet" in capsys.readouterr().err
+    box = find_outline(colors, (114, 136, 192, 130))
+    assert overlap(box.mask, inside) > 0.99 and box.how == "by rembg (isnet-general-use) in the box"
+    assert rembg.sessions == ["isnet-general-use"], "loaded once"
+    assert not capsys.readouterr().err, "said once"
+
+
+@pytest.mark.parametrize("failure", [OSError("no route to host"), RuntimeError("odd weights")])
+@pytest.mark.parametrize("box", [None, (114, 136, 192, 130)])
+def test_the_packages_network_does_what_rembg_cannot(rembg, room, failure, box) -> None:
+    pytest.importorskip("cv2", reason="needs the extra photos")
+    colors, inside = room
+    rembg.failure = failure
+    outline = find_outline(colors, box)
+    assert overlap(outline.mask, inside) > 0.9
+    assert f"by a network and GrabCut, as rembg fails ({failure})" in outline.how
+
+
+def test_outlines_on_which_two_networks_disagree_are_doubted(rembg, room) -> None:
+    colors, inside = room
+    other = colors.copy()
+    other[inside] = (60, 60, 60)
+    other[20:70, 30:100] = (200, 40, 40)  # rembg takes the picture on the wall
+    assert find_outline(other).doubt == "two networks see different outlines"
 
 
 def test_a_box_leaves_out_a_picture_on_the_wall_that_the_object_touches(room) -> None:

@@ -13,7 +13,7 @@ from learn3d.files.reading import DamagedFile
 from learn3d.runs import checkpoint
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
 from learn3d.studio.picture_to_mesh.export import export
-from learn3d.studio.picture_to_mesh.reconstruction import SMALL_MODEL, load_model
+from learn3d.studio.picture_to_mesh.make import SMALL_MODEL, load_model
 from learn3d.training import train
 
 

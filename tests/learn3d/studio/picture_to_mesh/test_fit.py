@@ -18,26 +18,24 @@ from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import centre
 from learn3d.pictures import photograph
 from learn3d.presets import PRESETS
-from learn3d.studio.picture_to_mesh.coloring import _nearest_clear, color_mesh
+from learn3d.studio.picture_to_mesh.coloring import _alike, color_mesh
 from learn3d.studio.picture_to_mesh.export import export
 from learn3d.studio.picture_to_mesh.familiarity import KnownCodes, known_codes, learn_others
 from learn3d.studio.picture_to_mesh.fit import (
     AZIMUTHS,
     CENTRED_SIZE,
+    Target,
     View,
     find_view,
     fit,
     frame_view,
     predict,
 )
-from learn3d.studio.picture_to_mesh.reconstruction import (
-    Reconstruction,
-    cut_out_pictures,
-    load_model,
-    recognize,
-    reconstruct_picture,
-)
-from learn3d.studio.picture_to_mesh.smoothing import joined
+from learn3d.studio.picture_to_mesh.make import load_model, recognize, reconstruct_picture
+from learn3d.studio.picture_to_mesh.options import DEFAULTS
+from learn3d.studio.picture_to_mesh.reconstruction import cut_out_pictures
+from learn3d.studio.picture_to_mesh.smoothing import divide, joined
+from learn3d.studio.picture_to_mesh.write import Reconstruction
 
 
 def arrow() -> tuple[torch.Tensor, torch.Tensor]:
@@ -134,7 +132,7 @@ def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_m
     rgb, alpha = photograph(
         view.place(vertices[None])[0], faces, paint, view.cameras(), image_size=256, lights=lights
     )
-    picture = np.concatenate([rgb[0].transpose(2, 0, 1), alpha])
+    picture = Target(torch.from_numpy(np.concatenate([rgb[0].transpose(2, 0, 1), alpha])) / 255)
     reflection = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
     surface = color_mesh((vertices, faces), view, picture, reflection)
     _, y, z = surface.vertices.T
@@ -156,16 +154,41 @@ def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
     places = torch.tensor([(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)])
     vertices = (box + places[:, None]).flatten(0, 1)
     faces = torch.cat([faces, faces + 8, faces + 16])
-    clear = np.arange(24) % 24 // 8 != 1
-    nearest = _nearest_clear(vertices.numpy(), clear, joined(faces.numpy(), 24))
-    assert nearest.tolist() == [*range(8), *range(8), *range(16, 24)]
+    clear = np.arange(24) // 8 != 1
+    colors = np.arange(24)[:, None] // 8 + np.zeros((1, 3))
+    normals = np.zeros((24, 3))
+    neighbours = joined(faces.numpy(), 24)
+    alike = _alike(colors, clear, vertices.numpy(), normals, neighbours, DEFAULTS.color)
+    assert alike[:, 0].tolist() == [0] * 16 + [2] * 8, (
+        "the leg has the other leg's, not the near part's"
+    )
+
+
+def test_hidden_sides_have_the_colours_at_their_height() -> None:
+    """A house, half glass above half paint, that is seen from one side only."""
+    box = trimesh.creation.box((0.8, 0.6, 0.4))
+    vertices, faces = divide(torch.tensor(box.vertices).float(), torch.tensor(box.faces), 0.04)
+    high = vertices[faces].mean(1)[:, 1:2] > 0
+    paint = np.where(high, [[0.1, 0.2, 0.8]], [[0.8, 0.2, 0.1]])
+    view = frame_view(vertices[None], torch.tensor([0.0]), torch.tensor([5.0]))
+    placed, look = (
+        view.place(vertices[None])[0],
+        {"image_size": 256, "lights": nmr.Lights(1.0, 0.0)},
+    )
+    rgb, alpha = photograph(placed, faces, paint, view.cameras(), **look)
+    target = Target(torch.from_numpy(np.concatenate([rgb[0].transpose(2, 0, 1), alpha])) / 255)
+    surface = color_mesh((vertices, faces), view, target)
+    behind = (surface.vertices[:, 2] > 0.19) & (surface.vertices[:, 0].abs() < 0.3)
+    for side, wanted in ((surface.vertices[:, 1] > 0.1, 2), (surface.vertices[:, 1] < -0.1, 0)):
+        found = surface.colors[behind & side].mean(0)
+        assert found.argmax() == wanted and found[wanted] > 2 * found[2 - wanted], found
 
 
 def test_a_picture_without_a_seen_vertex_still_has_colours() -> None:
     vertices, faces = arrow()
     level = torch.zeros(1)
     view = View(level, level, torch.tensor([3.0]), torch.zeros(1, 2), level)
-    surface = color_mesh((vertices, faces), view, np.zeros((4, 64, 64), np.uint8))
+    surface = color_mesh((vertices, faces), view, Target(torch.zeros(4, 64, 64)))
     assert surface.colors.isfinite().all()
 
 
@@ -198,9 +221,7 @@ def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> No
     assert all(model.known_codes.is_strange(code) for code in -codes)
     assert recognize(model, codes[0]) == (None, None), "it knows only one category"
     other = model._replace(known_codes=KnownCodes(-model.known_codes.kinds))
-    assert recognize(other, codes[0])[1].startswith(
-        "this looks like nothing that the model was trained on (airplane)"
-    )
+    assert recognize(other, codes[0])[1].startswith("this may be none of airplane: tell its kind")
 
 
 def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, tmp_path) -> None:

@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
 
 from learn3d.pictures import draw_around
-from learn3d.studio.picture_to_mesh.inflation import CELLS, DEPTH, inflate
-from learn3d.studio.picture_to_mesh.reconstruction import (
-    enlarge,
-    fill_drawing,
-    load_model,
-    reconstruct_picture,
-    reduce_mask,
-)
+from learn3d.studio.picture_to_mesh.fit import Target, frame_target
+from learn3d.studio.picture_to_mesh.inflation import DEPTH, GRID, inflate
+from learn3d.studio.picture_to_mesh.make import load_model, reconstruct_picture
+from learn3d.studio.picture_to_mesh.read import fill_drawing
 
 SIZE = 200
 Y, X = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
@@ -30,9 +25,9 @@ MASKS = {
 }
 
 
-def framed(mask: np.ndarray) -> np.ndarray:
+def framed(mask: np.ndarray) -> Target:
     colors = np.stack([128 + X, 128 + Y, 0 * X + 90], -1).astype(np.uint8)
-    return enlarge(colors, 255 * mask.astype(np.uint8))
+    return frame_target(colors, 255 * mask.astype(np.uint8))
 
 
 @pytest.mark.parametrize("name", MASKS)
@@ -42,9 +37,9 @@ def test_the_shape_is_closed_symmetric_and_has_the_outline(name) -> None:
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
     assert mesh.is_watertight and mesh.volume > 0, "closed, normals outwards"
     mirrored = surface.vertices * torch.tensor([1, 1, -1])
-    assert torch.cdist(mirrored, surface.vertices).min(1).values.max() < 1 / CELLS
+    assert torch.cdist(mirrored, surface.vertices).min(1).values.max() < 1 / GRID
     wanted = {"line": 0.2, "dots": 0.2}.get(name, 0.9)
-    assert float(view.ious(surface.vertices[None], surface.faces, reduce_mask(picture[3]))) > wanted
+    assert float(view.ious(surface.vertices[None], surface.faces, picture.outline())) > wanted
 
 
 def test_a_disc_becomes_an_ellipsoid_with_the_picture_on_both_sides() -> None:
@@ -87,9 +82,9 @@ def test_drawings_of_black_lines_are_filled() -> None:
     assert fill_drawing(ink, half)[1] is half, "an open line"
 
 
-def test_pictures_of_unknown_kinds_are_inflated(tmp_path) -> None:
+def test_a_smooth_shape_is_made_if_it_is_asked_for() -> None:
     mask = 255 * MASKS["mug"].astype(np.uint8)
-    made = reconstruct_picture(load_model(None), np.full((SIZE, SIZE, 3), 180, np.uint8), mask)
-    assert made.kind is None and "looks like nothing that the model was trained on" in made.warning
-    assert made.silhouette_iou > 0.9 and made.azimuth_deg == 0
-    Image.fromarray(draw_around(made.surface, [0], image_size=64)[0]).save(tmp_path / "mug.png")
+    picture = np.full((SIZE, SIZE, 3), 180, np.uint8), mask
+    made = reconstruct_picture(load_model(None), *picture, smooth=True)
+    assert made.kind is made.warning is None and made.silhouette_iou > 0.9
+    assert made.azimuth_deg == 0 and made.view is not None

@@ -1,0 +1,295 @@
+"""Makes a mesh of a picture with an outline: finds the camera, bends templates, ranks them, colours the best."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from learn3d.config import TrainConfig
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.framing import MEAN_OBJECT_SIZE
+from learn3d.data.poses import Poses
+from learn3d.files.reading import DamagedFile
+from learn3d.methods.mesh_method import MeshMethod
+from learn3d.methods.method import Method
+from learn3d.networks.encoders import centre
+from learn3d.pictures import Surface
+from learn3d.runs import checkpoint
+from learn3d.settings import split_names
+from learn3d.studio.picture_to_mesh.coloring import color_mesh
+from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
+from learn3d.studio.picture_to_mesh.fit import (
+    Fit,
+    Prediction,
+    Report,
+    find_view,
+    fit,
+    frame_target,
+    predict,
+)
+from learn3d.studio.picture_to_mesh.inflation import inflate
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, Options
+from learn3d.studio.picture_to_mesh.read import fill_drawing, prepare_image
+from learn3d.studio.picture_to_mesh.refinement import refine
+from learn3d.studio.picture_to_mesh.smoothing import outer_surface
+from learn3d.studio.picture_to_mesh.templates import (
+    MIRROR,
+    TEMPLATES,
+    Candidates,
+    Templates,
+    bend_best,
+    find_candidates,
+    join,
+)
+from learn3d.studio.picture_to_mesh.write import Reconstruction
+
+SMALL_MODEL = Path(__file__).with_name("small.safetensors")  # the model in the package
+
+
+class Model(NamedTuple):
+    """A trained model, ready to turn pictures into meshes."""
+
+    method: Method
+    config: TrainConfig
+    object_size: float  # `ViewDataset.mean_object_size` of its training images
+    known_codes: KnownCodes | None = None  # None if its file has none
+    templates: Templates | None = None  # None if its file has none
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The categories that it was trained on."""
+        return split_names(self.config.category)
+
+    def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
+        """Call `prepare_image` with the image size, object size and layout of these networks."""
+        size, layout = self.method.image_size, self.config.layout
+        return prepare_image(
+            colors, mask, crop=crop, object_size=self.object_size, size=size, layout=layout
+        )
+
+
+def load_model(run: Path | None, which: str = "last") -> Model:
+    """The model of a run folder or checkpoint file, or the model in the package if `run` is None."""
+    path = checkpoint.find(run or SMALL_MODEL, which)
+    method, config, metadata = checkpoint.load_method(path)
+    tensors = checkpoint.load(path)[0]
+    stored = ((KnownCodes, KNOWN_CODES), (Templates, TEMPLATES))
+    parts = [
+        kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored
+    ]
+    categories = len(split_names(config.category))
+    if not all(part is None or part.fits(categories) for part in parts):
+        raise DamagedFile(path, "has known codes or templates of other shapes than its categories")
+    return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, *parts)
+
+
+@torch.no_grad()
+def reconstruct(
+    method: Method,
+    images: np.ndarray | Tensor,
+    masks: Tensor | None = None,
+    poses: Poses | None = None,
+) -> list[Surface]:
+    """Shapes, in the object frame, of stored images uint8 [B,4,S,S], for example from `prepare_image`.
+
+    With masks float32 [B,64,64] and poses, the shapes are fitted to them; ValueError if the
+    method predicts voxels.
+    """
+    images = torch.as_tensor(images)
+    if poses is not None:
+        return refine(method, images, masks, poses).surfaces()
+    return method.decode(method.encode(images)).surfaces()
+
+
+def reconstruct_picture(
+    model: Model, colors: np.ndarray, mask: np.ndarray, **options: object
+) -> Reconstruction:
+    """The first of `reconstruct_guesses`, with its options."""
+    return next(reconstruct_guesses(model, colors, mask, **options))
+
+
+@torch.no_grad()
+def reconstruct_guesses(
+    model: Model,
+    colors: np.ndarray,
+    mask: np.ndarray,
+    *,
+    crop: bool = True,
+    refined: bool = True,
+    category: str | None = None,
+    smooth: bool = False,
+    guesses: int = 1,
+    progress: Report = lambda *_: None,
+    options: Options = DEFAULTS,
+) -> Iterator[Reconstruction]:
+    """Reconstruct a picture uint8 [H, W, 3] with its mask uint8 [H, W]; its camera is unknown.
+
+    refined: fit camera, shape and colours to the picture; methods with voxels only predict.
+    category: the object's, None if unknown. With a known one there is no warning. smooth: inflate
+    the outline instead, for objects of other kinds. guesses: largest number of different shapes,
+    the best first; a model without templates makes one.
+    progress: called with the name of each stage and the share that is done.
+
+    Raises ValueError if the model was not trained on the category, or if guesses is below 1.
+    """
+    if guesses < 1:
+        raise ValueError(f"guesses must be at least 1, got {guesses}")
+    if category is not None:
+        check_category(model, category)
+    colors, mask = fill_drawing(colors, mask)
+    method, stored = model.method, model.prepare(colors, mask, crop=crop)
+    image, target = torch.from_numpy(stored), frame_target(colors, mask)
+    outline = target.outline()
+    if smooth:
+        surface, view = inflate(target)
+        iou = float(view.ious(surface.vertices[None], surface.faces, outline))
+        yield Reconstruction(surface, stored, 0.0, iou, view=view)
+        return
+    if not refined or not isinstance(method, MeshMethod):
+        (surface,) = reconstruct(method, image[None])
+        found = method.view_probabilities(image[None])
+        azimuth_deg = input_azimuth_deg(surface, stored[3], None if found is None else found[0])
+        yield Reconstruction(surface, stored, azimuth_deg)
+        return
+    progress("camera", 0.0)
+    predicted = predict(method, image, outline, options=options.fit)
+    kind, warning = (category, None) if category else recognize(model, predicted.code[0])
+    if model.templates is None:
+        fitted = fit(method, predicted, outline, progress, options.fit)
+        mesh = outer_surface(fitted.vertices, fitted.faces)
+        progress("colours", 0.9)
+        mirror = method.generator.reflection
+        surface = color_mesh(mesh, fitted.view, target, mirror, options=options.color)
+        azimuth_deg = float(fitted.view.azimuth_deg)
+        yield Reconstruction(surface, stored, azimuth_deg, fitted.iou, kind, warning, fitted.view)
+        return
+    photo = colors, mask
+    matched = match_templates(model, predicted, photo, category, guesses, progress, options)
+    for fitted, kind, warning in matched:
+        progress("colours", 0.9)
+        mesh, view = (fitted.vertices, fitted.faces), fitted.view
+        surface = color_mesh(mesh, view, target, MIRROR, fine=True, options=options.color)
+        azimuth_deg = float(view.azimuth_deg)
+        yield Reconstruction(surface, stored, azimuth_deg, fitted.iou, kind, warning, view)
+
+
+@torch.no_grad()
+def match_templates(
+    model: Model,
+    predicted: Prediction,
+    photo: tuple[np.ndarray, np.ndarray],
+    category: str | None = None,
+    guesses: int = 1,
+    progress: Report = lambda *_: None,
+    options: Options = DEFAULTS,
+) -> list[tuple[Fit, str, str | None]]:
+    """Up to `guesses` bent templates, the best first, each with its category and a warning or None.
+
+    photo: colours uint8 [H, W, 3] and mask uint8 [H, W], for which the model has `predicted` code
+    and view. If the best stretched template fits badly, or the picture is like none that the model
+    knows, level cameras, all categories, and cameras that are turned about their axes are tried.
+    """
+    progress("shape", 0.3)
+    target = frame_target(*photo)
+    outline = target.outline()
+    warnings = {0.0: None if category else recognize(model, predicted.code[0])[1]}  # by the roll
+
+    def find(predicted: Prediction, level: bool = False, few: bool = False) -> Candidates:
+        match = options.match
+        if few:
+            halves = {"candidates": match.candidates // 2, "kept": match.kept // 2}
+            match = dataclasses.replace(match, **halves)
+        known = model.templates, model.categories
+        return find_candidates(*known, predicted, outline, category, level, match)
+
+    found = find(predicted)
+    best = float(found.views.ious(found.shapes, found.faces, outline).max())
+    if warnings[0.0] or best < options.match.poor:
+        progress("camera", 0.5)
+        more = [found, find(predicted, level=True, few=True)]
+        for roll_deg in _familiar_rolls(model, predicted, photo, category, options):
+            turned = torch.from_numpy(model.prepare(*_turn(*photo, roll_deg)))
+            rolled = predict(model.method, turned, outline, roll_deg, options.fit)
+            warnings[roll_deg] = None if category else recognize(model, rolled.code[0])[1]
+            tried = find(rolled, few=True)
+            more.append(tried._replace(prior=tried.prior - options.match.rolled))
+        found = join(more)
+        found = found._replace(prior=options.match.doubted * found.prior)
+    progress("surface", 0.7)
+    bent = bend_best(found, target, guesses, options.match)
+    return [(fitted, kind, warnings[float(fitted.view.roll_deg)]) for fitted, kind in bent]
+
+
+def _familiar_rolls(
+    model: Model,
+    predicted: Prediction,
+    photo: tuple[np.ndarray, np.ndarray],
+    category: str | None,
+    options: Options,
+) -> list[float]:
+    """The angles of the camera about its axis at which a picture is more familiar than upright, the best first."""
+    if model.known_codes is None:
+        return []
+    rolls = options.match.rolls_deg
+    turned = [model.prepare(*_turn(*photo, roll)) for roll in rolls]
+    codes = model.method.encode(torch.from_numpy(np.stack(turned)))
+    kind = None if category is None else model.categories.index(category)
+    upright, *others = (
+        model.known_codes.distance(code, kind) for code in (predicted.code[0], *codes)
+    )
+    order = sorted((distance, roll) for distance, roll in zip(others, rolls, strict=True))
+    return [roll for distance, roll in order if distance < upright][: options.match.retries]
+
+
+def _turn(colors: np.ndarray, mask: np.ndarray, roll_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """A picture and its mask, turned clockwise: upright again if the camera was turned by this angle."""
+    image = Image.fromarray(np.dstack([colors, mask]))
+    turned = np.asarray(image.rotate(-roll_deg, Image.Resampling.BILINEAR, expand=True))
+    return np.ascontiguousarray(turned[..., :3]), turned[..., 3]
+
+
+def check_category(model: Model, category: str) -> None:
+    """Raise ValueError if the model was not trained on a category."""
+    if category not in model.categories:
+        known = ", ".join(model.categories)
+        raise ValueError(
+            f"the model was trained on {known}, not on {category!r}; give one of its categories, or none"
+        )
+
+
+def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
+    """Predicted category of a picture's code [C], and a warning if it is that of an unknown kind of object.
+
+    The category is None if the model has only one.
+    """
+    if model.known_codes is None:
+        return None, None
+    kinds = model.categories
+    kind = kinds[model.known_codes.nearest_kind(code)] if len(kinds) > 1 else None
+    if not model.known_codes.is_strange(code):
+        return kind, None
+    known = ", ".join(kinds)
+    return kind, f"this may be none of {known}: tell its kind, or ask for a smooth shape instead"
+
+
+@torch.no_grad()
+def input_azimuth_deg(
+    surface: Surface, mask: np.ndarray, probabilities: Tensor | None = None
+) -> float:
+    """Azimuth, in degrees, from which the shape's silhouette fits the mask uint8 [S,S] of its image best.
+
+    A guess, since elevation and distance are unknown; 0 for an empty shape. probabilities: see
+    `find_view`.
+    """
+    if not len(surface.faces):
+        return 0.0
+    size = MASK_SIZE, MASK_SIZE
+    share = F.adaptive_avg_pool2d(torch.from_numpy(mask)[None, None].float() / 255, size)
+    target = centre(share)[0, 0]
+    return float(find_view(surface.vertices, surface.faces, target, probabilities)[0].azimuth_deg)

@@ -1,0 +1,139 @@
+"""Reads pictures: from a file to colours and the outline of an object, framed for a network."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from learn3d.data.crops import Crops
+from learn3d.data.dataset import MASK_SIZE
+from learn3d.data.framing import MEAN_OBJECT_SIZE, frame, read_photo
+from learn3d.data.layouts import LAYOUTS, Layout
+from learn3d.data.masks import check_mask, keep_object, mask_box
+from learn3d.studio.picture_to_mesh.cutting import Box, check_box, find_outline
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, CutOptions
+from learn3d.terminal import note
+
+_INK = 16  # brightness up to which a pixel is black
+_BLACK = 0.7  # share of a drawing's pixels that are black
+_GAP = 0.015  # half of the widest gap in a line, as a share of the drawing
+_LINES = 0.75  # share of a drawing up to which it consists of lines
+_MIN_OBJECT_SIZE = 0.05  # smallest possible object size
+
+
+class Photo(NamedTuple):
+    """A picture with the outline of its object."""
+
+    colors: np.ndarray  # uint8 [H, W, 3]
+    mask: np.ndarray  # uint8 [H, W], above 127: object
+    doubt: str | None = None  # a reason to doubt the outline
+
+
+def read_picture(
+    path: Path,
+    mask_path: Path | None = None,
+    box: Box | None = None,
+    options: CutOptions = DEFAULTS.cut,
+) -> Photo:
+    """Read a picture. Its mask comes from `mask_path`, from its transparency, or is found in the picture or the box.
+
+    Says in a line how an object was found and what was left out. Raises ValueError if there is no
+    object.
+    """
+    colors, mask = read_photo(path, mask_path, optional=True)
+    if max(colors.shape[:2]) < MASK_SIZE:
+        size = f"{colors.shape[1]}x{colors.shape[0]} pixels"
+        note(
+            f"note: {path} has {size}, fewer than the {MASK_SIZE} of training; expect a rough shape"
+        )
+    searched = mask is None or box is not None  # a box counts even if the file has transparency
+    doubt = None
+    if searched:
+        colors, box = _reduce(colors, box, options.searched_side)
+        mask, how, doubt = find_outline(colors, box, options)
+        wrong = "if the outline in the strip of views is wrong, give --box or --masks"
+        note(f"note: {path}: the object was searched, {how}; {wrong}")
+    try:
+        check_mask(mask, cropped=not searched)
+    except ValueError as error:
+        advice = "Give --box or --masks, or cut the object out (transparency)"
+        missed = f"no object was found in this photograph. {advice}"
+        raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
+    mask, left_out = keep_object(mask)
+    if left_out:
+        note(f"note: {path}: {left_out}")
+    return Photo(colors, mask, doubt)
+
+
+def _reduce(colors: np.ndarray, box: Box | None, side: int) -> tuple[np.ndarray, Box | None]:
+    """A picture and a box in it, reduced until its longer side has at most `side` pixels."""
+    height, width = colors.shape[:2]
+    if box is not None:
+        check_box(box, width, height)
+    scale = min(1.0, side / max(height, width))
+    if scale == 1:
+        return colors, box
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    colors = np.asarray(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
+    if box is not None:
+        left, top = (int(scale * each) for each in box[:2])
+        wide, high = (max(2, round(scale * each)) for each in box[2:])
+        box = left, top, min(wide, size[0] - left), min(high, size[1] - top)
+    return colors, box
+
+
+def prepare_image(
+    colors: np.ndarray,
+    mask: np.ndarray,
+    *,
+    crop: bool = True,
+    object_size: float = MEAN_OBJECT_SIZE,
+    size: int = 64,
+    layout: Layout = "kato",
+) -> np.ndarray:
+    """Turn colours uint8 [H,W,3] and a mask uint8 [H,W] into a stored image uint8 [4,size,size] of a layout.
+
+    The background becomes white. crop: centre the object in a square, so that its larger side
+    takes `object_size` of it; without, the picture must be framed like that already and is only
+    padded to a square and scaled. Colours are inverted if the layout inverts them. Layouts with
+    stretched images (Pascal3D+) keep the background, and `crop` cuts out the mask's box as their
+    reader does (`learn3d.data.crops`).
+
+    Raises ValueError if the mask has no pixel above half.
+    """
+    if LAYOUTS[layout].stretched:
+        height, width = mask.shape
+        left, top, right, bottom = mask_box(mask) if crop else (0, 0, width, height)
+        box = np.array([[left, top, right - left, bottom - top]])
+        planes = (colors, np.repeat(mask[..., None], 3, axis=2))
+        cut, cut_mask = (
+            Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes
+        )
+        return np.concatenate([cut, cut_mask[:1]])
+    object_size = max(object_size, _MIN_OBJECT_SIZE) if crop else None
+    return frame(colors, mask, size, object_size=object_size, inverted=LAYOUTS[layout].inverted)
+
+
+def fill_drawing(colors: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Add the white areas between the black lines of a drawing to its mask.
+
+    colors, mask: uint8 [H, W, 3] and [H, W]. Lines may have small gaps. Pictures other than
+    drawings of lines stay as they are. Returns colours on white, and the mask.
+    """
+    inside = mask > 127
+    if not inside.any() or np.quantile(colors[inside].mean(1), _BLACK) > _INK:
+        return colors, mask
+    left, top, right, bottom = mask_box(mask)
+    gap = math.ceil(_GAP * max(right - left, bottom - top))
+    padded = np.pad(inside, gap + 1)
+    near = ndimage.distance_transform_edt(~padded) <= gap
+    closed = padded | (ndimage.distance_transform_edt(near) > gap)
+    solid = ndimage.binary_fill_holes(closed)[gap + 1 : -gap - 1, gap + 1 : -gap - 1]
+    if inside.sum() > _LINES * solid.sum():
+        return colors, mask
+    alpha = mask[..., None] / 255
+    on_white = (alpha * colors + 255 * (1 - alpha)).round().astype(np.uint8)
+    return on_white, np.where(solid, np.uint8(255), mask)
