@@ -203,8 +203,8 @@ def match_templates(
     def find(predicted: Prediction, level: bool = False, few: bool = False) -> Candidates:
         match = options.match
         if few:
-            halves = {"candidates": match.candidates // 2, "kept": match.kept // 2}
-            match = dataclasses.replace(match, **halves)
+            fewer = {"candidates": match.candidates // 3, "kept": match.kept // 2}
+            match = dataclasses.replace(match, **fewer)
         known = model.templates, model.categories
         return find_candidates(*known, predicted, outline, category, level, match)
 

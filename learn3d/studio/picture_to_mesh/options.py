@@ -108,8 +108,8 @@ class MatchOptions:
         135.0,
     )
     """Angles of the picture in its plane that are tried then."""
-    retries: int = 2
-    """Most familiar of these angles, whose templates are compared, too."""
+    retries: int = 1
+    """How many of the most familiar angles are tried. Each takes a third of the candidates."""
     doubted: float = 0.5
     """Factor of the voxels' and the codes' weights then."""
     rolled: float = 0.25

@@ -142,7 +142,7 @@ def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -
     noise[50:70] = (200, 30, 30)
     Image.fromarray(noise).save(tmp_path / "disc.png")
     status, _, said = command(*words)
-    assert status == 0 and "warning: disc: its outline touches 2 sides of the picture" in said
+    assert status == 1 and "no object was found" in said and "Give --box or --masks" in said
     status, _, said = command(*words, "--box", 10, 45, 100, 30)
     assert status == 0, said
 

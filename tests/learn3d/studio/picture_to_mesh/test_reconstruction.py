@@ -60,6 +60,19 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
         assert said in capsys.readouterr().err
 
 
+def test_a_doubtful_outline_is_said_beside_the_mesh(
+    finished_run, tmp_path, short_turntables, capsys
+) -> None:
+    colors = np.full((100, 120, 3), 200, np.uint8)
+    colors[40:60] = (150, 30, 30)  # from side to side
+    Image.fromarray(colors).save(tmp_path / "band.png")
+    paths = reconstruct_files(finished_run, tmp_path / "out", [tmp_path / "band.png"])
+    said = capsys.readouterr().err
+    assert (
+        paths[0].is_file() and "warning: band: its outline touches 2 sides of the picture" in said
+    )
+
+
 @pytest.mark.parametrize("edge", [0, 2, 9])
 @pytest.mark.parametrize("top", [0, 14])
 def test_a_frame_around_a_picture_is_no_object(edge: int, top: int, tmp_path) -> None:
