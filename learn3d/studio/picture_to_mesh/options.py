@@ -108,7 +108,7 @@ class MatchOptions:
         135.0,
     )
     """Angles of the picture in its plane that are tried then."""
-    retries: int = 1
+    retries: int = 2
     """How many of the most familiar angles are tried. Each takes a third of the candidates."""
     doubted: float = 0.5
     """Factor of the voxels' and the codes' weights then."""
