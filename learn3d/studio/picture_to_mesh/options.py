@@ -95,18 +95,7 @@ class MatchOptions:
     """Best of these, which are bent and then ranked."""
     poor: float = 0.86
     """IoU of the best stretched template below which other cameras are tried."""
-    rolls_deg: tuple[float, ...] = (
-        -135.0,
-        -90.0,
-        -60.0,
-        -45.0,
-        -30.0,
-        30.0,
-        45.0,
-        60.0,
-        90.0,
-        135.0,
-    )
+    rolls_deg: tuple[float, ...] = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
     """Angles of the picture in its plane that are tried then."""
     retries: int = 2
     """How many of the most familiar angles are tried. Each takes a third of the candidates."""

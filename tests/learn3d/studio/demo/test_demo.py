@@ -113,7 +113,8 @@ def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
         assert np.allclose(2 * near * (points[:, axis] + camera["shift"][axis]), wanted, atol=1e-4)
 
 
-def test_pictures_full_of_holes_cost_at_most_twice_as_much() -> None:
+def test_pictures_full_of_holes_cost_at_most_three_times_as_much() -> None:
+    """No template fits them, so other cameras are tried; the holes themselves cost next to nothing."""
     models = {"small model": load_model(None)}
     with Image.open(io.BytesIO(pictures.example("chair"))) as image:
         colors, alpha = np.split(np.asarray(image), [3], axis=2)
@@ -138,7 +139,7 @@ def test_pictures_full_of_holes_cost_at_most_twice_as_much() -> None:
         start = time.process_time()
         pictures.make_meshes(models, picture, lambda _: None)
         seconds.append(time.process_time() - start)
-    assert max(seconds[2:]) < 2 * seconds[1], seconds
+    assert max(seconds[2:]) < 3 * seconds[1], seconds
 
 
 def test_the_packages_own_model_is_the_default(
