@@ -2,6 +2,7 @@
 // tensor operations.)
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
 #include <vector>
 
@@ -15,10 +16,15 @@ namespace {
 // Vertices per task. Sums are taken per chunk, in kGroup partial sums, then over chunks: the same
 // on every processor.
 constexpr int64_t kVertexChunk = 512;
-constexpr int kCameraSums =
-    12 + 6 + 8;  // sums over vertices per camera: gradients of [A | t], K, distortion
-constexpr int kTotals =
-    kCameraSums + 3 + 1;  // plus the gradients of origin and extent, which follow from the sums
+
+// The gradient of one camera, summed over vertices. Numbers are double, or kGroup partial sums.
+template <class Number>
+struct LensGradient {
+  Number matrix[12], intrinsics[6], distortion[kMostCoefficients];
+};
+struct CameraGradient : LensGradient<double> {
+  double origin[3], extent;  // these follow from the sums
+};
 
 // Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small
 // enough that sums cannot overflow.
@@ -45,14 +51,13 @@ struct Lens {
         largest_k(0),
         largest_d(1),
         usable(true) {
-    const T* camera = args.camera + (args.camera_each ? kCamera * b : 0);
+    const T* camera = args.camera + (args.cameras == args.batch ? kCamera * b : 0);
     std::copy_n(camera, 12, a);
     std::copy_n(camera + kIntrinsics, 6, k);
     std::copy_n(camera + kOrigin, 3, o);
     extent = camera[kExtent];
-    if (args.distortion)
-      std::copy_n(args.distortion + (args.distortion_each ? args.coefficients * b : 0),
-                  args.coefficients, d);
+    if (args.distortion.values)
+      std::copy_n(args.distortion.of(b, args.coefficients), args.coefficients, d);
     inverse_extent = 1 / extent;
     for (T value : a) largest_a = std::max(largest_a, std::abs(value));
     for (T value : k) largest_k = std::max(largest_k, std::abs(value * inverse_extent));
@@ -62,7 +67,7 @@ struct Lens {
     for (T value : d) usable = usable && std::abs(value) < kLimit<T>;
     for (T value : o) usable = usable && std::isfinite(value);
     usable = usable && std::isfinite(extent) && std::isfinite(inverse_extent);
-    if (!args.distortion || !args.perspective || !usable) return;
+    if (!args.distortion.values || !args.perspective || !usable) return;
     const int64_t n = args.coefficients;
     reach2 = static_cast<T>(n == 4   ? square_reach<4>(d)
                             : n == 5 ? square_reach<5>(d)
@@ -87,7 +92,7 @@ namespace {
 
 struct ProjectScratch {
   std::vector<Run> runs;
-  std::vector<double> totals;
+  std::vector<CameraGradient> gradients;  // of each run
 };
 
 // The runs of all images, in order.
@@ -104,17 +109,67 @@ const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch)
   return scratch.runs;
 }
 
+// The parts of cameras as rows.
 template <class T>
-void write(const double* sum, int count, T* grad, int64_t place) {
-  const double largest = std::numeric_limits<T>::max();
-  for (int k = 0; k < count && grad; ++k)
-    grad[place + k] = static_cast<T>(std::clamp(sum[k], -largest, largest));
+void join_parts(const Project<T>& args) {
+  for (int64_t b = 0; b < args.cameras; ++b) {
+    T* row = args.camera + kCamera * b;
+    std::copy_n(args.matrix.of(b, 12), 12, row);
+    std::copy_n(args.intrinsics.of(b, 6), 6, row + kIntrinsics);
+    for (int k = 0; k < 3; ++k)
+      row[kOrigin + k] = args.origin.values ? args.origin.of(b, 3)[k] : T(0);
+    row[kExtent] = args.extent.values ? *args.extent.of(b, 1) : T(1);
+  }
+}
+
+// Multiplies the rows of K by `across` and `down`.
+template <class T>
+void stretch(const Project<T>& args, T* rows) {
+  for (int64_t b = 0; b < args.cameras; ++b)
+    for (int k = 0; k < 6; ++k)
+      rows[kCamera * b + kIntrinsics + k] *= k < 3 ? args.across : args.down;
 }
 
 template <class T>
-void write_camera(const double* sum, T* grad, int64_t b) {
-  write(sum, 18, grad, kCamera * b);
-  write(sum + kCameraSums, 4, grad, kCamera * b + kOrigin);
+T in_range(double sum) {
+  const double largest = std::numeric_limits<T>::max();
+  return static_cast<T>(std::clamp(sum, -largest, largest));
+}
+
+// The gradient of one part of the cameras, `size` numbers of each row.
+template <class T>
+void write_part(const Project<T>& args, const std::vector<T>& rows, int64_t first, int64_t size,
+                const Parameter<T>& part) {
+  if (!part.grad) return;
+  for (int64_t k = 0; k < size; ++k) {
+    double sum = 0;
+    for (int64_t b = 0; b < args.cameras; ++b) {
+      const T value = rows[kCamera * b + first + k];
+      sum += static_cast<double>(value);
+      if (part.each) part.grad[size * b + k] = value;
+    }
+    if (!part.each) part.grad[k] = in_range<T>(sum);
+  }
+}
+
+// Adds what one image contributes to the gradient of its camera.
+void add(const CameraGradient& more, CameraGradient& sum) {
+  const auto add_numbers = [](const auto& from, auto& to) {
+    for (size_t k = 0; k < std::size(from); ++k) to[k] += from[k];
+  };
+  add_numbers(more.matrix, sum.matrix);
+  add_numbers(more.intrinsics, sum.intrinsics);
+  add_numbers(more.distortion, sum.distortion);
+  add_numbers(more.origin, sum.origin);
+  sum.extent += more.extent;
+}
+
+template <class T>
+void write_row(const CameraGradient& sum, T* row) {
+  for (double value : sum.matrix) *row++ = in_range<T>(value);
+  for (double value : sum.intrinsics) *row++ = in_range<T>(value);
+  for (double value : sum.origin) *row++ = in_range<T>(value);
+  *row = in_range<T>(sum.extent);
 }
 
 }  // namespace
@@ -122,9 +177,14 @@ void write_camera(const double* sum, T* grad, int64_t b) {
 template <class T>
 void project_forward(const Project<T>& args) {
   const ScratchUse use;
+  args.eye.values ? look_at(args) : join_parts(args);
+  stretch(args, args.camera);
   const std::vector<Run>& runs = runs_of(args, thread_scratch<ProjectScratch>());
+  std::vector<T> nearest(runs.size());
   parallel_for(static_cast<int64_t>(runs.size()), args.num_threads,
-               [&](int64_t r) { NMR_AT_BEST_LEVEL(forward_run, args, runs[r]); });
+               [&](int64_t r) { nearest[r] = NMR_AT_BEST_LEVEL(forward_run, args, runs[r]); });
+  *args.nearest = std::numeric_limits<T>::infinity();
+  for (T depth : nearest) *args.nearest = std::min(*args.nearest, depth);
 }
 
 template <class T>
@@ -133,8 +193,11 @@ void project_backward(const Project<T>& args) {
   ProjectScratch& scratch = thread_scratch<ProjectScratch>();
   const std::vector<Run>& runs = runs_of(args, scratch);
   const int64_t num_runs = static_cast<int64_t>(runs.size());
-  const bool sum_camera = args.grad_camera || args.grad_distortion;
-  double* totals = sum_camera ? reserve(scratch.totals, num_runs * kTotals) : nullptr;
+  const bool of_pose = args.eye.grad || args.at.grad || args.up.grad || args.view.grad,
+             of_parts =
+                 args.matrix.grad || args.intrinsics.grad || args.origin.grad || args.extent.grad;
+  CameraGradient* gradients =
+      of_pose || of_parts || args.distortion.grad ? reserve(scratch.gradients, num_runs) : nullptr;
 
   if (args.batch == 0 && args.grad_vertices)
     std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
@@ -149,26 +212,36 @@ void project_backward(const Project<T>& args) {
     std::fill_n(grad, 3 * runs[task].count, T(0));
     for (int64_t b = 0; b < images; ++b) {
       const int64_t r = b * tasks + task;
-      NMR_AT_BEST_LEVEL(backward_run, args, runs[r], grad, totals ? totals + r * kTotals : nullptr);
+      NMR_AT_BEST_LEVEL(backward_run, args, runs[r], grad, gradients ? gradients + r : nullptr);
     }
   });
-  if (!sum_camera) return;
+  if (!gradients) return;
 
   // One camera for all images gets the sum over them.
-  double of_all[kTotals] = {};
+  std::vector<T> rows(kCamera * args.cameras);
+  CameraGradient of_all{};
+  const auto write_distortion = [&](const CameraGradient& sum, int64_t b) {
+    for (int64_t k = 0; k < args.coefficients && args.distortion.grad; ++k)
+      args.distortion.grad[args.coefficients * b + k] = in_range<T>(sum.distortion[k]);
+  };
   for (int64_t b = 0, r = 0; b < args.batch; ++b) {
-    double sum[kTotals] = {};
-    for (; r < num_runs && runs[r].image == b; ++r)
-      for (int k = 0; k < kTotals; ++k) sum[k] += totals[r * kTotals + k];
-    for (int k = 0; k < kTotals; ++k) of_all[k] += sum[k];
-    if (args.camera_each) write_camera(sum, args.grad_camera, b);
-    if (args.distortion_each)
-      write(sum + 18, static_cast<int>(args.coefficients), args.grad_distortion,
-            args.coefficients * b);
+    CameraGradient sum{};
+    for (; r < num_runs && runs[r].image == b; ++r) add(gradients[r], sum);
+    add(sum, of_all);
+    if (args.cameras == args.batch) write_row(sum, rows.data() + kCamera * b);
+    if (args.distortion.each) write_distortion(sum, b);
   }
-  if (!args.camera_each) write_camera(of_all, args.grad_camera, 0);
-  if (!args.distortion_each)
-    write(of_all + 18, static_cast<int>(args.coefficients), args.grad_distortion, 0);
+  if (args.cameras != args.batch && args.cameras == 1) write_row(of_all, rows.data());
+  if (!args.distortion.each) write_distortion(of_all, 0);
+
+  if (args.grad_camera)
+    for (size_t k = 0; k < rows.size(); ++k) rows[k] += args.grad_camera[k];
+  stretch(args, rows.data());
+  if (of_pose) look_at_backward(args, rows.data());
+  write_part(args, rows, 0, 12, args.matrix);
+  write_part(args, rows, kIntrinsics, 6, args.intrinsics);
+  write_part(args, rows, kOrigin, 3, args.origin);
+  write_part(args, rows, kExtent, 1, args.extent);
 }
 
 NMR_FLOAT_AND_DOUBLE(project_forward, Project)

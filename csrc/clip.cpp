@@ -65,17 +65,6 @@ bool changes(const MeshBatch<T>& mesh, int64_t b, T near) {
 
 }  // namespace
 
-// Whether a depth is behind the plane; false for NaN, because such a face is not drawn anyway.
-template <class T>
-bool crosses_near(const T* vertices, int64_t count, T near) {
-  int32_t behind[kGroup] = {};
-  int64_t v = 0;
-  for (; v + kGroup <= count; v += kGroup)
-    for (int64_t l = 0; l < kGroup; ++l) behind[l] |= vertices[3 * (v + l) + 2] < near;
-  for (; v < count; ++v) behind[0] |= vertices[3 * v + 2] < near;
-  return std::any_of(behind, behind + kGroup, [](int32_t any) { return any != 0; });
-}
-
 template <class T>
 void clip_count(const ClipCount<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
@@ -156,8 +145,6 @@ void clip_faces(const ClipFaces<T>& args) {
   });
 }
 
-template bool crosses_near(const float*, int64_t, float);
-template bool crosses_near(const double*, int64_t, double);
 NMR_FLOAT_AND_DOUBLE(clip_count, ClipCount)
 NMR_FLOAT_AND_DOUBLE(clip_faces, ClipFaces)
 

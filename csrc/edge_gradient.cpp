@@ -26,6 +26,7 @@
 #include <limits>
 #include <vector>
 
+#include "average.h"
 #include "blocks.h"
 #include "corner_values.h"
 #include "geometry.h"

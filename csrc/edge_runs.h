@@ -87,13 +87,13 @@ NMR_INLINE void load_pixels(const EdgeImage<T>& image, const LineGroup<T>& group
     load_planes(image.grad, image.size, C, lines, group.grads, stride);
     return;
   }
-  // A pixel of the image is two by two of the raster, each of which gets a quarter of the gradient.
   const LineRange halves{lines.first / 2, lines.count / 2, lines.columns};
   load_planes(image.grad, image.size, C, halves, group.half_grads, stride);
   for (int64_t n = 0; n < halves.count * C; ++n) {
     const T* half = group.half_grads + n * stride;
     T* grad = group.grads + n * stride;
-    for (int64_t m = 0; m < M / 2; ++m) grad[2 * m] = grad[2 * m + 1] = half[m] / 4;
+    for (int64_t m = 0; m < M / 2; ++m)
+      grad[2 * m] = grad[2 * m + 1] = half[m] * share_of_pixel<T>(true);
     std::fill_n(grad + M, kLanes, T(0));
   }
 }

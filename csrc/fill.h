@@ -488,7 +488,7 @@ NMR_INLINE void cover_row(const int32_t* face_index, int64_t w, bool anti_aliasi
   for (int64_t x = 0; x < w; ++x) {
     const int upper_covered = (upper[2 * x] >= 0) + (upper[2 * x + 1] >= 0);
     const int lower_covered = (lower[2 * x] >= 0) + (lower[2 * x + 1] >= 0);
-    alpha[x] = T(0.25) * static_cast<T>(upper_covered + lower_covered);
+    alpha[x] = share_of_pixel<T>(true) * static_cast<T>(upper_covered + lower_covered);
   }
 }
 

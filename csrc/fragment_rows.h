@@ -154,7 +154,7 @@ void forward_block(const Fragments<T>& args, const FragmentBlock<T>& block,
       std::copy_n(upper, w, depth);
     } else if (j % 2) {
       for (int64_t i = 0; i < w; ++i)
-        depth[i] = (upper[2 * i] + upper[2 * i + 1] + lower[2 * i] + lower[2 * i + 1]) / 4;
+        depth[i] = average(upper[2 * i], upper[2 * i + 1], lower[2 * i], lower[2 * i + 1]);
     }
   }
 }
@@ -243,115 +243,92 @@ NMR_INLINE void backward_block(const FragmentBlock<T>& block, FragmentScratch<T>
   }
 }
 
-// With c = g z^2 of each pixel, S_k = sum over pixels of c w_k:  grad z_k = S_k / z_k^2,  grad X_k
-// = S_k sum_m M_m0 / z_m. Without perspective c = g:  grad z_k = S_k,  grad X_k = -S_k sum_m M_m0
-// z_m.
-template <class T>
-void depth_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block,
-                          FragmentScratch<T>& scratch, FaceGradients<T>& result) {
-  const int64_t W = block.raster.width, w = args.image.width;
-  T* grad = scratch.rows.data();
-  const Lanes<T> zero = splat(T(0)), one = splat(T(1));
-  const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
-                 half_height = splat(static_cast<T>(block.raster.height) / 2);
-  std::fill_n(grad + W, kLanes, T(0));
-  const auto start_row = [&](int64_t j) {
-    const T* upstream =
-        args.grad_depth + block.b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
-    if (!args.anti_aliasing) {
-      std::copy_n(upstream, w, grad);
-    } else if (j % 2 == 0) {  // blocks begin with an even row
-      for (int64_t i = 0; i < w; ++i) grad[2 * i] = grad[2 * i + 1] = upstream[i] / 4;
-    }
-  };
-  const auto add = [&](int64_t, int64_t i, Lanes32, const FragmentPixels<T>& p, T* sums) {
-    const Lanes<T> z = scratch.perspective ? depth_or_zero<T>(p.z) : one;
-    const Lanes<T> c = load_lanes<Lanes<T>>(grad + i) * z * z;
-    add_to_faces<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p, 4, sums);
-  };
-  const auto gradients = [&](const T* sums, int64_t slot, const FaceLanes<T>& faces,
-                             Lanes<T>(&out)[9]) {
-    Lanes<T> sum[4];
-    load_face_quads<T>(sums, slot, 4, sum);
-    const Lanes<T>(&z)[4] = faces.z;
-    const auto slope = [&](const Lanes<T>(&m)[4]) {
-      return moderate_or_zero<T>(scratch.perspective
-                                     ? m[0] / z[0] + m[1] / z[1] + m[2] / z[2]
-                                     : zero - (m[0] * z[0] + m[1] * z[1] + m[2] * z[2]));
-    };
-    const Lanes<T> slope_x = slope(faces.mx) * half_width, slope_y = slope(faces.my) * half_height;
-    for (int k = 0; k < 3; ++k) {
-      out[3 * k] = sum[k] * slope_x;
-      out[3 * k + 1] = sum[k] * slope_y;
-      out[3 * k + 2] =
-          scratch.perspective ? sum[k] * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k];
-    }
-  };
-  backward_block<4>(block, scratch, result, start_row, add, gradients);
-}
-
 // With u_m = dL/db_m, g = dL/dz and h_m = z (u_m - sum_k u_k b_k) - g z^2:  dL = sum_m h_m d(w_m /
 // z_m), so that grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over
 // pixels of h_m w_k. Without perspective h_m = u_m + g z_m:  grad z_m = sum over pixels of g w_m,
 // grad X_k = -sum_m H_mk M_m0.
 template <class T>
-void fragments_backward_block(const Fragments<T>& args, const FragmentBlock<T>& block,
-                              FragmentScratch<T>& scratch, FaceGradients<T>& result) {
-  const int64_t W = block.raster.width;
+void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
+                   FragmentScratch<T>& scratch, FaceGradients<T>& result) {
+  const int64_t W = block.raster.width, w = args.image.width;
+  const bool perspective = scratch.perspective;
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));
   const Lanes<T> half_width = splat(static_cast<T>(W) / 2),
                  half_height = splat(static_cast<T>(block.raster.height) / 2);
-  const auto add = [&](int64_t j, int64_t i, Lanes32 ids, const FragmentPixels<T>& p, T* sums) {
-    const int64_t at = block.b * block.raster.pixels() + j * W + i, count = std::min(kLanes, W - i);
-    Lanes<T> h[3] = {zero, zero, zero}, by_depth = zero;
-    if (args.grad_depth) {
-      T grad[kLanes] = {};
-      std::copy_n(args.grad_depth + at, count, grad);
-      const Lanes<T> g = load_lanes<Lanes<T>>(grad), deep = depth_or_zero<T>(p.z);
-      if (scratch.perspective) {
-        h[0] = h[1] = h[2] = (zero - g) * deep * deep;
-      } else {
-        by_depth = g;
-        for (int m = 0; m < 3; ++m) h[m] = g * depth_or_zero<T>(p.corner_z[m]);
-      }
-    }
-    if (args.grad_weights) {
-      T grad[3][kLanes] = {};
-      for (int64_t n = 0; n < count; ++n)
-        for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (at + n) + m];
-      const LaneMask<T> reversed =
-          widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
-      const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]), last = load_lanes<Lanes<T>>(grad[2]);
-      const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
-                             choose(reversed, first, last)};
-      Lanes<T> mean = zero;
-      if (scratch.perspective)
-        for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
-      const Lanes<T> scale = scratch.perspective ? p.z : one;
-      for (int m = 0; m < 3; ++m) h[m] = h[m] + scale * (u[m] - mean);
-    }
-    for (int m = 0; m < 3; ++m)
-      add_to_faces<T>({h[m] * p.w[0], h[m] * p.w[1], h[m] * p.w[2], by_depth * p.w[m]}, p, 12,
-                      sums + 4 * m);
+
+  T* grad_row = scratch.rows.data();  // g
+  std::fill_n(grad_row, W + kLanes, T(0));
+  const auto start_row = [&](int64_t j) {
+    if (!args.grad_depth || (args.anti_aliasing && j % 2)) return;  // blocks begin with an even row
+    const int64_t scale = args.anti_aliasing ? 2 : 1;
+    const T* upstream = args.grad_depth + block.b * args.image.pixels() + j / scale * w;
+    for (int64_t i = 0; i < W; ++i)
+      grad_row[i] = upstream[i / scale] * share_of_pixel<T>(args.anti_aliasing);
   };
-  const auto gradients = [&](const T* sums, int64_t slot, const FaceLanes<T>& faces,
+  const auto gradients = [&](const Lanes<T>(&sum)[3][4], const FaceLanes<T>& faces,
                              Lanes<T>(&out)[9]) {
     const auto& [mx, my, z] = faces;
-    Lanes<T> sum[3][4], slope_x[3], slope_y[3];
+    Lanes<T> slope_x[3], slope_y[3];
     for (int m = 0; m < 3; ++m) {
-      load_face_quads<T>(sums + 4 * m, slot, 12, sum[m]);
-      slope_x[m] = moderate_or_zero<T>(scratch.perspective ? mx[m] / z[m] : mx[m]) * half_width;
-      slope_y[m] = moderate_or_zero<T>(scratch.perspective ? my[m] / z[m] : my[m]) * half_height;
+      slope_x[m] = moderate_or_zero<T>(perspective ? mx[m] / z[m] : mx[m]) * half_width;
+      slope_y[m] = moderate_or_zero<T>(perspective ? my[m] / z[m] : my[m]) * half_height;
     }
     for (int k = 0; k < 3; ++k) {
       out[3 * k] =
           zero - (sum[0][k] * slope_x[0] + sum[1][k] * slope_x[1] + sum[2][k] * slope_x[2]);
       out[3 * k + 1] =
           zero - (sum[0][k] * slope_y[0] + sum[1][k] * slope_y[1] + sum[2][k] * slope_y[2]);
-      out[3 * k + 2] = scratch.perspective
-                           ? (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k]))
-                           : sum[k][3];
+      out[3 * k + 2] =
+          perspective ? (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k][3];
     }
   };
-  backward_block<12>(block, scratch, result, [](int64_t) {}, add, gradients);
+
+  // Without u the h_m differ by factors of the face, so that four sums do: of g z^2 w_k, or g w_k.
+  if (!args.grad_weights) {
+    const auto add = [&](int64_t, int64_t i, Lanes32, const FragmentPixels<T>& p, T* sums) {
+      const Lanes<T> z = perspective ? depth_or_zero<T>(p.z) : one;
+      const Lanes<T> c = load_lanes<Lanes<T>>(grad_row + i) * z * z;
+      add_to_faces<T>({c * p.w[0], c * p.w[1], c * p.w[2], zero}, p, 4, sums);
+    };
+    return backward_block<4>(
+        block, scratch, result, start_row, add,
+        [&](const T* sums, int64_t slot, const FaceLanes<T>& faces, Lanes<T>(&out)[9]) {
+          Lanes<T> each[4], sum[3][4];
+          load_face_quads<T>(sums, slot, 4, each);
+          for (int m = 0; m < 3; ++m) {
+            const Lanes<T> factor = perspective ? zero - one : depth_or_zero<T>(faces.z[m]);
+            for (int k = 0; k < 3; ++k) sum[m][k] = factor * each[k];
+            sum[m][3] = each[m];
+          }
+          gradients(sum, faces, out);
+        });
+  }
+  const auto add = [&](int64_t j, int64_t i, Lanes32 ids, const FragmentPixels<T>& p, T* sums) {
+    const int64_t at = block.b * block.raster.pixels() + j * W + i, count = std::min(kLanes, W - i);
+    const Lanes<T> g = load_lanes<Lanes<T>>(grad_row + i), deep = depth_or_zero<T>(p.z);
+    T grad[3][kLanes] = {};
+    for (int64_t n = 0; n < count; ++n)
+      for (int m = 0; m < 3; ++m) grad[m][n] = args.grad_weights[3 * (at + n) + m];
+    const LaneMask<T> reversed = widen_mask<T>(ids >= splat(static_cast<int32_t>(block.num_faces)));
+    const Lanes<T> first = load_lanes<Lanes<T>>(grad[0]), last = load_lanes<Lanes<T>>(grad[2]);
+    const Lanes<T> u[3] = {choose(reversed, last, first), load_lanes<Lanes<T>>(grad[1]),
+                           choose(reversed, first, last)};
+    Lanes<T> mean = zero;
+    if (perspective)
+      for (int m = 0; m < 3; ++m) mean = mean + u[m] * (p.w[m] * p.z / p.corner_z[m]);
+    const Lanes<T> scale = perspective ? p.z : one;
+    for (int m = 0; m < 3; ++m) {
+      const Lanes<T> by_depth =
+          perspective ? (zero - g) * deep * deep : g * depth_or_zero<T>(p.corner_z[m]);
+      const Lanes<T> h = by_depth + scale * (u[m] - mean);
+      add_to_faces<T>({h * p.w[0], h * p.w[1], h * p.w[2], g * p.w[m]}, p, 12, sums + 4 * m);
+    }
+  };
+  backward_block<12>(
+      block, scratch, result, start_row, add,
+      [&](const T* sums, int64_t slot, const FaceLanes<T>& faces, Lanes<T>(&out)[9]) {
+        Lanes<T> sum[3][4];
+        for (int m = 0; m < 3; ++m) load_face_quads<T>(sums + 4 * m, slot, 12, sum[m]);
+        gradients(sum, faces, out);
+      });
 }

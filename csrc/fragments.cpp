@@ -12,6 +12,7 @@
 #include <limits>
 #include <vector>
 
+#include "average.h"
 #include "blocks.h"
 #include "geometry.h"
 #include "parallel.h"
@@ -69,10 +70,9 @@ struct FragmentBlock {
 #include "levels.h"
 
 namespace nmr {
-namespace {
 
 template <class T>
-void forward(const Fragments<T>& args) {
+void fragments_forward(const Fragments<T>& args) {
   for_blocks(
       args.mesh.batch, raster_of(args.image, args.anti_aliasing), args.num_threads,
       [&](int64_t b) { return args.mesh.face_count(b); },
@@ -83,10 +83,8 @@ void forward(const Fragments<T>& args) {
       });
 }
 
-// Sums the gradients that body(block, scratch, result) computes for each block. It needs `sums`
-// numbers per face.
-template <class T, class Body>
-void backward(const Fragments<T>& args, int64_t sums, const Body& body) {
+template <class T>
+void fragments_backward(const Fragments<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
   sum_blocks<FaceGradients<T>>(
@@ -96,10 +94,10 @@ void backward(const Fragments<T>& args, int64_t sums, const Body& body) {
         const int64_t most = block.blocks.most_visible();
         FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
         scratch.reserve_for(block.blocks, args.perspective);
-        reserve(scratch.sums, (most + 1 + kLanes) * sums);
+        reserve(scratch.sums, (most + 1 + kLanes) * 12);
         reserve(result.ids, most);
         reserve(result.values, 9 * most);
-        body(FragmentBlock<T>(args, block), scratch, result);
+        NMR_AT_BEST_LEVEL(backward_rows, args, FragmentBlock<T>(args, block), scratch, result);
       },
       [&](int64_t b, const FaceGradients<T>& result) {
         scatter_face_gradients(result, mesh.image_faces(b), mesh.face_count(b),
@@ -107,35 +105,7 @@ void backward(const Fragments<T>& args, int64_t sums, const Body& body) {
       });
 }
 
-}  // namespace
-
-template <class T>
-void fragments_forward(const Fragments<T>& args) {
-  forward(args);
-}
-
-template <class T>
-void fragments_backward(const Fragments<T>& args) {
-  backward(args, 12, [&](const auto& block, auto& scratch, auto& result) {
-    NMR_AT_BEST_LEVEL(fragments_backward_block, args, block, scratch, result);
-  });
-}
-
-template <class T>
-void depth_forward(const Fragments<T>& args) {
-  forward(args);
-}
-
-template <class T>
-void depth_backward(const Fragments<T>& args) {
-  backward(args, 4, [&](const auto& block, auto& scratch, auto& result) {
-    NMR_AT_BEST_LEVEL(depth_backward_block, args, block, scratch, result);
-  });
-}
-
 NMR_FLOAT_AND_DOUBLE(fragments_forward, Fragments)
 NMR_FLOAT_AND_DOUBLE(fragments_backward, Fragments)
-NMR_FLOAT_AND_DOUBLE(depth_forward, Fragments)
-NMR_FLOAT_AND_DOUBLE(depth_backward, Fragments)
 
 }  // namespace nmr

@@ -19,6 +19,7 @@
 #include <cmath>
 #include <vector>
 
+#include "average.h"
 #include "blocks.h"
 #include "geometry.h"
 #include "parallel.h"
@@ -46,8 +47,6 @@ struct LocalRaster {
   int64_t image_pixel(int64_t row, int64_t column) const {
     return anti_aliasing ? row / 2 * size.width + column / 2 : row * size.width + column;
   }
-  // With a 2x2 mean each raster pixel gets a quarter of the image's gradient.
-  T share() const { return anti_aliasing ? T(0.25) : T(1); }
 };
 
 template <class T>
@@ -57,8 +56,8 @@ struct LocalCoverage : LocalRaster<T> {
   bool ends(int64_t, int64_t, int64_t r, int64_t c) const { return this->id(r, c) < 0; }
   // (I - I of the neighbour) times the gradients of the pixel and of its neighbour.
   void products(int64_t row, int64_t column, int64_t r, int64_t c, T& own, T& other) const {
-    own = grad_alpha[this->image_pixel(row, column)] * this->share();
-    other = grad_alpha[this->image_pixel(r, c)] * this->share();
+    own = grad_alpha[this->image_pixel(row, column)] * share_of_pixel<T>(this->anti_aliasing);
+    other = grad_alpha[this->image_pixel(r, c)] * share_of_pixel<T>(this->anti_aliasing);
   }
 };
 
@@ -118,7 +117,7 @@ struct LocalColors : LocalRaster<T> {
       own += (a[k] - b[k]) * of_a[k];
       other += (a[k] - b[k]) * of_b[k];
     }
-    own *= this->share(), other *= this->share();
+    own *= share_of_pixel<T>(this->anti_aliasing), other *= share_of_pixel<T>(this->anti_aliasing);
   }
 };
 

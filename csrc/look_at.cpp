@@ -1,5 +1,5 @@
-// Cameras given by a place and a direction, forward and backward: one call instead of about thirty
-// tensor operations. Poses that are not finite are handled here.
+// Cameras given by a place and a direction, forward and backward. Poses that are not finite are
+// handled here.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -49,13 +49,13 @@ Vec3<double> normalized_backward(const Vec3<double>& v, const Vec3<double>& grad
   return (grad - n * n.dot(grad)) / size;
 }
 
-Vec3d parameter(const double* values, bool each, int64_t b) {
-  return Eigen::Map<const Vec3d>(values + (each ? 3 * b : 0));
+Vec3d vector_of(const Parameter<double>& parameter, int64_t b) {
+  return Eigen::Map<const Vec3d>(parameter.of(b, 3));
 }
 
-// Adds the gradient of a parameter of `size` numbers.
-void add(double* grad, bool each, int64_t b, const double* value, int size) {
-  for (int k = 0; k < size && grad; ++k) grad[(each ? size * b : 0) + k] += value[k];
+void add(const Parameter<double>& parameter, int64_t b, const Vec3d& grad) {
+  for (int k = 0; k < 3 && parameter.grad; ++k)
+    parameter.grad[(parameter.each ? 3 * b : 0) + k] += grad[k];
 }
 
 template <class T>
@@ -65,11 +65,10 @@ struct Axes {
   Vec3<T> x, y, z;
   bool usable;
 
-  Axes(const LookAt<T>& args, int64_t b) : usable(true) {
-    const Vec3d place = parameter(args.eye, args.eye_each, b),
-                target = parameter(args.at, args.at_each, b);
+  Axes(const Project<T>& args, int64_t b) : usable(true) {
+    const Vec3d place = vector_of(args.eye, b), target = vector_of(args.at, b);
     forward = (args.along ? target : Vec3d(target - place)).template cast<T>();
-    up = parameter(args.up, args.up_each, b).template cast<T>();
+    up = vector_of(args.up, b).template cast<T>();
     for (int k = 0; k < 3; ++k)
       usable =
           usable && std::abs(forward[k]) < T(kLargestAxis) && std::abs(up[k]) < T(kLargestAxis);
@@ -85,8 +84,8 @@ struct Axes {
 }  // namespace
 
 template <class T>
-void look_at_forward(const LookAt<T>& args) {
-  for (int64_t b = 0; b < args.batch; ++b) {
+void look_at(const Project<T>& args) {
+  for (int64_t b = 0; b < args.cameras; ++b) {
     T* camera = args.camera + kCamera * b;
     Eigen::Map<Matrix34<T>> matrix(camera);
     const Axes<T> axes(args, b);
@@ -95,12 +94,11 @@ void look_at_forward(const LookAt<T>& args) {
     else
       matrix.setConstant(std::numeric_limits<T>::quiet_NaN());
     if (args.right_handed) matrix.row(0) *= T(-1);
-    const double view = args.view[args.view_each ? b : 0];
+    const double view = *args.view.of(b, 1);
     const T scale = args.perspective ? T(1) : static_cast<T>(view);
     const T intrinsics[6] = {scale, 0, 0, 0, -scale, 0};
     std::copy_n(intrinsics, 6, camera + kIntrinsics);
-    for (int k = 0; k < 3; ++k)
-      camera[kOrigin + k] = static_cast<T>(parameter(args.eye, args.eye_each, b)[k]);
+    for (int k = 0; k < 3; ++k) camera[kOrigin + k] = static_cast<T>(args.eye.of(b, 3)[k]);
     const double angle = static_cast<T>(view * kRadians);  // rounded, as published
     camera[kExtent] = args.perspective ? static_cast<T>(std::tan(angle)) : T(1);
   }
@@ -152,35 +150,32 @@ Vec3d clamped(const Vec3d& grad) {
 }  // namespace
 
 template <class T>
-void look_at_backward(const LookAt<T>& args) {
-  const auto clear = [&](double* grad, bool each, int64_t size) {
-    if (grad) std::fill_n(grad, each ? size * args.batch : size, 0.0);
-  };
-  clear(args.grad_eye, args.eye_each, 3);
-  clear(args.grad_at, args.at_each, 3);
-  clear(args.grad_up, args.up_each, 3);
-  clear(args.grad_view, args.view_each, 1);
-  for (int64_t b = 0; b < args.batch; ++b) {
-    const T* grad_camera = args.grad_camera + kCamera * b;
+void look_at_backward(const Project<T>& args, const T* grad_camera) {
+  for (const Parameter<double>* vector : {&args.eye, &args.at, &args.up})
+    if (vector->grad) std::fill_n(vector->grad, vector->each ? 3 * args.cameras : 3, 0.0);
+  if (args.view.grad) std::fill_n(args.view.grad, args.view.each ? args.cameras : 1, 0.0);
+  for (int64_t b = 0; b < args.cameras; ++b, grad_camera += kCamera) {
     const PoseGradient grad =
         pose_gradient(Axes<T>(args, b), Matrix34<T>(Eigen::Map<const Matrix34<T>>(grad_camera)),
                       args.right_handed);
-    const Vec3d of_forward = clamped<T>(grad.forward), of_up = clamped<T>(grad.up);
+    const Vec3d of_forward = clamped<T>(grad.forward);
     Vec3d of_eye = Eigen::Map<const Vec3<T>>(grad_camera + kOrigin).template cast<double>();
     if (!args.along) of_eye -= of_forward;
-    add(args.grad_eye, args.eye_each, b, of_eye.data(), 3);
-    add(args.grad_at, args.at_each, b, of_forward.data(), 3);
-    add(args.grad_up, args.up_each, b, of_up.data(), 3);
+    add(args.eye, b, of_eye);
+    add(args.at, b, of_forward);
+    add(args.up, b, clamped<T>(grad.up));
+    if (!args.view.grad) continue;
     const double tangent =
-        std::tan(static_cast<double>(static_cast<T>(args.view[args.view_each ? b : 0] * kRadians)));
-    const double of_view =
+        std::tan(static_cast<double>(static_cast<T>(*args.view.of(b, 1) * kRadians)));
+    args.view.grad[args.view.each ? b : 0] +=
         args.perspective ? grad_camera[kExtent] * (1 + tangent * tangent) * kRadians
                          : double(grad_camera[kIntrinsics]) - double(grad_camera[kIntrinsics + 4]);
-    add(args.grad_view, args.view_each, b, &of_view, 1);
   }
 }
 
-NMR_FLOAT_AND_DOUBLE(look_at_forward, LookAt)
-NMR_FLOAT_AND_DOUBLE(look_at_backward, LookAt)
+template void look_at(const Project<float>&);
+template void look_at(const Project<double>&);
+template void look_at_backward(const Project<float>&, const float*);
+template void look_at_backward(const Project<double>&, const double*);
 
 }  // namespace nmr

@@ -16,7 +16,8 @@ namespace {
 
 using Vec3 = Eigen::Vector3d;
 
-constexpr double kLargestCoordinate = 1e12;  // coordinates beyond this do not count
+// Coordinates beyond this do not count: their products could overflow.
+constexpr double kLargestCoordinate = 1e100;
 
 // A shorter product counts as no area: its derivative could overflow.
 template <class T>
@@ -47,8 +48,8 @@ NMR_INLINE Vec3 direction_backward(const Direction& d, const Vec3& grad) {
 // origin.
 template <class T>
 NMR_INLINE bool counts(const T* vertex) {
-  return std::abs(vertex[0]) < T(kLargestCoordinate) &&
-         std::abs(vertex[1]) < T(kLargestCoordinate) && std::abs(vertex[2]) < T(kLargestCoordinate);
+  const auto is_used = [](T x) { return std::abs(static_cast<double>(x)) < kLargestCoordinate; };
+  return is_used(vertex[0]) && is_used(vertex[1]) && is_used(vertex[2]);
 }
 
 template <class T>

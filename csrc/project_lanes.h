@@ -86,34 +86,35 @@ NMR_INLINE void forward_lanes(const Lens<T>& c, const T* __restrict vertices,
 // along: the gradient of m.
 template <int kDistortion, class T>
 NMR_INLINE void add_coefficients(const Radial<T>& radial, T along, T gqx, T gqy, T x, T y, int l,
-                                 T (*__restrict sums)[kGroup]) {
+                                 LensGradient<T[kGroup]>* __restrict sums) {
   const T r2 = x * x + y * y, xy = x * y;
   if (kDistortion == kFisheye) {
     T power = along * radial.per_r;
     for (int k = 0; k < 4; ++k) {
       power *= radial.angle2;
-      sums[18 + k][l] += power;
+      sums->distortion[k][l] += power;
     }
     return;
   }
   const T by_numerator = kDistortion == kRational ? along * radial.inverse : along;
-  sums[18][l] += by_numerator * r2;
-  sums[19][l] += by_numerator * r2 * r2;
-  sums[20][l] += 2 * gqx * xy + gqy * (r2 + 2 * y * y);
-  sums[21][l] += gqx * (r2 + 2 * x * x) + 2 * gqy * xy;
-  sums[22][l] += by_numerator * r2 * r2 * r2;
+  sums->distortion[0][l] += by_numerator * r2;
+  sums->distortion[1][l] += by_numerator * r2 * r2;
+  sums->distortion[2][l] += 2 * gqx * xy + gqy * (r2 + 2 * y * y);
+  sums->distortion[3][l] += gqx * (r2 + 2 * x * x) + 2 * gqy * xy;
+  sums->distortion[4][l] += by_numerator * r2 * r2 * r2;
   if (kDistortion == kRational) {
     const T by_denominator = -by_numerator * radial.m;
-    sums[23][l] += by_denominator * r2;
-    sums[24][l] += by_denominator * r2 * r2;
-    sums[25][l] += by_denominator * r2 * r2 * r2;
+    sums->distortion[5][l] += by_denominator * r2;
+    sums->distortion[6][l] += by_denominator * r2 * r2;
+    sums->distortion[7][l] += by_denominator * r2 * r2 * r2;
   }
 }
 
 // The gradient of p from that of q, and those of the coefficients. keep: see backward_lanes.
 template <int kDistortion, bool kSumCamera, class T>
 NMR_INLINE void distort_backward(const Lens<T>& c, const ProjectedVertex<T>& s, bool keep, T gqx,
-                                 T gqy, int l, T (*__restrict sums)[kGroup], T& gpx, T& gpy) {
+                                 T gqy, int l, LensGradient<T[kGroup]>* __restrict sums, T& gpx,
+                                 T& gpy) {
   const T x = keep ? s.cx : T(0), y = keep ? s.cy : T(0);
   const T r2 = x * x + y * y;
   const Radial<T> radial = radial_of<kDistortion>(c.d, r2);
@@ -149,7 +150,7 @@ NMR_INLINE void distort_backward(const Lens<T>& c, const ProjectedVertex<T>& s, 
 template <class T, bool kPerspective, int kDistortion, bool kSumCamera>
 NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices,
                                const T* __restrict grad_points, T* __restrict grad_vertices,
-                               T (*__restrict sums)[kGroup]) {
+                               LensGradient<T[kGroup]>* __restrict sums) {
   for (int l = 0; l < kGroup; ++l) {
     T x = vertices[3 * l] - c.o[0], y = vertices[3 * l + 1] - c.o[1],
       z = vertices[3 * l + 2] - c.o[2];
@@ -187,15 +188,15 @@ NMR_INLINE void backward_lanes(const Lens<T>& c, const T* __restrict vertices,
     if (kSumCamera) {
       const T gu[3] = {gux, guy, guz}, g[2] = {gx, gy};
       for (int i = 0; i < 3; ++i) {
-        sums[4 * i][l] += gu[i] * x;
-        sums[4 * i + 1][l] += gu[i] * y;
-        sums[4 * i + 2][l] += gu[i] * z;
-        sums[4 * i + 3][l] += gu[i];
+        sums->matrix[4 * i][l] += gu[i] * x;
+        sums->matrix[4 * i + 1][l] += gu[i] * y;
+        sums->matrix[4 * i + 2][l] += gu[i] * z;
+        sums->matrix[4 * i + 3][l] += gu[i];
       }
       for (int i = 0; i < 2; ++i) {
-        sums[12 + 3 * i][l] += g[i] * s.qx;
-        sums[13 + 3 * i][l] += g[i] * s.qy;
-        sums[14 + 3 * i][l] += g[i];
+        sums->intrinsics[3 * i][l] += g[i] * s.qx;
+        sums->intrinsics[3 * i + 1][l] += g[i] * s.qy;
+        sums->intrinsics[3 * i + 2][l] += g[i];
       }
     }
   }
@@ -212,8 +213,19 @@ struct Padded {
   }
 };
 
+template <class T>
+NMR_INLINE T least_depth(const T* points, int64_t count) {
+  T least[kGroup];
+  std::fill_n(least, kGroup, std::numeric_limits<T>::infinity());
+  int64_t n = 0;
+  for (; n + kGroup <= count; n += kGroup)
+    for (int64_t l = 0; l < kGroup; ++l) least[l] = std::min(least[l], points[3 * (n + l) + 2]);
+  for (; n < count; ++n) least[0] = std::min(least[0], points[3 * n + 2]);
+  return *std::min_element(least, least + kGroup);
+}
+
 template <class T, bool kPerspective, int kDistortion>
-NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run) {
+NMR_INLINE T forward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run) {
   const T* vertices = args.vertices + 3 * run.vertices;
   T* points = args.points + 3 * run.points;
   const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
@@ -222,38 +234,41 @@ NMR_INLINE void forward_run_of(const Project<T>& args, const Lens<T>& lens, cons
     forward_lanes<T, kPerspective, kDistortion>(lens, n < whole ? vertices + 3 * n : last.vertices,
                                                 n < whole ? points + 3 * n : last.out);
   std::copy_n(last.out, 3 * rest, points + 3 * whole);
+  return least_depth(points, run.count);
 }
 
 // Calls body(perspective, distortion) with compile-time constants: of the camera, and its number of
 // coefficients.
 template <class T, class Body>
-NMR_INLINE void with_lens(const Project<T>& args, const Body& body) {
+NMR_INLINE auto with_lens(const Project<T>& args, const Body& body) {
   using None = std::integral_constant<int, 0>;
   if (!args.perspective) return body(std::false_type(), None());
-  if (!args.distortion) return body(std::true_type(), None());
+  if (!args.distortion.values) return body(std::true_type(), None());
   if (args.coefficients == 4) return body(std::true_type(), std::integral_constant<int, 4>());
   if (args.coefficients == 5) return body(std::true_type(), std::integral_constant<int, 5>());
-  body(std::true_type(), std::integral_constant<int, 8>());
+  return body(std::true_type(), std::integral_constant<int, 8>());
 }
 
+// The points of a run, and the least depth of them.
 template <class T>
-void forward_run(const Project<T>& args, const Run& run) {
+T forward_run(const Project<T>& args, const Run& run) {
   const Lens<T> lens(args, run.image);
   if (lens.usable)
     return with_lens(args, [&](auto perspective, auto distortion) {
-      forward_run_of<T, perspective(), distortion()>(args, lens, run);
+      return forward_run_of<T, perspective(), distortion()>(args, lens, run);
     });
   T* points = args.points + 3 * run.points;
   for (int64_t n = 0; n < run.count; ++n) {
     points[3 * n] = points[3 * n + 1] = std::numeric_limits<T>::infinity();
     points[3 * n + 2] = 0;
   }
+  return 0;
 }
 
 template <class T, bool kPerspective, int kDistortion, bool kSumCamera>
 NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, const Run& run,
-                                T* grad_vertices, double* total) {
-  T sums[kCameraSums][kGroup] = {};
+                                T* grad_vertices, CameraGradient* total) {
+  LensGradient<T[kGroup]> sums = {};
   const T* vertices = args.vertices + 3 * run.vertices;
   const T* grad_points = args.grad_points + 3 * run.points;
   const int64_t whole = run.count / kGroup * kGroup, rest = run.count - whole;
@@ -265,27 +280,32 @@ NMR_INLINE void backward_run_of(const Project<T>& args, const Lens<T>& lens, con
     backward_lanes<T, kPerspective, kDistortion, kSumCamera>(
         lens, inside ? vertices + 3 * n : last.vertices,
         inside ? grad_points + 3 * n : last.grad_points, inside ? grad_vertices + 3 * n : last.out,
-        sums);
+        &sums);
   }
   std::copy_n(last.out, 3 * rest, grad_vertices + 3 * whole);
   if (!kSumCamera) return;
-  for (int k = 0; k < kCameraSums; ++k) {
-    total[k] = 0;
-    for (int l = 0; l < kGroup; ++l) total[k] += static_cast<double>(sums[k][l]);
-  }
+  const auto add_up = [](const auto& groups, auto& numbers) {
+    for (size_t k = 0; k < std::size(numbers); ++k) {
+      numbers[k] = 0;
+      for (T part : groups[k]) numbers[k] += static_cast<double>(part);
+    }
+  };
+  add_up(sums.matrix, total->matrix);
+  add_up(sums.intrinsics, total->intrinsics);
+  add_up(sums.distortion, total->distortion);
   // u depends on v - origin and q on p / extent.
-  const double* t = total;
+  const double *a = total->matrix, *k = total->intrinsics;
   for (int j = 0; j < 3; ++j)
-    total[kCameraSums + j] =
-        -(double(lens.a[j]) * t[3] + double(lens.a[4 + j]) * t[7] + double(lens.a[8 + j]) * t[11]);
-  total[kCameraSums + 3] = -(double(lens.k[0]) * t[12] + double(lens.k[1]) * t[13] +
-                             double(lens.k[3]) * t[15] + double(lens.k[4]) * t[16]) /
-                           double(lens.extent);
+    total->origin[j] =
+        -(double(lens.a[j]) * a[3] + double(lens.a[4 + j]) * a[7] + double(lens.a[8 + j]) * a[11]);
+  total->extent = -(double(lens.k[0]) * k[0] + double(lens.k[1]) * k[1] + double(lens.k[3]) * k[3] +
+                    double(lens.k[4]) * k[4]) /
+                  double(lens.extent);
 }
 
-// total: kTotals gradients of the camera, summed over this run, or nullptr.
+// total: the gradient of the camera, summed over this run, or nullptr.
 template <class T>
-void backward_run(const Project<T>& args, const Run& run, T* grad_vertices, double* total) {
+void backward_run(const Project<T>& args, const Run& run, T* grad_vertices, CameraGradient* total) {
   const Lens<T> lens(args, run.image);
   if (lens.usable)
     return with_lens(args, [&](auto perspective, auto distortion) {
@@ -296,5 +316,5 @@ void backward_run(const Project<T>& args, const Run& run, T* grad_vertices, doub
         backward_run_of<T, perspective(), distortion(), false>(args, lens, run, grad_vertices,
                                                                nullptr);
     });
-  if (total) std::fill_n(total, kTotals, 0.0);
+  if (total) *total = {};
 }

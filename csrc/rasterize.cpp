@@ -15,6 +15,7 @@
 #include <limits>
 #include <vector>
 
+#include "average.h"
 #include "geometry.h"
 #include "parallel.h"
 #include "stages.h"

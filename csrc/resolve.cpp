@@ -3,6 +3,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "average.h"
 #include "corner_values.h"
 #include "parallel.h"
 #include "stages.h"
@@ -29,13 +30,13 @@ NMR_INLINE void resolve_row(const int32_t* face_index, const T* pixels, const T*
     const int32_t* corner = behind ? face_index + 2 * x : nullptr;
     if (!behind || (corner[0] | corner[1] | corner[W] | corner[W + 1]) >= 0) {
       for (int64_t c = 0; c < C; ++c)
-        out[c] = (upper[c] + upper[C + c] + lower[c] + lower[C + c]) / 4;
+        out[c] = average(upper[c], upper[C + c], lower[c], lower[C + c]);
     } else if ((corner[0] & corner[1] & corner[W] & corner[W + 1]) < 0) {
       for (int64_t c = 0; c < C; ++c) out[c] = behind[C + c];
     } else {
       const T *a = corner[0] < 0 ? behind : upper, *b = corner[1] < 0 ? behind : upper + C;
       const T *d = corner[W] < 0 ? behind : lower, *e = corner[W + 1] < 0 ? behind : lower + C;
-      for (int64_t c = 0; c < C; ++c) out[c] = (a[c] + b[c] + d[c] + e[c]) / 4;
+      for (int64_t c = 0; c < C; ++c) out[c] = average(a[c], b[c], d[c], e[c]);
     }
   }
 }
@@ -46,7 +47,7 @@ template <int64_t kChannels, class T>
 NMR_INLINE void resolve_row_backward(const int32_t* face_index, const T* grad, int64_t w,
                                      bool anti_aliasing, int64_t channels, T* out) {
   const int64_t C = kChannels ? kChannels : channels, scale = anti_aliasing ? 2 : 1;
-  const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
+  const T share = share_of_pixel<T>(anti_aliasing);
   for (int64_t x = 0; x < w; ++x, grad += C)
     for (int64_t k = 0; k < scale; ++k, out += C) {
       const bool drawn = !face_index || face_index[scale * x + k] >= 0;
@@ -67,7 +68,7 @@ void resolve_forward(const Resolve<T>& args) {
     const T* color = args.background + b * C;
     behind.insert(behind.end(), color, color + C);
     for (int64_t c = 0; c < C; ++c)
-      behind.push_back((color[c] + color[c] + color[c] + color[c]) / 4);
+      behind.push_back(average(color[c], color[c], color[c], color[c]));
   }
   with_channels<T>(C, [&](auto known) {
     constexpr int64_t kChannels = known();
@@ -88,7 +89,7 @@ void resolve_backward(const Resolve<T>& args) {
   const int64_t h = args.image.height, w = args.image.width, C = args.channels,
                 scale = args.anti_aliasing ? 2 : 1;
   const int64_t H = scale * h, W = scale * w;
-  const T share = T(1) / static_cast<T>(scale * scale);  // a power of two: exact
+  const T share = share_of_pixel<T>(args.anti_aliasing);
   if (args.grad_pixels)
     with_channels<T>(C, [&](auto known) {
       constexpr int64_t kChannels = known();

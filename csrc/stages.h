@@ -51,46 +51,38 @@ struct MeshBatch {
   const int64_t* image_faces(int64_t b) const { return faces + 3 * face_start(b); }
 };
 
-// A camera as the kernels take it, a row of kCamera numbers: [A | t] (3 x 4, world to camera axes:
-// x right, y down, z forward), K (2 x 3, renderer-space x and y), the origin (3) and the extent.
-constexpr int64_t kCamera = 12 + 6 + 3 + 1, kIntrinsics = 12, kOrigin = 18, kExtent = 21;
+// A parameter of cameras: one for all, or one for each.
+template <class P>
+struct Parameter {
+  const P* values;  // [size] or [n, size]; nullptr if it is not given
+  bool each;        // [n, size]
+  P* grad;          // backward out, like values (summed over cameras if there is one), or nullptr
 
-// Cameras at `eye` that look at a point or along a direction (look_at.cpp): rows x, -y, z of A; z =
-// n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5); t = 0, the origin is the eye.
-// If forward or up is not finite or beyond 1e15, A and t are NaN and get no gradient. Parameters
-// are doubles, one for all images or one each; the difference at - eye and the angle are rounded to
-// T before anything is computed from them, as published.
-template <class T>
-struct LookAt {
-  int64_t batch;      // B
-  const double* eye;  // [3] or [B, 3]
-  const double* at;   // [3] or [B, 3]: the point, or the direction
-  const double* up;   // [3] or [B, 3]
-  const double*
-      view;  // [] or [B]: perspective: half of the field of view in degrees, else the scale
-  bool eye_each, at_each, up_each, view_each;  // one for each image
-  bool along;                                  // `at` is a direction
-  bool right_handed;                           // x points to the other side
-  bool perspective;      // extent = tan(view), else K is multiplied by the scale
-  T* camera;             // forward out [B, kCamera]
-  const T* grad_camera;  // backward in
-  double* grad_eye;      // backward out, like the parameters (summed over images), or nullptr
-  double* grad_at;
-  double* grad_up;
-  double* grad_view;
+  const P* of(int64_t camera, int64_t size) const { return values + (each ? camera * size : 0); }
 };
 
-// World space to renderer space (camera.cpp). Per image b: u = A (v - origin) + t; then
+// A camera as a row of kCamera numbers: [A | t] (3 x 4, world to camera axes: x right, y down, z
+// forward), K (2 x 3, renderer-space x and y), the origin (3) and the extent.
+constexpr int64_t kCamera = 12 + 6 + 3 + 1, kIntrinsics = 12, kOrigin = 18, kExtent = 21;
+
+// World space to renderer space (camera.cpp). The cameras are poses, or given by their parts.
+//
+// A pose (look_at.cpp) looks from `eye` at a point or along a direction: rows x, -y, z of A; z =
+// n(forward), x = n(up x z), y = n(z x x), n(v) = v / max(|v|, 1e-5); t = 0, the origin is the eye.
+// If forward or up is not finite or beyond 1e15, A and t are NaN and get no gradient. Parameters
+// are doubles; the difference at - eye and the angle are rounded to T before anything is computed
+// from them, as published.
+//
+// Per image b: u = A (v - origin) + t; then
 //   perspective:   p = (u_x / u_z, u_y / u_z), distorted as OpenCV does (distortion.h); q = p /
 //   extent;
 //                  out = (K00 q_x + K01 q_y + K02, K10 q_x + ...,
 //                  u_z)
 //   orthographic:  the same with p = (u_x, u_y), without distortion.
-// Origin and extent are separate arguments so that look-at cameras round as the published ones:
-// images and gradients then have the same bits. A vertex has no finite image if it is not finite
-// itself, if it is in the plane of the eye, if x / z^2 overflows, or if the camera is not finite.
-// It then gets out = (inf, inf, any finite number), so that its faces are not drawn, and gradient
-// 0.
+// Origin and extent are separate parameters so that poses round as the published ones: images and
+// gradients then have the same bits. A vertex has no finite image if it is not finite itself, if it
+// is in the plane of the eye, if x / z^2 overflows, or if the camera is not finite. It then gets
+// out = (inf, inf, any finite number), so that its faces are not drawn, and gradient 0.
 template <class T>
 struct Project {
   const T* vertices;      // [B or 1, V, 3], or packed [N, 3]
@@ -98,18 +90,29 @@ struct Project {
   int64_t batch;          // B, of the output
   int64_t vertex_batch;   // 1 or B when not packed
   int64_t num_vertices;   // V
-  const T* camera;        // [B or 1, kCamera]
-  bool camera_each;       // B, else 1
-  const T* distortion;    // [B or 1, coefficients], or nullptr
-  bool distortion_each;
-  int64_t coefficients;  // 5: k1 k2 p1 p2 k3; 8: also k4 k5 k6; 4: k1 k2 k3 k4 of a fisheye
+  int64_t cameras;        // n: B or 1
   bool perspective;
+
+  Parameter<double> eye, at, up;  // of poses [3]; else not given
+  Parameter<double> view;  // []: half of the field of view in degrees, else the scale: then extent
+                           // = tan(view), or K is multiplied by the scale
+  bool along;              // `at` is a direction
+  bool right_handed;       // x points to the other side
+
+  Parameter<T> matrix, intrinsics;  // the parts: [A | t] and K
+  Parameter<T> origin, extent;      // 0 and 1 if they are not given
+  T across, down;                   // factors of the rows of K
+
+  Parameter<T> distortion;  // [coefficients], may be missing
+  int64_t coefficients;     // 5: k1 k2 p1 p2 k3; 8: also k4 k5 k6; 4: k1 k2 k3 k4 of a fisheye
+
+  T* camera;             // forward out, backward in [n, kCamera]: the cameras as rows
   T* points;             // forward out [B, V, 3] or [N, 3]
-  const T* grad_points;  // backward in
+  T* nearest;            // forward out []: the least depth of all points, which are never NaN
+  const T* grad_camera;  // backward in, or nullptr
+  const T* grad_points;  // backward in, or nullptr
   T* grad_vertices;  // backward out, like vertices (summed over images when vertex_batch is 1), or
                      // nullptr
-  T* grad_camera;    // backward out, like camera (summed over images when there is one), or nullptr
-  T* grad_distortion;  // backward out, like distortion, or nullptr
   int num_threads;
 };
 
@@ -259,7 +262,7 @@ struct Fragments {
                // background. nullptr: a depth image
   T* depth;    // forward out [B, h, w]
   const T* grad_weights;  // backward in [B, H, W, 3], or nullptr
-  const T* grad_depth;    // backward in [B, h, w]; nullptr, if not of a depth image
+  const T* grad_depth;    // backward in [B, h, w], or nullptr
   T* grad_vertices;       // backward out, like mesh.vertices
   int num_threads;
   bool perspective = true;
@@ -406,7 +409,7 @@ struct Antialias {
 
 // Unit normals of meshes in world space (normals.cpp): n((v0 - v1) x (v2 - v1)) of faces, or of
 // vertices the direction of the sum of these products over the faces around them. 0 without an
-// area. A vertex that is not finite, or beyond 1e12, counts as the origin and gets no gradient.
+// area. A vertex that is not finite, or beyond 1e100, counts as the origin and gets no gradient.
 template <class T>
 struct Normals {
   MeshBatch<T> mesh;
@@ -541,15 +544,13 @@ struct SoftIou {
 };
 
 template <class T>
-void look_at_forward(const LookAt<T>& args);
+void look_at(const Project<T>& args);  // fills `camera`
 template <class T>
-void look_at_backward(const LookAt<T>& args);
+void look_at_backward(const Project<T>& args, const T* grad_camera);
 template <class T>
 void project_forward(const Project<T>& args);
 template <class T>
 void project_backward(const Project<T>& args);
-template <class T>
-bool crosses_near(const T* vertices, int64_t count, T near);  // some depth is smaller
 template <class T>
 void clip_count(const ClipCount<T>& args);
 template <class T>
@@ -578,10 +579,6 @@ template <class T>
 void fragments_forward(const Fragments<T>& args);
 template <class T>
 void fragments_backward(const Fragments<T>& args);
-template <class T>
-void depth_forward(const Fragments<T>& args);
-template <class T>
-void depth_backward(const Fragments<T>& args);
 template <class T>
 void texture_cubes_forward(const TextureCubes<T>& args);
 template <class T>

@@ -65,16 +65,17 @@ def clip_plane(near: float, far: float) -> float:
 
 
 def clip_near(
-    world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float
+    world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float, nearest: Tensor | None
 ) -> Clipped | None:
     """Cuts the faces that cross z = plane and leaves out those behind it; None if the meshes may
     stay as they are.
 
-    ``world`` and ``mesh`` are the meshes before and after the camera. The new vertices are
+    ``world`` and ``mesh`` are the meshes before and after the camera, ``nearest []`` the least
+    depth of all vertices, if it is known. The new vertices are
     interpolated in the world and then go through the camera, so that gradients reach the corners
     of the cut edges.
     """
-    room = _room(mesh, plane)
+    room = _room(mesh, plane, nearest)
     if room is None:
         return None
     num_new, num_drawn = zip(*room, strict=True)
@@ -98,15 +99,15 @@ def clip_near(
     return Clipped(drawn, source, mesh.num_faces, corners, places, place_starts)
 
 
-def _room(mesh: MeshBatch, plane: float) -> list[tuple[int, int]] | None:
+def _room(mesh: MeshBatch, plane: float, nearest: Tensor | None) -> list[tuple[int, int]] | None:
     """New vertices and drawn faces of each mesh; None if nothing is cut.
 
     Meshes whose values are not known yet (torch.compile, torch.func.vmap) get room for every face
     to be cut.
     """
     if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active():
-        room = ops.clip_count(*mesh[:3], plane).tolist()
-        return room if room and room[0][0] >= 0 else None
+        depth = mesh.vertices.detach()[..., 2] if nearest is None else nearest
+        return ops.clip_count(*mesh[:3], plane).tolist() if (depth < plane).any() else None
     return [(2 * n, 2 * n) for n in mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch]
 
 

@@ -31,7 +31,7 @@ from ._validate import (
     holds_for_all,
 )
 from .cameras import Camera
-from .cameras.projection import ProjectingCamera, has_perspective
+from .cameras.projection import ProjectingCamera, has_perspective, transform
 from .fragments import Fragments
 from .lights import Lights
 from .textures import Colors
@@ -154,21 +154,19 @@ def make_scene(
         mesh = pack_meshes(vertices, faces)
     else:
         mesh = MeshBatch(check_vertices(vertices, ", or a list of [V_b, 3]"), faces)
-    world = mesh.vertices
+    world, nearest = mesh.vertices, None
     if camera is not None:
         check_camera(camera, mesh.starts is not None)
         if isinstance(camera, ProjectingCamera):
             camera = camera.for_image(height, width)
-        if mesh.starts is None:
-            mesh = mesh._replace(vertices=camera.transform(world))
-        else:
-            mesh = mesh._replace(vertices=camera.transform(world, starts=mesh.starts))
-        check_transformed(mesh.vertices, world, mesh.starts is not None)
+        points, nearest = transform(camera, world, mesh.batch, mesh.starts)
+        mesh = mesh._replace(vertices=points)
+        check_transformed(points, world, mesh.starts is not None)
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
     check_depth_range(near, far, mesh.vertices.dtype)
     check_eps(eps, mesh.vertices.dtype)
     near = clip_plane(near, far) if check_flag(clip, "clip") else float(near)
-    clipped = clip_near(world, mesh, camera, near) if clip else None
+    clipped = clip_near(world, mesh, camera, near, nearest) if clip else None
     if clipped is not None and mesh.vertices.dtype == torch.float32 and has_perspective(camera):
         depth = mesh.vertices.detach()[..., 2]
         if not holds_for_all(~depth.isfinite() | (depth * _NARROWEST < near)):

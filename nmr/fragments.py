@@ -19,8 +19,8 @@ from ._validate import (
     check_values,
     describe,
 )
+from ._vectors import unit
 from .cameras.projection import ProjectingCamera, has_perspective
-from .mesh import _unit
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -246,7 +246,7 @@ class Fragments:
         turn = (
             _image_axes(intrinsics.to(normals)) @ torch.linalg.inv(matrix[:, :, :3].to(normals)).mT
         )[:, None]
-        return _unit(normals @ turn.mT)
+        return unit(normals @ turn.mT)
 
     def _lit(
         self,
@@ -358,7 +358,7 @@ def _image_axes(intrinsics: Tensor) -> Tensor:
     """Right and up in the image and the direction of view ``[B, 3, 3]``, in camera axes; a skew
     turns nothing.
     """
-    up = _unit(intrinsics[:, 1, :2])
+    up = unit(intrinsics[:, 1, :2])
     right = torch.stack([up[:, 1], -up[:, 0]], dim=1)
     right = right * torch.where((right * intrinsics[:, 0, :2]).sum(1, keepdim=True) < 0, -1.0, 1.0)
     flat = torch.nn.functional.pad(torch.stack([right, up], dim=1), (0, 1))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from . import ops
 from ._validate import check_faces, check_indices, check_vertices, describe
+from ._vectors import gather_rows
 
 
 def icosphere(subdivisions: int = 3) -> tuple[Tensor, Tensor]:
@@ -170,7 +172,7 @@ def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
     batched = check_vertices(vertices)
     faces = check_faces(faces, batched.shape[0], batched.device)
     check_indices(faces, batched.shape[1])
-    corners = _gather(batched, faces.flatten(-2)).unflatten(1, (-1, 3))
+    corners = gather_rows(batched, faces.flatten(-2)).unflatten(1, (-1, 3))
     return corners if vertices.ndim == 3 else corners.squeeze(0)
 
 
@@ -203,7 +205,7 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     >>> nmr.face_normals(vertices, faces).shape
     torch.Size([1280, 3])
     """
-    return _unit(_face_cross(face_vertices(vertices, faces)))
+    return _normals(vertices, faces, smooth=False)
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -232,29 +234,15 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     >>> (nmr.vertex_normals(vertices, faces) * vertices).sum(-1).min() > 0.999
     tensor(True)
     """
+    return _normals(vertices, faces, smooth=True)
+
+
+def _normals(vertices: Tensor, faces: Tensor, smooth: bool) -> Tensor:
     batched = check_vertices(vertices)
     faces = check_faces(faces, batched.shape[0], batched.device)
-    cross = _face_cross(face_vertices(batched, faces))  # twice the area long
-    normals = _unit(
-        _scatter_sum(cross.repeat_interleave(3, dim=1), faces.flatten(-2), batched.shape[1])
-    )
+    # the kernel's normals belong to clockwise faces
+    normals = ops.normals(batched, faces.flip(-1), None, smooth)
     return normals if vertices.ndim == 3 else normals.squeeze(0)
-
-
-def _face_cross(corners: Tensor) -> Tensor:
-    """Normals [..., F, 3], each with twice the area of its face as its length."""
-    p0, p1, p2 = corners.unbind(-2)
-    return torch.linalg.cross(p1 - p0, p2 - p0)
-
-
-def _unit(vectors: Tensor) -> Tensor:
-    """Vectors over their lengths; 0, with gradient 0, if the length is 0."""
-    # Scaled to a largest coordinate of 1 first, so that the squares neither under- nor overflow.
-    # The result does not depend on the scale, so neither does its derivative.
-    scale = vectors.detach().abs().amax(-1, keepdim=True)
-    zero = scale < torch.finfo(vectors.dtype).tiny
-    vectors = torch.where(zero, 1.0, vectors / torch.where(zero, 1.0, scale))
-    return torch.where(zero, 0.0, vectors / vectors.square().sum(-1, keepdim=True).sqrt())
 
 
 def _one_mesh(faces: Tensor) -> Tensor:
@@ -270,21 +258,3 @@ def _one_mesh(faces: Tensor) -> Tensor:
 def _sides(faces: Tensor) -> Tensor:
     """Vertices of all sides 0-1, then all 1-2, then all 2-0, [3 F, 2], the smaller first."""
     return torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
-
-
-def _expanded(indices: Tensor, batch: int) -> Tensor:
-    """Indices [N] or [B, N] as [B, N, 3], without a copy."""
-    return indices.expand(batch, -1).unsqueeze(-1).expand(-1, -1, 3)
-
-
-def _gather(rows: Tensor, indices: Tensor) -> Tensor:
-    """Rows ``[B, N, 3]`` of ``[B, V, 3]``. On a CPU, torch.gather is the fastest way, forward and
-    backward.
-    """
-    return torch.gather(rows, 1, _expanded(indices, rows.shape[0]))
-
-
-def _scatter_sum(rows: Tensor, indices: Tensor, count: int) -> Tensor:
-    """Sums ``[B, count, 3]`` of the rows ``[B, N, 3]`` that go to the same index."""
-    sums = rows.new_zeros(rows.shape[0], count, 3)
-    return sums.scatter_add(1, _expanded(indices, rows.shape[0]), rows)

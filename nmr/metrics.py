@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from ._validate import cast_under_autocast, check_number, check_size, check_vertices, describe
-from .mesh import _face_cross, _gather, _unit, face_vertices
+from ._vectors import face_cross, gather_rows, unit
+from .mesh import face_vertices
 
 __all__ = [
     "SurfacePoints",
@@ -77,7 +78,7 @@ def sample_surface(
     count = check_size(count, "count", 1 << 30)
     batched = check_vertices(vertices)
     corners = face_vertices(batched, faces)
-    cross = _face_cross(corners)
+    cross = face_cross(corners)
     area = torch.linalg.vector_norm(cross.detach().double(), dim=-1)
     total = area.sum(1)
     bad = (~(total.isfinite() & (total > 0))).nonzero()
@@ -88,9 +89,9 @@ def sample_surface(
         2, *face_index.shape, 1, generator=generator, dtype=batched.dtype, device=batched.device
     )
     r, s = random[0].sqrt(), random[1]
-    p0, p1, p2 = (_gather(corner, face_index) for corner in corners.unbind(2))
+    p0, p1, p2 = (gather_rows(corner, face_index) for corner in corners.unbind(2))
     points = (1 - r) * p0 + r * (1 - s) * p1 + r * s * p2
-    normals = _unit(_gather(cross, face_index))
+    normals = unit(gather_rows(cross, face_index))
     if vertices.ndim == 2:
         return SurfacePoints(points.squeeze(0), normals.squeeze(0), face_index.squeeze(0))
     return SurfacePoints(points, normals, face_index)
@@ -297,7 +298,7 @@ def _to_nearest(a: Tensor, b: Tensor) -> Tensor:
     """Vectors from each point of a [B, N, 3] to its nearest point of b [B, M, 3]. Differentiable
     in both.
     """
-    return _gather(b, _nearest(a.detach(), b.detach())) - a
+    return gather_rows(b, _nearest(a.detach(), b.detach())) - a
 
 
 def _length(vectors: Tensor) -> Tensor:

@@ -25,8 +25,8 @@ from ._validate import (
     describe,
     holds_for_all,
 )
+from ._vectors import unit
 from .cameras.projection import has_perspective
-from .mesh import _unit
 
 if TYPE_CHECKING:
     from .fragments import Fragments
@@ -444,7 +444,7 @@ class NormalMap(UVTexture):
             world.expand(len(fragments.faces), -1, -1) if fragments.faces.ndim == 3 else world
         )
         normals = -ops.normals(all_vertices, fragments.faces, fragments.mesh.starts, True)
-        n = _unit(ops.interpolate(normals, fragments.faces, *fragments._at))
+        n = unit(ops.interpolate(normals, fragments.faces, *fragments._at))
         sides, changes = [], []  # from corner 0 to corners 1 and 2, in space and in uv
         for k in (1, 2):
             weights = fragments.weights.new_zeros(3)
@@ -455,9 +455,9 @@ class NormalMap(UVTexture):
         (du1, dv1), (du2, dv2) = (change.split(1, dim=-1) for change in changes)
         turned = torch.sign(du1 * dv2 - du2 * dv1)  # -1: the image is mirrored on the face
         along = turned * (dv2 * sides[0] - dv1 * sides[1])
-        t = _unit(along - n * (n * along).sum(-1, keepdim=True))
+        t = unit(along - n * (n * along).sum(-1, keepdim=True))
         x, y, z = texel.split(1, dim=-1)
-        mapped = _unit(x * t + y * turned * torch.linalg.cross(n, t) + z * n)
+        mapped = unit(x * t + y * turned * torch.linalg.cross(n, t) + z * n)
         return mapped
 
 

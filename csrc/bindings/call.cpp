@@ -1,25 +1,26 @@
 #include "call.h"
 
 #include <algorithm>
-#include <cstdlib>
 
 namespace nmr {
 namespace {
 
-std::vector<std::string_view> split(std::string_view text, std::string_view separator) {
-  std::vector<std::string_view> parts;
+// Calls part(text) for the parts of a text until one gives true, and returns whether one did.
+// Nothing is allocated: for small meshes that would take longer than the kernel.
+template <class Part>
+bool any_part(std::string_view text, std::string_view separator, const Part& part) {
   while (true) {
     const size_t end = std::min(text.find(separator), text.size());
-    parts.push_back(text.substr(0, end));
-    if (end == text.size()) return parts;
+    if (part(text.substr(0, end))) return true;
+    if (end == text.size()) return false;
     text.remove_prefix(end + separator.size());
   }
 }
 
-// "[A, B]" as A and B.
-std::vector<std::string_view> axes_of(std::string_view shape) {
-  if (shape == "[]") return {};
-  return split(shape.substr(1, shape.size() - 2), ", ");
+// The same for the sizes A and B of "[A, B]".
+template <class Part>
+bool any_axis(std::string_view shape, const Part& part) {
+  return shape != "[]" && any_part(shape.substr(1, shape.size() - 2), ", ", part);
 }
 
 std::string_view shapes_of(std::string_view text) { return text.substr(text.find('[')); }
@@ -39,12 +40,13 @@ const char* type_name(Type type) {
 Argument& require_type(Argument& argument, Type type) {
   if (argument.type == Type::none || (argument.type == type && argument.contiguous))
     return argument;
-  throw WrongType(argument.name + " must be a C-contiguous array of " + type_name(type) + ", got " +
+  throw WrongType(std::string(argument.name) + " must be a C-contiguous array of " +
+                  type_name(type) + ", got " +
                   (argument.type == type ? "one with gaps" : type_name(argument.type)));
 }
 
 [[noreturn]] void refuse_shape(const Argument& argument, const std::string& wanted) {
-  throw std::invalid_argument(argument.name + " must have shape " + wanted + ", got " +
+  throw std::invalid_argument(std::string(argument.name) + " must have shape " + wanted + ", got " +
                               argument.shape_text());
 }
 
@@ -62,48 +64,54 @@ std::string Argument::shape_text() const {
   return "[" + text + "]";
 }
 
-const Argument* Call::look_up(const std::string& name) const {
+const Argument* Call::look_up(std::string_view name) const {
   for (const Argument& argument : arguments_)
     if (argument.name == name) return &argument;
   return nullptr;
 }
 
-bool Call::has(const std::string& name) const {
+bool Call::has(std::string_view name) const {
   const Argument* argument = look_up(name);
   return argument && argument->type != Type::none;
 }
 
-const Argument& Call::operator()(const std::string& name) const {
+const Argument& Call::operator()(std::string_view name) const {
   const Argument* argument = look_up(name);
-  if (!argument) throw WrongType("the argument " + name + " is missing");
+  if (!argument) throw WrongType("the argument " + std::string(name) + " is missing");
   return *argument;
 }
 
-bool Call::is_double(const std::string& of) const {
-  if (!of.empty()) return (*this)((backward ? "grad_" : "") + of).type == Type::float64;
+bool Call::is_double(std::string_view of) const {
+  if (!of.empty())
+    return (*this)(backward ? gradient_of(of) : std::string(of)).type == Type::float64;
   for (const Argument& argument : arguments_)
     if (argument.type == Type::float32 || argument.type == Type::float64)
       return argument.type == Type::float64;
   return false;
 }
 
-Argument& Call::find(const std::string& name, bool may_be_none) {
+Argument& Call::find(std::string_view name, bool may_be_none) {
   Argument& argument = const_cast<Argument&>((*this)(name));
   argument.read = true;
-  if (argument.type == Type::none && !may_be_none) throw WrongType(name + " must not be None");
+  if (argument.type == Type::none && !may_be_none)
+    throw WrongType(std::string(name) + " must not be None");
   return argument;
 }
 
-double Call::number(const std::string& name) {
+double Call::number(std::string_view name) {
   const Argument& argument = find(name, false);
   if (argument.type != Type::number)
-    throw WrongType(name + " must be a number, got " + type_name(argument.type));
+    throw WrongType(std::string(name) + " must be a number, got " + type_name(argument.type));
   return argument.number;
 }
 
 // A number, or a size with a name; -1 if it is not known yet.
 int64_t Call::value_of(std::string_view size) const {
-  if (size[0] >= '0' && size[0] <= '9') return std::strtoll(std::string(size).c_str(), nullptr, 10);
+  if (size[0] >= '0' && size[0] <= '9') {
+    int64_t number = 0;
+    for (char digit : size) number = 10 * number + (digit - '0');
+    return number;
+  }
   const auto [name, more] = name_and_more(size);
   for (const auto& [known, value] : sizes_)
     if (known == name) return value + more;
@@ -118,61 +126,61 @@ int64_t Call::operator[](std::string_view size) const {
 
 // One size of an array. An unknown name takes the actual size.
 bool Call::fits(std::string_view axis, int64_t actual) {
-  for (std::string_view choice : split(axis, "|")) {
+  return any_part(axis, "|", [&](std::string_view choice) {
     const int64_t value = value_of(choice);
     if (value == actual) return true;
     const auto [name, more] = name_and_more(choice);
-    if (value >= 0 || actual < more) continue;
+    if (value >= 0 || actual < more) return false;
     let(name, actual - more);
     return true;
-  }
-  return false;
+  });
 }
 
 bool Call::fits(std::string_view shape, const Argument& argument) {
-  std::vector<std::string_view> axes = axes_of(shape);
-  const bool open = !axes.empty() && axes.back() == "...";
-  if (open) axes.pop_back();
-  if (open ? axes.size() > argument.shape.size() : axes.size() != argument.shape.size())
-    return false;
-  const size_t known = sizes_.size();
-  for (size_t d = 0; d < axes.size(); ++d) {
-    if (fits(axes[d], argument.shape[d])) continue;
-    sizes_.resize(known);
-    return false;
-  }
-  return true;
+  const size_t known = sizes_.size(), axes = argument.shape.size();
+  size_t d = 0;
+  bool open = false;
+  const bool differs = any_axis(shape, [&](std::string_view axis) {
+    open = axis == "...";
+    return !open && (d == axes || !fits(axis, argument.shape[d++]));
+  });
+  if (!differs && (open || d == axes)) return true;
+  sizes_.resize(known);
+  return false;
 }
 
 // Shapes as an error shows them: with the numbers that are known.
 std::string Call::wanted(std::string_view shapes) const {
   std::string text;
-  for (std::string_view shape : split(shapes, " or ")) {
+  any_part(shapes, " or ", [&](std::string_view shape) {
     std::string sizes;
-    for (std::string_view axis : axes_of(shape)) {
+    any_axis(shape, [&](std::string_view axis) {
       sizes += sizes.empty() ? "" : ", ";
-      for (std::string_view choice : split(axis, "|")) {
+      return any_part(axis, "|", [&](std::string_view choice) {
         const int64_t value = value_of(choice);
         sizes += (choice.data() == axis.data() ? "" : " or ") +
                  (value < 0 ? std::string(choice) : std::to_string(value));
-      }
-    }
+        return false;
+      });
+    });
     text += (text.empty() ? "[" : " or [") + sizes + "]";
-  }
+    return false;
+  });
   return text;
 }
 
 Argument& Call::bind(std::string_view text, const char* prefix, Type type, bool may_be_none) {
-  const std::string name(text.substr(0, text.find_first_of("? ")));
-  Argument& argument = require_type(find(prefix + name, may_be_none), type);
+  const std::string_view name = text.substr(0, text.find_first_of("? "));
+  Argument& found =
+      *prefix ? find(prefix + std::string(name), may_be_none) : find(name, may_be_none);
+  Argument& argument = require_type(found, type);
   if (argument.type == Type::none) return argument;
-  for (std::string_view shape : split(shapes_of(text), " or "))
-    if (fits(shape, argument)) return argument;
+  if (any_part(shapes_of(text), " or ", [&](auto shape) { return fits(shape, argument); }))
+    return argument;
   refuse_shape(argument, wanted(shapes_of(text)));
 }
 
-Argument& Call::bind_like(const std::string& of, const std::string& name, Type type,
-                          bool may_be_none) {
+Argument& Call::bind_like(std::string_view of, std::string_view name, Type type, bool may_be_none) {
   Argument& argument = require_type(find(name, may_be_none), type);
   const Argument& like = (*this)(of);
   if (argument.type != Type::none && argument.shape != like.shape)
@@ -182,14 +190,17 @@ Argument& Call::bind_like(const std::string& of, const std::string& name, Type t
 
 int64_t Call::count_of(std::string_view text) const {
   int64_t count = 1;
-  for (std::string_view axis : axes_of(shapes_of(text))) count *= (*this)[axis];
+  any_axis(shapes_of(text), [&](std::string_view axis) {
+    count *= (*this)[axis];
+    return false;
+  });
   return count;
 }
 
 void Call::require_all_read() const {
   for (const Argument& argument : arguments_)
     if (!argument.read && argument.type > Type::number)
-      throw WrongType("there is no argument " + argument.name);
+      throw WrongType("there is no argument " + std::string(argument.name));
 }
 
 }  // namespace nmr

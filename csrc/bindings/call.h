@@ -33,7 +33,7 @@ constexpr Type type_of(const bool*) { return Type::boolean; }
 
 // An array, a number, or None. Its memory belongs to the caller.
 struct Argument {
-  std::string name;
+  std::string_view name;
   Type type = Type::none;
   double number = 0;
   void* data = nullptr;
@@ -54,13 +54,13 @@ class Call {
 
   // Whether the floats are float64: those of a result, or else those of the first array that has
   // floats.
-  bool is_double(const std::string& of) const;
-  bool has(const std::string& name) const;  // an array is given, and not None
-  const Argument& operator()(const std::string& name) const;
+  bool is_double(std::string_view of) const;
+  bool has(std::string_view name) const;  // an array is given, and not None
+  const Argument& operator()(std::string_view name) const;
   int64_t operator[](std::string_view size) const;  // a size that is known by now
   void let(std::string_view size, int64_t value) { sizes_.emplace_back(size, value); }
-  double number(const std::string& name);
-  bool flag(const std::string& name) { return number(name) != 0; }
+  double number(std::string_view name);
+  bool flag(std::string_view name) { return number(name) != 0; }
 
   // Binds an array to a field of the kernel's struct: "name [sizes] or [sizes]". A size is a
   // number, a name, a name + 1, or several of these with | between them; "..." at the end stands
@@ -72,7 +72,7 @@ class Call {
 
   // The same shape as another array.
   template <class P>
-  void read_like(const std::string& of, const std::string& name, P*& field) {
+  void read_like(std::string_view of, std::string_view name, P*& field) {
     assign(bind_like(of, name, type_of(field), false), field);
   }
 
@@ -93,19 +93,17 @@ class Call {
 
   // In the backward pass: where the gradient of an argument goes, or nullptr if it is not wanted.
   template <class T>
-  void gradient(const std::string& of, T*& grad) {
-    if (backward) assign(bind_like(of, "grad_" + of, type_of(grad), true), grad);
+  void gradient(std::string_view of, T*& grad) {
+    if (backward) assign(bind_like(of, gradient_of(of), type_of(grad), true), grad);
   }
 
   // The same for a kernel with one differentiable argument: its gradient must be wanted.
   template <class T>
-  void only_gradient(const std::string& of, T*& grad) {
-    if (backward) assign(bind_like(of, "grad_" + of, type_of(grad), false), grad);
+  void only_gradient(std::string_view of, T*& grad) {
+    if (backward) assign(bind_like(of, gradient_of(of), type_of(grad), false), grad);
   }
 
-  void skip(const std::string& name) {
-    find(name, true);
-  }  // an array that only the other pass needs
+  void skip(std::string_view name) { find(name, true); }  // an array that only the other pass needs
   void require_all_read() const;
 
  private:
@@ -118,10 +116,11 @@ class Call {
     field = static_cast<P*>(argument.data);
     return argument;
   }
-  const Argument* look_up(const std::string& name) const;
-  Argument& find(const std::string& name, bool may_be_none);
+  static std::string gradient_of(std::string_view name) { return "grad_" + std::string(name); }
+  const Argument* look_up(std::string_view name) const;
+  Argument& find(std::string_view name, bool may_be_none);
   Argument& bind(std::string_view text, const char* prefix, Type type, bool may_be_none);
-  Argument& bind_like(const std::string& of, const std::string& name, Type type, bool may_be_none);
+  Argument& bind_like(std::string_view of, std::string_view name, Type type, bool may_be_none);
   int64_t value_of(std::string_view size) const;
   bool fits(std::string_view axis, int64_t actual);
   bool fits(std::string_view shape, const Argument& argument);

@@ -1,33 +1,18 @@
-// Cameras, and the projection of vertices.
+// Cameras: vertices to renderer space.
 #include "read.h"
 
 namespace nmr {
 namespace {
 
-// One for all images, or one for each.
+// A parameter of cameras and its gradient; None if it is not given. It has `size` numbers if there
+// is one for all.
 template <class P>
-bool read_each(Call& call, std::string_view text, P*& field, size_t axes_of_one) {
-  const std::vector<int64_t>& shape = call.read(text, field).shape;
-  return shape.size() > axes_of_one && shape[0] == call["B"];
-}
-
-template <class T>
-LookAt<T> read_look_at(Call& call) {
-  LookAt<T> args{};
-  call.result("camera [B, 22]", args.camera, args.grad_camera);
-  args.batch = call["B"];
-  args.eye_each = read_each(call, "eye [3] or [1|B, 3]", args.eye, 1);
-  args.at_each = read_each(call, "at [3] or [1|B, 3]", args.at, 1);
-  args.up_each = read_each(call, "up [3] or [1|B, 3]", args.up, 1);
-  args.view_each = read_each(call, "view [] or [1|B]", args.view, 0);
-  args.along = call.flag("along");
-  args.right_handed = call.flag("right_handed");
-  args.perspective = call.flag("perspective");
-  call.gradient("eye", args.grad_eye);
-  call.gradient("at", args.grad_at);
-  call.gradient("up", args.grad_up);
-  call.gradient("view", args.grad_view);
-  return args;
+Parameter<P> read_parameter(Call& call, std::string_view text, int64_t size) {
+  Parameter<P> parameter{};
+  const Argument& values = call.read(text, parameter.values);
+  parameter.each = parameter.values && values.count() != size;
+  call.gradient(text.substr(0, text.find('?')), parameter.grad);
+  return parameter;
 }
 
 template <class T>
@@ -35,36 +20,51 @@ Project<T> read_project(Call& call) {
   Project<T> args{};
   const bool packed = call.has("starts");
   call.read("starts? [B + 1, 2]", args.starts);
-  call.result(packed ? "points [V, 3]" : "points [B, V, 3]", args.points, args.grad_points);
-  args.batch = call["B"];
-  args.num_vertices = call["V"];
   args.vertex_batch =
       call.read(packed ? "vertices [V, 3]" : "vertices [1|B, V, 3]", args.vertices).shape[0];
-  args.camera_each = call.read("camera [1|B, 22]", args.camera).shape[0] == args.batch;
-  const Argument& distortion = call.read("distortion? [1|B, 4|5|8]", args.distortion);
-  args.distortion_each = args.distortion && distortion.shape[0] == args.batch;
-  args.coefficients = args.distortion ? distortion.shape[1] : 0;
+  args.num_vertices = call["V"];
+  args.cameras = call.read("camera [1|B, 22]", args.camera).shape[0];
+  const Argument& distortion = call.read("distortion? [1|B, 4|5|8]", args.distortion.values);
+  if (call.backward && !call.has("grad_points")) call.let("B", 1);  // if it is not known by now
+  call.result(packed ? "points [V, 3]" : "points [B, V, 3]", args.points, args.grad_points);
+  args.batch = call["B"];
   if (packed)
     require_starts(args.starts, args.batch, args.num_vertices, args.starts[2 * args.batch + 1]);
-  args.perspective = call.flag("perspective");
-  args.num_threads = num_threads(call);
   call.gradient("vertices", args.grad_vertices);
-  call.gradient("camera", args.grad_camera);
-  call.gradient("distortion", args.grad_distortion);
+  call.let("n", args.cameras);
+  args.perspective = call.flag("perspective");
+
+  args.eye = read_parameter<double>(call, "eye? [3] or [1|n, 3]", 3);
+  args.at = read_parameter<double>(call, "at? [3] or [1|n, 3]", 3);
+  args.up = read_parameter<double>(call, "up? [3] or [1|n, 3]", 3);
+  args.view = read_parameter<double>(call, "view? [] or [1|n]", 1);
+  args.along = call.flag("along");
+  args.right_handed = call.flag("right_handed");
+  args.matrix = read_parameter<T>(call, "matrix? [1|n, 3, 4]", 12);
+  args.intrinsics = read_parameter<T>(call, "intrinsics? [1|n, 2, 3]", 6);
+  args.origin = read_parameter<T>(call, "origin? [1|n, 3]", 3);
+  args.extent = read_parameter<T>(call, "extent? [1|n]", 1);
+  args.across = static_cast<T>(call.number("across"));
+  args.down = static_cast<T>(call.number("down"));
+  const bool posed = call.has("eye") && call.has("at") && call.has("up") && call.has("view");
+  require(posed || (!call.has("eye") && call.has("matrix") && call.has("intrinsics")),
+          "a camera is a pose (eye, at, up, view), or has a matrix and intrinsics");
+
+  call.gradient("distortion", args.distortion.grad);
+  args.distortion.each = args.distortion.values && distortion.shape[0] == args.batch;
+  args.coefficients = args.distortion.values ? distortion.shape[1] : 0;
+  if (call.backward) {
+    call.read("grad_camera? [n, 22]", args.grad_camera);
+    call.skip("nearest");
+  } else {
+    call.read("nearest []", args.nearest);
+  }
+  args.num_threads = num_threads(call);
   return args;
 }
 
 }  // namespace
 
-void add_camera(Kernels& kernels) {
-  kernels.add_with_backward(
-      "look_at",
-      [](auto zero, Call& call) {
-        const auto args = read_look_at<decltype(zero)>(call);
-        call.backward ? look_at_backward(args) : look_at_forward(args);
-      },
-      "camera");
-  NMR_ADD_STAGE(kernels, project);
-}
+void add_camera(Kernels& kernels) { NMR_ADD_STAGE(kernels, project); }
 
 }  // namespace nmr

@@ -38,7 +38,7 @@ void add_fragments(Kernels& kernels) {
   NMR_ADD_STAGE(kernels, fragments);
   kernels.add_with_backward("depth_image", [](auto zero, Call& call) {
     const auto args = read_depth<decltype(zero)>(call);
-    call.backward ? depth_backward(args) : depth_forward(args);
+    call.backward ? fragments_backward(args) : fragments_forward(args);
   });
 }
 

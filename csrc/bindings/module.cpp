@@ -51,44 +51,58 @@ struct Torch {
   }
 };
 
-py::object ask(const py::handle& value, const py::handle& method) {
-  PyObject* answer = PyObject_CallMethodNoArgs(value.ptr(), method.ptr());
+py::object checked(PyObject* answer) {
   if (!answer) throw py::error_already_set();
   return py::reinterpret_steal<py::object>(answer);
 }
 
-// A tensor in host memory. One with gaps is copied; `kept` holds the copy during the call.
-void read_tensor(py::object tensor, Argument& argument, py::list& kept) {
+py::object attribute(const py::handle& value, const py::handle& name) {
+  return checked(PyObject_GetAttr(value.ptr(), name.ptr()));
+}
+
+py::object ask(const py::handle& value, const py::handle& method) {
+  return checked(PyObject_CallMethodNoArgs(value.ptr(), method.ptr()));
+}
+
+// A tensor in host memory. One with gaps is copied; `copies` holds the copy during the call.
+void read_tensor(py::handle tensor, Argument& argument, std::vector<py::object>& copies) {
   const Torch& torch = Torch::get();
-  if (!py::getattr(tensor, torch.is_cpu).cast<bool>())
-    throw py::type_error(argument.name + " must be in host memory");
-  if (ask(tensor, torch.is_neg).cast<bool>()) tensor = tensor.attr("resolve_neg")();
-  if (!ask(tensor, torch.is_contiguous).cast<bool>()) tensor = tensor.attr("contiguous")();
-  kept.append(tensor);
-  argument.data = reinterpret_cast<void*>(ask(tensor, torch.data_ptr).cast<uintptr_t>());
-  for (const py::handle& size : py::getattr(tensor, torch.shape))
-    argument.shape.push_back(size.cast<int64_t>());
+  const auto replace = [&](const char* method) {
+    copies.push_back(tensor.attr(method)());
+    tensor = copies.back();
+  };
+  if (attribute(tensor, torch.is_cpu).ptr() != Py_True)
+    throw py::type_error(std::string(argument.name) + " must be in host memory");
+  if (ask(tensor, torch.is_neg).ptr() == Py_True) replace("resolve_neg");
+  if (ask(tensor, torch.is_contiguous).ptr() != Py_True) replace("contiguous");
+  argument.data = PyLong_AsVoidPtr(ask(tensor, torch.data_ptr).ptr());
+  const py::tuple shape = attribute(tensor, torch.shape);
+  argument.shape.reserve(shape.size());
+  for (const py::handle& size : shape) argument.shape.push_back(PyLong_AsLongLong(size.ptr()));
   argument.type = Type::other;
-  const py::object dtype = py::getattr(tensor, torch.dtype);
+  const py::object dtype = attribute(tensor, torch.dtype);
   for (const auto& [known, type] : torch.dtypes)
     if (dtype.is(known)) argument.type = type;
 }
 
-Argument argument_of(const py::handle& name, const py::handle& value, py::list& kept) {
+// The names and values belong to the caller.
+Argument argument_of(const py::handle& name, const py::handle& value,
+                     std::vector<py::object>& copies) {
   Argument argument;
-  argument.name = py::cast<std::string>(name);
+  argument.name = py::cast<std::string_view>(name);
   if (value.is_none()) return argument;
-  if (PyObject_TypeCheck(value.ptr(), reinterpret_cast<PyTypeObject*>(Torch::get().tensor.ptr()))) {
-    read_tensor(py::reinterpret_borrow<py::object>(value), argument, kept);
+  if (PyFloat_Check(value.ptr()) || PyLong_Check(value.ptr())) {
+    argument.type = Type::number;
+    argument.number = value.cast<double>();
+  } else if (PyObject_TypeCheck(value.ptr(),
+                                reinterpret_cast<PyTypeObject*>(Torch::get().tensor.ptr()))) {
+    read_tensor(value, argument, copies);
   } else if (py::isinstance<py::array>(value)) {
     const auto array = py::reinterpret_borrow<py::array>(value);
     argument.type = type_of(array.dtype());
     argument.data = const_cast<void*>(array.data());
     argument.contiguous = array.flags() & py::array::c_style;
     argument.shape.assign(array.shape(), array.shape() + array.ndim());
-  } else if (PyFloat_Check(value.ptr()) || PyLong_Check(value.ptr())) {
-    argument.type = Type::number;
-    argument.number = value.cast<double>();
   } else {
     argument.type = Type::other;
   }
@@ -97,10 +111,10 @@ Argument argument_of(const py::handle& name, const py::handle& value, py::list& 
 
 void define(py::module_& m, const std::string& name, const Kernel& kernel, bool backward) {
   m.def(name.c_str(), [run = kernel.run, backward](const py::kwargs& given) {
-    py::list kept;
+    std::vector<py::object> copies;
     std::vector<Argument> arguments;
     arguments.reserve(given.size());
-    for (const auto& [key, value] : given) arguments.push_back(argument_of(key, value, kept));
+    for (const auto& [key, value] : given) arguments.push_back(argument_of(key, value, copies));
     Call call(std::move(arguments), backward);
     try {
       const py::gil_scoped_release release;

@@ -4,24 +4,12 @@
 namespace nmr {
 namespace {
 
-// -1 if no mesh has a vertex behind the plane: all stay as they are.
 template <class T>
-void count_clipped(Call& call) {
-  const T* vertices = nullptr;
-  const T near = static_cast<T>(call.number("near"));
-  const bool packed = call.has("starts");
-  const Argument& points = call.read(packed ? "vertices [N, 3]" : "vertices [B, V, 3]", vertices);
-  ClipCount<T> args{{}, near, nullptr, num_threads(call)};
-  const Argument& counts = call.read("counts [meshes, 2]", args.counts);
-  if (!crosses_near(vertices, points.count() / 3, near)) {
-    for (const char* name : {"faces", "starts"}) call.skip(name);
-    std::fill_n(args.counts, counts.count(), int64_t(-1));
-    return;
-  }
-  args.mesh = read_mesh<T>(call);
-  require(call["B"] == call["meshes"],
-          "counts must have a row per mesh, got " + counts.shape_text());
-  clip_count(args);
+ClipCount<T> read_clip_count(Call& call) {
+  ClipCount<T> args{read_mesh<T>(call), static_cast<T>(call.number("near")), nullptr,
+                    num_threads(call)};
+  call.read("counts [B, 2]", args.counts);
+  return args;
 }
 
 template <class T>
@@ -97,7 +85,8 @@ void pull_silhouette(Call& call) {
 }  // namespace
 
 void add_raster(Kernels& kernels) {
-  kernels.add("clip_count", [](auto zero, Call& call) { count_clipped<decltype(zero)>(call); });
+  kernels.add("clip_count",
+              [](auto zero, Call& call) { clip_count(read_clip_count<decltype(zero)>(call)); });
   kernels.add("clip_faces",
               [](auto zero, Call& call) { clip_faces(read_clip<decltype(zero)>(call)); });
   kernels.add("rasterize",

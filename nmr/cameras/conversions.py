@@ -12,6 +12,8 @@ and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -366,6 +368,7 @@ def from_pytorch3d(
     return kind(_PYTORCH3D_AXES * matrix, intrinsics, perspective=not orthographic)
 
 
+@dataclass(frozen=True, eq=False)
 class _SquareProjection(Projection, SquarePixels):
     """A projection whose [-1, 1] belongs to the shorter side of an image."""
 

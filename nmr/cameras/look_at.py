@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .. import ops
 from .._validate import as_numbers, callers_level, holds_for_all
 from .projection import (
     Numbers,
@@ -115,38 +114,36 @@ class _Placed(SquarePixels):
 
         Not when compiled, traced or on a GPU.
         """
-        parameters = [x.detach() for x in self._parameters()]
-        if torch.compiler.is_compiling() or not all(x.is_cpu for x in parameters):
+        if torch.compiler.is_compiling() or not all(x.is_cpu for x in self._parameters()):
             return
-        rows = ops.look_at(
-            *(x.double() for x in parameters), self._along, False, self.perspective, True
-        )
+        with torch.no_grad():
+            matrix = self.projection().matrix
         # 1, but less if up x forward is too short to be stretched
-        sideways = rows[:, :3].square().sum(1)
+        sideways = matrix[:, 0].square().sum(1)
         if holds_for_all(sideways > _UNIT):
             return
         warn_if_not_finite(self, *names)
         which = (sideways <= _UNIT).nonzero().flatten().tolist()
         if which:
             warnings.warn(
-                f"camera {which[0]} of {len(rows)} looks along its up vector, or at its own place ({len(which)} in all)"
-                ": it has no left and right. Its image is squeezed to a part of its width, or empty. Give it another "
-                "up, for example up=(0, 0, 1) to look straight down, or another place.",
+                f"camera {which[0]} of {len(matrix)} looks along its up vector, or at its own place "
+                f"({len(which)} in all): it has no left and right. Its image is squeezed to a part of its width, or "
+                "empty. Give it another up, for example up=(0, 0, 1) to look straight down, or another place.",
                 stacklevel=callers_level(),
             )
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.eye, getattr(self, self._names[0]), self.up, self._view
 
-    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, None, bool]:
-        parameters = (x.to("cpu", torch.float64) for x in self._parameters())
-        how = self._along, bool(self.right_handed), self.perspective, dtype == torch.float64
-        return ops.look_at(*parameters, *how), None, self.perspective
+    def _given(self, dtype: torch.dtype) -> tuple:
+        pose = (x.to("cpu", torch.float64) for x in self._parameters())
+        how = self._along, bool(self.right_handed), self.perspective
+        return *pose, None, None, None, None, None, *how
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        rows, *_ = self._rows(dtype)
+        _, rows, _ = self._project(torch.empty(1, 0, 3, dtype=dtype, device="cpu"), 1, None)
         matrix, intrinsics, origin, extent = rows.split([12, 6, 3, 1], dim=1)
-        matrix, intrinsics = matrix.reshape(-1, 3, 4), intrinsics.reshape(-1, 2, 3)
+        matrix, intrinsics = matrix.unflatten(1, (3, 4)), intrinsics.unflatten(1, (2, 3))
         return Projection(matrix, intrinsics, None, self.perspective, origin, extent.squeeze(1))
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from .. import ops
@@ -55,6 +55,7 @@ class ProjectingCamera(Poses):
     """Base class of cameras that define :meth:`projection`; it provides :meth:`transform`."""
 
     perspective = True
+    _stretch = 1.0, 1.0  # see SquarePixels
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
         """The camera in its general form, computed in ``dtype`` in host memory; differentiable in
@@ -62,11 +63,9 @@ class ProjectingCamera(Poses):
         """
         raise NotImplementedError
 
-    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None, bool]:
-        """For :func:`nmr.ops.project`, in host memory: camera ``[B, 22]``, distortion, and
-        whether in perspective.
-        """
-        return self.projection(dtype)._rows(dtype)
+    def _given(self, dtype: torch.dtype) -> tuple:
+        """The arguments of :func:`nmr.ops.project` from ``eye`` to ``perspective``."""
+        return self.projection(dtype)._given(dtype)
 
     def for_image(self, height: int, width: int) -> ProjectingCamera:
         """The camera for an image of height x width pixels.
@@ -105,17 +104,20 @@ class ProjectingCamera(Poses):
         TypeError, ValueError
             For wrong types and shapes, or a camera with another batch size than the vertices.
         """
-        vertices, meshes = _check_batch(vertices, starts)
-        rows, distortion, perspective = self._rows(vertices.dtype)
-        rows = rows.to(vertices)
-        distortion = None if distortion is None else distortion.to(vertices)
-        batch = len(rows) if distortion is None or len(distortion) == 1 else len(distortion)
+        return self._project(*_check_batch(vertices, starts), starts)[0]
+
+    def _project(
+        self, vertices: Tensor, meshes: int, starts: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """:func:`nmr.ops.project` of checked vertices."""
+        given = self._given(vertices.dtype)
+        batch = ops.count_cameras(*given)
         if batch != meshes and batch != 1 and (meshes != 1 or starts is not None):
             raise ValueError(
                 f"vertices and camera must have one batch size (or 1), got {meshes} meshes and {batch} poses"
                 + ("" if starts is None else "; packed meshes need one pose each, or one for all")
             )
-        return ops.project(vertices, rows, distortion, starts, perspective)
+        return ops.project(vertices, starts, *given, *self._stretch)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,21 +217,20 @@ class Projection(ProjectingCamera):
         return self.matrix, self.intrinsics, self.distortion, self.origin, self.extent
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        """The camera itself."""
-        return self
+        """The camera itself, with the intrinsics of its image."""
+        if self._stretch == (1.0, 1.0):
+            return self
+        factors = torch.tensor(self._stretch, dtype=dtype, device="cpu").unsqueeze(1)
+        intrinsics = self.intrinsics * factors
+        rest = self.distortion, self.perspective, self.origin, self.extent
+        return Projection(self.matrix, intrinsics, *rest)
 
-    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None, bool]:
+    def _given(self, dtype: torch.dtype) -> tuple:
         matrix, intrinsics, distortion, origin, extent = (
             None if x is None else x.to("cpu", dtype) for x in self.parameters()
         )
-        origin = matrix.new_zeros(1, 3) if origin is None else origin
-        extent = matrix.new_ones(1) if extent is None else extent
-        parts = (matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1))
-        batch = self.batch
-        rows = torch.cat(
-            [part if len(part) == batch else part.expand(batch, -1) for part in parts], dim=1
-        )
-        return rows, distortion, self.perspective
+        parts = None, None, None, None, matrix, intrinsics, origin, extent, distortion
+        return *parts, False, False, self.perspective
 
     def plain(self) -> Projection:
         """The same camera in float64, without origin and extent."""
@@ -272,40 +273,20 @@ class Projection(ProjectingCamera):
         return torch.cat([place.expand(batch, 3), rest.expand(batch, 2)], dim=1)
 
 
+@dataclass(frozen=True, eq=False)
 class SquarePixels(ProjectingCamera):
     """Base class of cameras whose field of view belongs to the shorter side of an image."""
 
+    # factors of x and y in an image that is not square: see for_image
+    _stretch: tuple[float, float] = field(default=(1.0, 1.0), repr=False, kw_only=True)
+
     def for_image(self, height: int, width: int) -> ProjectingCamera:
-        return self if height == width else _Shaped(self, height, width)
-
-
-@dataclass(frozen=True, eq=False)
-class _Shaped(ProjectingCamera):
-    """A camera with square pixels in an image that is not square: x and y count from -1 to 1
-    across its sides.
-    """
-
-    camera: ProjectingCamera
-    height: int
-    width: int
-
-    @property
-    def perspective(self) -> bool:
-        return self.camera.perspective
-
-    def projection(self, dtype: torch.dtype = torch.float64) -> Projection:
-        square = self.camera.projection(dtype)
-        return replace(square, intrinsics=square.intrinsics * self._stretch(dtype).view(2, 3))
-
-    def _rows(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None, bool]:
-        rows, *rest = self.camera._rows(dtype)
-        return rows * F.pad(self._stretch(dtype), (12, 4), value=1.0), *rest
-
-    def _stretch(self, dtype: torch.dtype) -> Tensor:
-        """The factors ``[6]`` of the intrinsics."""
-        short = min(self.height, self.width)
-        across, down = short / self.width, short / self.height
-        return torch.tensor([across] * 3 + [down] * 3, dtype=dtype, device="cpu")
+        """The camera whose x and y count from -1 to 1 across the sides of such an image."""
+        if height == width or self._stretch != (1.0, 1.0):
+            return self
+        shaped, short = copy.copy(self), min(height, width)
+        object.__setattr__(shaped, "_stretch", (short / width, short / height))
+        return shaped
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -315,6 +296,19 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 def _sum_of_three(terms: Tensor) -> Tensor:
     """``[B, 1]`` of ``[B, 3]``, from left to right."""
     return (terms[:, :1] + terms[:, 1:2]) + terms[:, 2:]
+
+
+def transform(
+    camera: Camera, vertices: Tensor, meshes: int, starts: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """Checked vertices in renderer space, and the least depth of all, if the camera computes it."""
+    own = getattr(type(camera), "transform", None)
+    if own is ProjectingCamera.transform:
+        points, _, nearest = camera._project(vertices, meshes, starts)
+        return points, nearest
+    return (
+        camera.transform(vertices) if starts is None else camera.transform(vertices, starts=starts)
+    ), None
 
 
 def has_perspective(camera: Camera | None) -> bool:

@@ -15,7 +15,7 @@ same; row 0 = top. A face index map is int32:
 -1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
 """
 
-from .camera import look_at, project
+from .camera import count_cameras, project
 from .clip_space import antialias, clip_weights
 from .edges import resolve
 from .fragments import depth_image, fragments
@@ -33,11 +33,11 @@ __all__ = [
     "clip_count",
     "clip_faces",
     "clip_weights",
+    "count_cameras",
     "depth_image",
     "fragments",
     "interpolate",
     "lit",
-    "look_at",
     "mipmaps",
     "normals",
     "project",

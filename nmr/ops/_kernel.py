@@ -107,15 +107,27 @@ def _operator(
         like = args[first]
         if not like.is_cpu:
             outputs = run(*(x.cpu() if isinstance(x, Tensor) else x for x in args))
-            return tuple(x.to(like.device) for x in outputs) if several else outputs.to(like.device)
+            if not several:
+                return outputs.to(like.device)
+            # a gradient goes to the device of its argument
+            pairs = zip(outputs, allocate(*args), strict=True)
+            return tuple(x if x is None else x.to(to.device) for x, to in pairs)
         outputs = allocate(*args)
         found = outputs if several else (outputs,)
-        if has_wanted:
-            *args, wanted = args
-            found = [x if want else None for x, want in zip(found, wanted, strict=True)]
-        given = dict(zip(names, (*args, *found), strict=True))
-        getattr(_C, name)(**given, num_threads=torch.get_num_threads())
+        given = dict(zip(names, (*args[: len(args) - has_wanted], *found), strict=True))
+        given["num_threads"] = torch.get_num_threads()
+        getattr(_C, name)(**given)
         return outputs
+
+    def filled(compute, args):
+        """The results of ``compute``. Those that are not wanted are empty: torch needs tensors."""
+        outputs = compute(*args)
+        if not has_wanted:
+            return outputs
+        nothing = args[first].new_empty
+        if not several:
+            return nothing(0) if outputs is None else outputs
+        return tuple(nothing(0) if x is None else x for x in outputs)
 
     def call(*args):
         if torch.compiler.is_compiling() or not _PLAIN.issuperset(map(type, args)):
@@ -131,7 +143,7 @@ def _operator(
             return (x if d is None else x.select(d, i) for x, d in zip(args, dims, strict=True))
 
         dims = [d if isinstance(x, Tensor) else None for x, d in zip(args, in_dims, strict=True)]
-        items = [call(*item(i)) for i in range(info.batch_size)]
+        items = [filled(call, list(item(i))) for i in range(info.batch_size)]
         if not several:
             return torch.stack(items), 0
         return tuple(map(torch.stack, zip(*items, strict=True))), (0,) * len(results)
@@ -143,12 +155,13 @@ def _operator(
         else _TYPES[returned]
     )
     _LIBRARY.define(f"{name}({arguments}) -> {of_results}", tags=(torch.Tag.pt2_compliant_tag,))
-    _LIBRARY.impl(name, run, "CompositeExplicitAutograd")
+    call.run = lambda *args: filled(run, args)
+    _LIBRARY.impl(name, call.run, "CompositeExplicitAutograd")
     op = getattr(torch.ops.nmr, name).default
-    torch.library.register_fake(op, allocate, lib=_LIBRARY)
+    torch.library.register_fake(op, lambda *args: filled(allocate, args), lib=_LIBRARY)
     if hasattr(torch.library, "register_vmap"):  # torch < 2.5 loops, too, but warns that it is slow
         torch.library.register_vmap(op, one_by_one, lib=_LIBRARY)
-    call.op, call.run, call.vmap, call.direct, call.transformed = op, run, one_by_one, None, op
+    call.op, call.vmap, call.direct, call.transformed = op, one_by_one, None, op
     return call
 
 
@@ -182,10 +195,9 @@ def _add_gradient(
     without = [k for k, name in enumerate(results) if name in constant]
     upstream = [k for k in range(len(results)) if k not in without]
 
-    def allocate(*args):
-        like = next(x for x in args if isinstance(x, Tensor))
+    def allocate(*args):  # None: not wanted
         grads = [
-            args[k].new_empty(args[k].shape) if want else like.new_empty(0)
+            args[k].new_empty(args[k].shape) if want else None
             for k, want in zip(of, args[-1], strict=True)
         ]
         return tuple(grads) if len(of) > 1 else grads[0]
@@ -237,18 +249,31 @@ def _refuse_gradient(backward: Callable, used_by: str) -> None:
 
 
 def _add_second(backward: Callable, twice: Callable) -> None:
-    """``twice`` takes the tensors that ``backward`` takes, and returns all gradients."""
+    """``twice`` takes the arguments of ``backward`` but ``wanted``, and returns all gradients."""
 
     def set_up(ctx, inputs, output):
-        ctx.save_for_backward(*inputs[:-1])
-        ctx.wanted = inputs[-1]
+        *arguments, ctx.wanted = inputs
+        tensors = [k for k, x in enumerate(arguments) if isinstance(x, Tensor)]
+        ctx.save_for_backward(*(arguments[k] for k in tensors))
+        ctx.tensors, ctx.count = tensors, len(inputs)
+        ctx.others = [None if k in tensors else x for k, x in enumerate(arguments)]
 
     def pull(ctx, *grads):
-        def gradients(*inputs):
-            return tuple(x for x, want in zip(twice(*inputs), ctx.wanted, strict=True) if want)
+        arguments, found = list(ctx.others), [None] * ctx.count
+        for k, x in zip(ctx.tensors, ctx.saved_tensors, strict=True):
+            arguments[k] = x
+        floats = [k for k in ctx.tensors if arguments[k].is_floating_point()]
 
-        pulled = torch.func.vjp(gradients, *ctx.saved_tensors)[1]
-        return *pulled(tuple(x for x, want in zip(grads, ctx.wanted, strict=True) if want)), None
+        def gradients(*values):
+            for k, value in zip(floats, values, strict=True):
+                arguments[k] = value
+            return tuple(x for x, want in zip(twice(*arguments), ctx.wanted, strict=True) if want)
+
+        pulled = torch.func.vjp(gradients, *(arguments[k] for k in floats))[1]
+        upstream = tuple(x for x, want in zip(grads, ctx.wanted, strict=True) if want)
+        for k, grad in zip(floats, pulled(upstream), strict=True):
+            found[k] = grad
+        return tuple(found)
 
     _register_autograd(backward, pull, set_up)
 

@@ -1,54 +1,63 @@
-"""Operators: cameras as rows of numbers, and vertices from world space to renderer space.
+"""Operator: vertices from world space to renderer space."""
 
-A camera is a row of 22 numbers: ``[A | t]`` (3 x 4), K (2 x 3), the origin (3) and the extent.
-"""
-
-import torch
 from torch import Tensor
 
 from ._kernel import kernel
 
+# of each parameter of cameras from eye to distortion, if there is one for each camera
+_AXES = 2, 2, 2, 1, 3, 3, 2, 1, 2
 
-@kernel("camera", gradients="eye at up view", used_by="a camera's transform")
-def look_at(
-    eye: Tensor,
-    at: Tensor,
-    up: Tensor,
-    view: Tensor,
+
+def count_cameras(*parameters: Tensor | None) -> int:
+    """B of the parameters of :func:`project` from ``eye`` on: one for all cameras, or one each."""
+    for parameter, axes in zip(parameters, _AXES, strict=False):
+        if parameter is not None and parameter.ndim == axes and parameter.shape[0] != 1:
+            return parameter.shape[0]
+    return 1
+
+
+@kernel(
+    "points camera nearest",
+    gradients="vertices eye at up view matrix intrinsics origin extent distortion",
+    keep="camera",
+    constant="nearest",
+    used_by="a camera's transform",
+)
+def project(
+    vertices: Tensor,
+    starts: Tensor | None,
+    eye: Tensor | None,
+    at: Tensor | None,
+    up: Tensor | None,
+    view: Tensor | None,
+    matrix: Tensor | None,
+    intrinsics: Tensor | None,
+    origin: Tensor | None,
+    extent: Tensor | None,
+    distortion: Tensor | None,
     along: bool,
     right_handed: bool,
     perspective: bool,
-    double: bool,
-) -> Tensor:
-    """Cameras ``[B or 1, 22]``, float64 or float32, at ``eye``, float64 ``[3]`` or ``[B, 3]`` as
-    ``at`` and ``up``.
-
-    They look at the point ``at`` or, with ``along``, in that direction. view ``[]`` or ``[B]`` is
-    half of the field of view in degrees or, without perspective, the scale.
-    """
-    sizes = [x.shape[0] for x, axes in ((eye, 2), (at, 2), (up, 2), (view, 1)) if x.ndim == axes]
-    batch = next((size for size in sizes if size != 1), 1)
-    return eye.new_empty((batch, 22), dtype=torch.float64 if double else torch.float32)
-
-
-@kernel("points", gradients="vertices camera distortion", used_by="a camera's transform")
-def project(
-    vertices: Tensor,
-    camera: Tensor,
-    distortion: Tensor | None,
-    starts: Tensor | None,
-    perspective: bool,
-) -> Tensor:
+    across: float,
+    down: float,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Vertices ``[B or 1, V, 3]`` or packed ``[N, 3]`` in renderer space, ``[B, V, 3]`` or
-    ``[N, 3]``.
+    ``[N, 3]``, the cameras, and the least depth of all points ``[]``.
 
-    For a camera ``[B or 1, 22]``: ``u = A (v - origin) + t``; ``p = (u_x, u_y)``, if perspective
-    divided by u_z and distorted by ``distortion`` ``[B or 1, 4, 5 or 8]`` or None; x and y are K
-    times ``(p_x, p_y) / extent`` and 1, z is u_z.
+    A camera is a pose, float64 in host memory: ``eye``, ``at`` and ``up`` ``[3]`` or ``[n, 3]``,
+    and ``view`` ``[]`` or ``[n]``, half of the field of view in degrees or, without perspective,
+    the scale. It looks at the point ``at`` or, with ``along``, in that direction. Or it has parts
+    in the dtype of the vertices: ``matrix [n, 3, 4]``, ``intrinsics [n, 2, 3]``, ``origin [n, 3]``
+    and ``extent [n]``. n is 1 or B. Then ``u = A (v - origin) + t``; ``p = (u_x, u_y)``, if
+    perspective divided by u_z and distorted by ``distortion`` ``[B or 1, 4, 5 or 8]``; x and y
+    are K times ``(p_x, p_y) / extent`` and 1, multiplied by ``across`` and ``down``; z is u_z.
+
+    The second result are the parts of the cameras, as rows ``[n, 22]`` of ``[A | t]``, K (both
+    rows multiplied), origin and extent.
     """
-    if starts is not None:
-        return vertices.new_empty(vertices.shape)
-    sizes = [
-        x.shape[0] for x in (vertices, camera, distortion) if x is not None and x.shape[0] != 1
-    ]
-    return vertices.new_empty((sizes[0] if sizes else 1, *vertices.shape[1:]))
+    cameras = count_cameras(eye, at, up, view, matrix, intrinsics, origin, extent)
+    sizes = vertices.shape[0], cameras, 1 if distortion is None else distortion.shape[0]
+    batch = next((size for size in sizes if size != 1), 1)
+    shape = vertices.shape if starts is not None else (batch, *vertices.shape[1:])
+    rows = vertices.new_empty((cameras, 22))
+    return vertices.new_empty(shape), rows, vertices.new_empty(())

@@ -35,9 +35,7 @@ def batch_size(vertices: Tensor, starts: Tensor | None) -> int:
 
 @kernel("counts")
 def clip_count(vertices: Tensor, faces: Tensor, starts: Tensor | None, near: float) -> Tensor:
-    """Room that the clipped meshes need: int64 ``[B, 2]``, new vertices and drawn faces; -1 if
-    nothing is cut.
-    """
+    """Room that the clipped meshes need: int64 ``[B, 2]``, new vertices and drawn faces."""
     return vertices.new_empty((batch_size(vertices, starts), 2), dtype=torch.int64)
 
 

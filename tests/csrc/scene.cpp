@@ -189,8 +189,8 @@ struct Run {
                              out("grad_depth_vertices", 3 * rows),
                              threads,
                              s.perspective};
-    depth_forward(image);
-    depth_backward(image);
+    fragments_forward(image);
+    fragments_backward(image);
   }
 
   void shading() {
@@ -431,64 +431,66 @@ struct Run {
     const int64_t B = s.batch, D = seed % 4 == 1   ? 4
                                    : seed % 4 == 2 ? 8
                                                    : 5;  // coefficients of the distortion
-    T *camera = in("camera", kCamera * B), *distortion = in("distortion", D * B);
-    for (int64_t b = 0; b < B; ++b) {
-      T* row = camera + kCamera * b;
-      for (int64_t n = 0; n < 12; ++n) row[n] = row[n] / 8 + T(n % 5 == 0) + T(n == 11 ? 2 : 0);
-      for (int64_t n = 0; n < 6; ++n)
-        row[kIntrinsics + n] = row[kIntrinsics + n] / 8 + T(n % 4 == 0);
-      for (int64_t n = 0; n < 3 && !placed; ++n) row[kOrigin + n] = 0;
-      row[kExtent] = placed ? T(0.25) + row[kExtent] * row[kExtent] : T(1);
-    }
+    T *matrix = in("matrix", 12 * B), *intrinsics = in("intrinsics", 6 * B);
+    T *origin = in("origin", 3 * B), *extent = in("extent", B);
+    T* distortion = in("distortion", D * B);
+    for (int64_t n = 0; n < 12 * B; ++n)
+      matrix[n] = matrix[n] / 8 + T(n % 12 % 5 == 0) + T(n % 12 == 11 ? 2 : 0);
+    for (int64_t n = 0; n < 6 * B; ++n) intrinsics[n] = intrinsics[n] / 8 + T(n % 6 % 4 == 0);
+    for (int64_t n = 0; n < B; ++n) extent[n] = T(0.25) + extent[n] * extent[n];
     for (int64_t n = 0; n < D * B; ++n) distortion[n] /= 16;
-    const Project<T> args{s.vertices.data(),
-                          mesh.starts,
-                          B,
-                          B,
-                          s.num_vertices,
-                          camera,
-                          true,
-                          distorted ? distortion : nullptr,
-                          true,
-                          D,
-                          s.perspective,
-                          out("points", 3 * rows),
-                          in("grad_points", 3 * rows),
-                          out("grad_world", 3 * rows),
-                          out("grad_camera", kCamera * B),
-                          out_if(distorted, "grad_distortion", D * B),
-                          threads};
+    Project<T> args{};
+    args.vertices = s.vertices.data();
+    args.starts = mesh.starts;
+    args.batch = args.cameras = args.vertex_batch = B;
+    args.num_vertices = s.num_vertices;
+    args.perspective = s.perspective;
+    args.matrix = {matrix, true, out("grad_matrix", 12 * B)};
+    args.intrinsics = {intrinsics, true, out("grad_intrinsics", 6 * B)};
+    if (placed) {
+      args.origin = {origin, true, nullptr};
+      args.extent = {extent, true, nullptr};
+    }
+    args.origin.grad = out_if(placed, "grad_origin", 3 * B);
+    args.extent.grad = out_if(placed, "grad_extent", B);
+    args.across = 1, args.down = T(0.5);
+    if (distorted) args.distortion = {distortion, true, nullptr};
+    args.distortion.grad = out_if(distorted, "grad_distortion", D * B);
+    args.coefficients = D;
+    args.camera = out("camera", kCamera * B);
+    args.points = out("points", 3 * rows);
+    args.nearest = out("nearest", 1);
+    args.grad_points = in("grad_points", 3 * rows);
+    args.grad_vertices = out("grad_world", 3 * rows);
+    args.num_threads = threads;
     project_forward(args);
     project_backward(args);
   }
 
   // Directions from the vertices, with whatever they hold; a camera for each pair of them, at the
-  // origin.
+  // origin. Nothing is projected.
   void poses() {
     const int64_t count = rows / 2;
     const std::vector<double> points(s.vertices.begin(), s.vertices.begin() + 3 * rows);
     const double eye[3] = {}, view = 30;
     std::vector<double> grads(6 * count);
-    const LookAt<T> args{count,
-                         eye,
-                         points.data(),
-                         points.data() + 3 * count,
-                         &view,
-                         false,
-                         true,
-                         true,
-                         false,
-                         true,
-                         false,
-                         s.perspective,
-                         out("pose", kCamera * count),
-                         in("grad_pose", kCamera * count),
-                         nullptr,
-                         grads.data(),
-                         grads.data() + 3 * count,
-                         nullptr};
-    look_at_forward(args);
-    look_at_backward(args);
+    T nearest = 0;
+    Project<T> args{};
+    args.batch = args.cameras = count;
+    args.vertex_batch = 1;
+    args.perspective = s.perspective;
+    args.eye = {eye, false, nullptr};
+    args.at = {points.data(), true, grads.data()};
+    args.up = {points.data() + 3 * count, true, grads.data() + 3 * count};
+    args.view = {&view, false, nullptr};
+    args.along = true;
+    args.across = args.down = 1;
+    args.camera = out("pose", kCamera * count);
+    args.nearest = &nearest;
+    args.grad_camera = in("grad_pose", kCamera * count);
+    args.num_threads = threads;
+    project_forward(args);
+    project_backward(args);
     std::copy_n(grads.data(), 3 * count, out("grad_forward", 3 * count));
     std::copy_n(grads.data() + 3 * count, 3 * count, out("grad_up", 3 * count));
   }
@@ -656,11 +658,12 @@ template <class T>
 const char* depends_on_company(const Scene<T>& scene, const Results<T>& together,
                                const Results<T>& alone) {
   return compare(together, alone, [&](string_view name, size_t, size_t size) {
-    const bool summed = is_one_of(name, {"pose", "grad_forward", "grad_up", "grad_lights"}) ||
-                        (scene.packed() && is_one_of(name, {"loss", "grad_loss_vertices"})) ||
-                        (!scene.per_image_values && name == "grad_sampled_texels") ||
-                        (!scene.per_image_values && !scene.packed() &&
-                         is_one_of(name, {"grad_textures", "grad_attributes", "grad_uv"}));
+    const bool summed =
+        is_one_of(name, {"pose", "nearest", "grad_forward", "grad_up", "grad_lights"}) ||
+        (scene.packed() && is_one_of(name, {"loss", "grad_loss_vertices"})) ||
+        (!scene.per_image_values && name == "grad_sampled_texels") ||
+        (!scene.per_image_values && !scene.packed() &&
+         is_one_of(name, {"grad_textures", "grad_attributes", "grad_uv"}));
     return summed ? 0 : size;
   });
 }
@@ -684,7 +687,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
       for (T x : r.get(name)) check(holds(x), sentence);
   };
   const MeshBatch<T> mesh = scene.mesh();
-  const Size raster = scene.raster(), image = scene.image;
+  const Size raster = scene.raster();
   const int64_t H = raster.height, W = raster.width;
   const bool foreign = scene.foreign_face_index;
   const std::vector<int32_t>& face_index = r.template get<int32_t>("face_index");
@@ -708,16 +711,6 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     }
     check(below[0] && below[1] && above[0] && above[1],
           "a face covers no centre outside its bounding box");
-  }
-  const std::vector<T>& alpha = r.get("alpha");
-  for (int64_t n = 0; n < scene.batch * image.pixels() && !foreign; ++n) {
-    const int64_t step = scene.anti_aliasing ? 2 : 1, b = n / image.pixels(),
-                  y = n / image.width % image.height, x = n % image.width;
-    int covered = 0;
-    for (int64_t k = 0; k < step * step; ++k)
-      covered +=
-          face_index[b * raster.pixels() + (step * y + k / step) * W + step * x + k % step] >= 0;
-    check(alpha[n] == T(covered) / T(step * step), "alpha is the covered share of a pixel");
   }
   for (const char* name : {"layers", "soft_layers"}) {
     const std::vector<int32_t>& layers = r.template get<int32_t>(name);
@@ -774,6 +767,9 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   for (size_t n = 0; n < points.size(); ++n)
     check(n % 3 == 2 ? std::isfinite(points[n]) : !std::isnan(points[n]),
           "a projected vertex has a depth and a place, or is at infinity");
+  T least = std::numeric_limits<T>::infinity();
+  for (size_t n = 2; n < points.size(); n += 3) least = std::min(least, points[n]);
+  check(r.get("nearest")[0] == least, "the nearest depth is the least of all");
   for (size_t n = 0; n < pose.size(); ++n)
     check(n % kCamera >= kIntrinsics ||
               (std::isfinite(pose[n]) == std::isfinite(pose[n - n % kCamera]) &&
@@ -806,14 +802,16 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   if (scene.hostile_upstream) return broken;
 
   const auto finite = [](T x) { return std::isfinite(x); };
-  check_all({"grad_local", "grad_world", "grad_camera", "grad_distortion", "grad_soft",
-             "grad_sigma", "grad_forward", "grad_up", "iou", "grad_prediction", "grad_target"},
+  check_all({"grad_local", "grad_world", "grad_matrix", "grad_intrinsics", "grad_origin",
+             "grad_extent", "grad_distortion", "grad_soft", "grad_sigma", "grad_forward", "grad_up",
+             "iou", "grad_prediction", "grad_target"},
             finite, "a gradient is finite");
   if (!foreign)
     check_all({"grad_silhouette", "grad_edges"}, finite, "a gradient of edges is finite");
   if (!tame) return broken;
   for (const auto& array : std::get<Arrays<T>>(r.lists).arrays)
-    if (!is_one_of(array.name, {"points", "pose"})) check(all_finite(array.values), array.name);
+    if (!is_one_of(array.name, {"points", "pose", "nearest"}))
+      check(all_finite(array.values), array.name);
   return broken;
 }
 

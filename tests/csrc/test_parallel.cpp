@@ -9,15 +9,6 @@
 
 namespace nmr::test {
 
-TEST(parallel_for_visits_each_index_once) {
-  for (int threads : {-1, 0, 1, 2, 3, 5, 16})
-    for (int64_t count : {0, 1, 2, 3, 7, 100}) {
-      std::vector<int> visits(count, 0);
-      parallel_for(count, threads, [&](int64_t i) { ++visits[i]; });
-      for (int n : visits) CHECK_EQUAL(n, 1);
-    }
-}
-
 TEST(parallel_for_exceptions_reach_the_caller) {
   for (int threads : {1, 2, 5}) {
     std::atomic<int> ran{0};

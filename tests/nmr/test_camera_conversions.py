@@ -281,8 +281,9 @@ def random_arguments(batch, num_vertices, shared, distorted=True):
 
 
 def project(vertices, matrix, intrinsics, distortion, origin, extent, perspective=True):
-    rows = matrix.flatten(1), intrinsics.flatten(1), origin, extent.unsqueeze(1)
-    return ops.project(vertices, torch.cat(rows, dim=1), distortion, None, perspective)
+    parts = matrix, intrinsics, origin, extent, distortion
+    how = False, False, perspective, 1.0, 1.0
+    return ops.project(vertices, None, None, None, None, None, *parts, *how)[0]
 
 
 @pytest.mark.parametrize("distorted", [True, False])

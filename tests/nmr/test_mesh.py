@@ -5,7 +5,7 @@ import functools
 import pytest
 import torch
 from scenes import bumpy_sphere, double, leaf_of, normal, uniform, value_and_gradients
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 from vectors import load_vector
 
@@ -100,9 +100,26 @@ def test_normals_of_batches(function):
 
 
 @pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])
-def test_normals_gradcheck(function):
+def test_normals_have_first_and_second_derivatives(function):
     vertices, faces = nmr.icosphere(0)
-    gradcheck(lambda x: function(x, faces), leaf_of(vertices * double([[[1.0, 0.7, 0.5]]])))
+    vertices = leaf_of(vertices * double([[[1.0, 0.7, 0.5]]]))
+    gradcheck(lambda x: function(x, faces), vertices)
+    gradgradcheck(lambda x: function(x, faces[:3]), vertices)
+
+
+def test_second_derivatives_of_packed_normals(smooth):
+    """The operator's: of two meshes, each alone."""
+    vertices, faces = nmr.icosphere(0)
+    vertices = torch.cat([vertices, vertices[:4]]) * double([1.0, 0.7, 0.5])
+    faces, starts = torch.cat([faces[:3], faces[:1] % 4]), torch.tensor([[0, 0], [12, 3], [16, 4]])
+    gradgradcheck(lambda x: nmr.ops.normals(x, faces, starts, smooth), leaf_of(vertices))
+
+
+def test_faces_that_name_a_vertex_twice_have_no_normal(dtype):
+    vertices = normal(30, 3, dtype=dtype)
+    first = torch.arange(30)
+    faces = torch.cat([torch.stack([first, first.roll(1), first], 1).roll(k, 1) for k in range(3)])
+    assert not nmr.face_normals(vertices, faces).any()
 
 
 @pytest.mark.parametrize("function", [nmr.face_normals, nmr.vertex_normals])

@@ -34,6 +34,47 @@ def test_equals_the_slow_definition(seed, size, anti_aliasing, fill_back):
     assert grad[..., :2].any() and not grad[..., 2].any()
 
 
+def on_pixel_centres(vertices, seed):
+    """Corners on centres and borders of 16 pixels: no rounding excuses a difference."""
+    flat = (2 * torch.floor(8 * (vertices[..., :2] + 1)) + 1 - 16) / 16
+    return torch.cat([flat, vertices[..., 2:]], dim=-1)
+
+
+def almost_equally_near(vertices, seed):
+    """Faces on one plane, but for some units in the last place of their depths: only the
+    published rounding tells which is nearer, bounds must not.
+    """
+    x, y, _ = vertices.unbind(-1)
+    q = 0.4 + 0.02 * (seed % 5) * x - 0.03 * y
+    z = 1 / q if seed % 2 else 2 + q  # one plane with perspective, or without
+    steps = torch.arange(z.numel()).view_as(z) * (seed + 1) % 7
+    z = z * (1 + steps * torch.finfo(z.dtype).eps)
+    return torch.stack([x, y, z], dim=-1)
+
+
+@pytest.mark.parametrize("place", [None, on_pixel_centres, almost_equally_near])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_face_index_map_is_the_definition(place, seed, dtype, perspective):
+    """Of several sizes; every third soup is cut by near and far."""
+    vertices, faces = random_soup(seed)
+    vertices = vertices.to(dtype)
+    vertices = vertices if place is None else place(vertices, seed)
+    near, far = (1.3, 1.7) if seed % 3 == 1 and place is None else (0.1, 100.0)
+    sizes = [(16, 16)] if place is on_pixel_centres else [(24, 24), (6, 45)]
+    for size in sizes:
+        how = seed % 2 == 0, near, far, perspective
+        drawn = nmr.ops.rasterize(vertices, faces, None, *size, *how)
+        for index, mesh in zip(drawn, vertices, strict=True):
+            assert torch.equal(index.flip(0).long(), reference.face_index(mesh, faces, size, *how))
+
+
+def test_of_equally_near_faces_the_first_is_drawn(dtype):
+    vertices = torch.tensor([[-0.9, -0.9, 2.0], [0.9, -0.9, 2.0], [0.0, 0.9, 2.0]], dtype=dtype)
+    faces = torch.tensor([[2, 1, 0], [0, 1, 2], [0, 1, 2]])
+    drawn = nmr.ops.rasterize(vertices[None], faces, None, 24, 24, True, 0.1, 100.0, True)
+    assert set(drawn.unique().tolist()) == {-1, 1}
+
+
 def test_row_zero_is_the_top_and_winding_matters_without_fill_back():
     top_right = torch.tensor([[0.2, 0.2, 1.0], [0.8, 0.2, 1.0], [0.8, 0.8, 1.0]])
 
