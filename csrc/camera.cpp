@@ -196,8 +196,8 @@ void project_backward(const Project<T>& args) {
   const bool of_pose = args.eye.grad || args.at.grad || args.up.grad || args.view.grad,
              of_parts =
                  args.matrix.grad || args.intrinsics.grad || args.origin.grad || args.extent.grad;
-  CameraGradient* gradients =
-      of_pose || of_parts || args.distortion.grad ? reserve(scratch.gradients, num_runs) : nullptr;
+  const bool of_camera = of_pose || of_parts || args.distortion.grad;
+  CameraGradient* gradients = of_camera ? reserve(scratch.gradients, num_runs) : nullptr;
 
   if (args.batch == 0 && args.grad_vertices)
     std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
@@ -215,7 +215,7 @@ void project_backward(const Project<T>& args) {
       NMR_AT_BEST_LEVEL(backward_run, args, runs[r], grad, gradients ? gradients + r : nullptr);
     }
   });
-  if (!gradients) return;
+  if (!of_camera) return;
 
   // One camera for all images gets the sum over them.
   std::vector<T> rows(kCamera * args.cameras);

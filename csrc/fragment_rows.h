@@ -260,10 +260,10 @@ void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
   std::fill_n(grad_row, W + kLanes, T(0));
   const auto start_row = [&](int64_t j) {
     if (!args.grad_depth || (args.anti_aliasing && j % 2)) return;  // blocks begin with an even row
-    const int64_t scale = args.anti_aliasing ? 2 : 1;
-    const T* upstream = args.grad_depth + block.b * args.image.pixels() + j / scale * w;
-    for (int64_t i = 0; i < W; ++i)
-      grad_row[i] = upstream[i / scale] * share_of_pixel<T>(args.anti_aliasing);
+    const int64_t shift = args.anti_aliasing;
+    const T* upstream = args.grad_depth + block.b * args.image.pixels() + (j >> shift) * w;
+    const T share = share_of_pixel<T>(args.anti_aliasing);
+    for (int64_t i = 0; i < W; ++i) grad_row[i] = upstream[i >> shift] * share;
   };
   const auto gradients = [&](const Lanes<T>(&sum)[3][4], const FaceLanes<T>& faces,
                              Lanes<T>(&out)[9]) {
