@@ -169,7 +169,7 @@ def _within(mask: np.ndarray, box: Box) -> np.ndarray:
 
 
 def is_plain(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> bool:
-    """Whether the border of a picture uint8 [H, W, 3] has one colour, except for a tenth of its pixels."""
+    """Whether a share `options.plain` of the border of a picture uint8 [H, W, 3] has one colour."""
     _, of_border = _differences(colors)
     return bool((of_border < 255 * options.even).mean() > options.plain)
 
