@@ -57,11 +57,11 @@ def buttons(tab: Any) -> set[str]:
 def paint(image: np.ndarray) -> np.ndarray:
     """The mean colour of all that is not grey: of the object, not of the page."""
     assert paint_share(image) > 0.01, "an object is shown"
-    return image[np.ptp(image, axis=2) > 60].mean(axis=0)
+    return image[np.ptp(image, axis=2) > 40].mean(axis=0)
 
 
 def paint_share(image: np.ndarray) -> float:
-    return float((np.ptp(image, axis=2) > 60).mean())
+    return float((np.ptp(image, axis=2) > 40).mean())
 
 
 def download(tab: Any, name: str, folder: Path) -> Path:
