@@ -89,6 +89,11 @@ def test_from_pytorch3d_draws_the_same_picture_both_ways():
     assert rgb[0, 128, 180, 0] > rgb[0, 128, 70, 0] and rgb[0, 70, 128, 1] > rgb[0, 180, 128, 1]
     # Nearest to the eye, which is at z = 2.7, is the greatest z.
     assert rgb[0, 128, 128, 2] > 0.9
+    nmr = names["nmr"]
+    fitted = nmr.render_silhouette(
+        names["shape"].detach(), names["faces"], names["views"], image_size=64
+    )
+    assert nmr.losses.soft_iou_loss(fitted, names["target"]) < 0.1
     names["uv"] = torch.tensor([[0.0, 0.0], [1.0, 1.0], [3 / 127, 5 / 63]])
     exec(
         re.findall(r"^uv = \(.*$", MIGRATING["pytorch3d"].read_text(), flags=re.MULTILINE)[0], names

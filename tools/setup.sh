@@ -23,7 +23,7 @@ setup() { # extra of the package to install into .venv: report, site or test
     command -v ${CXX:-c++ g++ clang++} >/dev/null ||
         fail "no C++ compiler: ${CXX:-c++, g++ or clang++}; install one (on Debian: apt-get install g++), or set CXX to its path"
     check_room "$PWD" 4
-    if ! .venv/bin/python -c '' 2>/dev/null; then
+    if ! .venv/bin/python -c 'import pip' 2>/dev/null; then # missing, or made in part
         step "Making a virtual environment in .venv"
         "$base" -m venv --clear .venv || fail "could not make a virtual environment in $PWD/.venv"
     fi
