@@ -215,9 +215,13 @@ def minimize(
 
 @torch.no_grad()
 def descend(
-    loss: Callable[[], Tensor], variables: Sequence[Tensor], rates: Sequence[float], steps: int
+    loss: Callable[[], Tensor],
+    variables: Sequence[Tensor],
+    rates: Sequence[float],
+    steps: int,
+    last: float = 0.1,
 ) -> None:
-    """Change variables so that they minimise a loss, by Adam with learning rates that fall to a tenth in the end."""
+    """Change variables so that they minimise a loss, by Adam with learning rates that fall to the share `last`."""
     moments = [(torch.zeros_like(value), torch.zeros_like(value)) for value in variables]
     for step in range(steps):
         with torch.enable_grad():
@@ -227,7 +231,7 @@ def descend(
         ):
             now = {
                 "state_steps": [torch.tensor(float(step))],
-                "lr": rate * (1 - 0.9 * step / steps),
+                "lr": rate * (1 - (1 - last) * step / steps),
             }
             adam([value], [gradient], [mean], [square], [], **now, **_ADAM)
 

@@ -50,7 +50,7 @@ def refine(method: Method, images: Tensor, masks: Tensor, poses: Poses) -> Meshe
             apart = nmr.losses.soft_iou_loss(silhouettes, masks)
             return apart + WEIGHT_OF_SMOOTHNESS * nmr.losses.smoothness_loss(vertices, method.edges)
 
-        descend(loss, [values], [learning_rate], steps)
+        descend(loss, [values], [learning_rate], steps, last=1.0)
         return values.detach()
 
     codes = method.encode(images).cpu()
