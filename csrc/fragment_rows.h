@@ -247,6 +247,9 @@ NMR_INLINE void backward_block(const FragmentBlock<T>& block, FragmentScratch<T>
 // z_m), so that grad z_m = -H_mm / z_m^2 and grad X_k = -sum_m H_mk M_m0 / z_m with H_mk = sum over
 // pixels of h_m w_k. Without perspective h_m = u_m + g z_m:  grad z_m = sum over pixels of g w_m,
 // grad X_k = -sum_m H_mk M_m0.
+//
+// Without u four sums do. With c = g z^2, or c = g without perspective, and C_k = sum over pixels
+// of c w_k:  H_mk = -C_k, or z_m C_k.
 template <class T>
 void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
                    FragmentScratch<T>& scratch, FaceGradients<T>& result) {
@@ -259,31 +262,26 @@ void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
   T* grad_row = scratch.rows.data();  // g
   std::fill_n(grad_row, W + kLanes, T(0));
   const auto start_row = [&](int64_t j) {
-    if (!args.grad_depth || (args.anti_aliasing && j % 2)) return;  // blocks begin with an even row
-    const int64_t shift = args.anti_aliasing;
-    const T* upstream = args.grad_depth + block.b * args.image.pixels() + (j >> shift) * w;
-    const T share = share_of_pixel<T>(args.anti_aliasing);
-    for (int64_t i = 0; i < W; ++i) grad_row[i] = upstream[i >> shift] * share;
+    if (!args.grad_depth) return;
+    const T* upstream =
+        args.grad_depth + block.b * args.image.pixels() + (args.anti_aliasing ? j / 2 : j) * w;
+    if (!args.anti_aliasing) {
+      std::copy_n(upstream, w, grad_row);
+    } else if (j % 2 == 0) {  // blocks begin with an even row
+      for (int64_t i = 0; i < w; ++i)
+        grad_row[2 * i] = grad_row[2 * i + 1] = upstream[i] * share_of_pixel<T>(true);
+    }
   };
-  const auto gradients = [&](const Lanes<T>(&sum)[3][4], const FaceLanes<T>& faces,
-                             Lanes<T>(&out)[9]) {
+  // M_m0 / z_m and M_m1 / z_m, or M_m0 and M_m1, in units of the vertices
+  const auto slopes = [&](const FaceLanes<T>& faces, Lanes<T>(&x)[3], Lanes<T>(&y)[3]) {
     const auto& [mx, my, z] = faces;
-    Lanes<T> slope_x[3], slope_y[3];
     for (int m = 0; m < 3; ++m) {
-      slope_x[m] = moderate_or_zero<T>(perspective ? mx[m] / z[m] : mx[m]) * half_width;
-      slope_y[m] = moderate_or_zero<T>(perspective ? my[m] / z[m] : my[m]) * half_height;
-    }
-    for (int k = 0; k < 3; ++k) {
-      out[3 * k] =
-          zero - (sum[0][k] * slope_x[0] + sum[1][k] * slope_x[1] + sum[2][k] * slope_x[2]);
-      out[3 * k + 1] =
-          zero - (sum[0][k] * slope_y[0] + sum[1][k] * slope_y[1] + sum[2][k] * slope_y[2]);
-      out[3 * k + 2] =
-          perspective ? (zero - sum[k][k]) * moderate_or_zero<T>(one / (z[k] * z[k])) : sum[k][3];
+      x[m] = moderate_or_zero<T>(perspective ? mx[m] / z[m] : mx[m]) * half_width;
+      y[m] = moderate_or_zero<T>(perspective ? my[m] / z[m] : my[m]) * half_height;
     }
   };
+  const auto inverse_square = [&](Lanes<T> z) { return moderate_or_zero<T>(one / (z * z)); };
 
-  // Without u the h_m differ by factors of the face, so that four sums do: of g z^2 w_k, or g w_k.
   if (!args.grad_weights) {
     const auto add = [&](int64_t, int64_t i, Lanes32, const FragmentPixels<T>& p, T* sums) {
       const Lanes<T> z = perspective ? depth_or_zero<T>(p.z) : one;
@@ -293,14 +291,19 @@ void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
     return backward_block<4>(
         block, scratch, result, start_row, add,
         [&](const T* sums, int64_t slot, const FaceLanes<T>& faces, Lanes<T>(&out)[9]) {
-          Lanes<T> each[4], sum[3][4];
-          load_face_quads<T>(sums, slot, 4, each);
+          Lanes<T> sum[4], slope_x[3], slope_y[3], x = zero, y = zero;
+          load_face_quads<T>(sums, slot, 4, sum);
+          slopes(faces, slope_x, slope_y);
           for (int m = 0; m < 3; ++m) {
-            const Lanes<T> factor = perspective ? zero - one : depth_or_zero<T>(faces.z[m]);
-            for (int k = 0; k < 3; ++k) sum[m][k] = factor * each[k];
-            sum[m][3] = each[m];
+            const Lanes<T> factor = perspective ? one : zero - depth_or_zero<T>(faces.z[m]);
+            x = x + factor * slope_x[m];
+            y = y + factor * slope_y[m];
           }
-          gradients(sum, faces, out);
+          for (int k = 0; k < 3; ++k) {
+            out[3 * k] = sum[k] * x;
+            out[3 * k + 1] = sum[k] * y;
+            out[3 * k + 2] = perspective ? sum[k] * inverse_square(faces.z[k]) : sum[k];
+          }
         });
   }
   const auto add = [&](int64_t j, int64_t i, Lanes32 ids, const FragmentPixels<T>& p, T* sums) {
@@ -327,8 +330,16 @@ void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
   backward_block<12>(
       block, scratch, result, start_row, add,
       [&](const T* sums, int64_t slot, const FaceLanes<T>& faces, Lanes<T>(&out)[9]) {
-        Lanes<T> sum[3][4];
+        Lanes<T> sum[3][4], slope_x[3], slope_y[3];
         for (int m = 0; m < 3; ++m) load_face_quads<T>(sums + 4 * m, slot, 12, sum[m]);
-        gradients(sum, faces, out);
+        slopes(faces, slope_x, slope_y);
+        for (int k = 0; k < 3; ++k) {
+          out[3 * k] =
+              zero - (sum[0][k] * slope_x[0] + sum[1][k] * slope_x[1] + sum[2][k] * slope_x[2]);
+          out[3 * k + 1] =
+              zero - (sum[0][k] * slope_y[0] + sum[1][k] * slope_y[1] + sum[2][k] * slope_y[2]);
+          out[3 * k + 2] =
+              perspective ? (zero - sum[k][k]) * inverse_square(faces.z[k]) : sum[k][3];
+        }
       });
 }
