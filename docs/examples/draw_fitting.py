@@ -54,12 +54,9 @@ def main(output: Path, frames: int = 40, size: int = 120, steps: int = 300) -> d
     size: side of each picture in pixels.
     steps: of Adam, for each object.
     """
+    elevations, azimuths = [-20.0, 30.0] * 12, [15.0 * k for k in range(24)]
     views = nmr.LookAt.from_angles(
-        2.732,
-        [-20.0, 30.0] * 12,
-        [15.0 * k for k in range(24)],
-        half_fov_deg=13.0,
-        right_handed=True,
+        2.732, elevations, azimuths, half_fov_deg=13.0, right_handed=True
     )
     turn = [150.0 + 360.0 * frame / frames for frame in range(frames)]
     cameras = [

@@ -63,13 +63,8 @@ def ribbons(size: int = 256) -> Tensor:
 def main(output: Path = Path("output"), views: int = 4, image_size: int = 180) -> Path:
     """Writes OUTPUT/views.png: one column per view; rows: colours, depth, normals."""
     vertices, faces, uv, uv_faces = trefoil()
-    camera = nmr.LookAt.from_angles(
-        3.0,
-        25.0,
-        [160 - 180 / views * k for k in range(views)],
-        half_fov_deg=17.0,
-        right_handed=True,
-    )
+    azimuths = [160 - 180 / views * k for k in range(views)]
+    camera = nmr.LookAt.from_angles(3.0, 25.0, azimuths, half_fov_deg=17.0, right_handed=True)
     eyes = torch.nn.functional.normalize(camera.eye.float(), dim=1)
     above = torch.tensor([0.0, 1.0, 0.0]).expand_as(eyes)
     near, far = 2.1, 3.9

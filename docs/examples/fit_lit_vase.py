@@ -52,12 +52,10 @@ def main(
     v = torch.linspace(0, 1, ROWS)
 
     def photographs(
-        radius: Tensor, texture: Tensor, lamp: Tensor, shine: Tensor, azimuths_deg: list[float]
+        radius: Tensor, texture: Tensor, lamp: Tensor, shine: Tensor, azimuths: list[float]
     ) -> Tensor:
         vertices, faces, uv = turned(radius)
-        camera = nmr.LookAt.from_angles(
-            3.0, 25.0, azimuths_deg, half_fov_deg=15.0, right_handed=True
-        )
+        camera = nmr.LookAt.from_angles(3.0, 25.0, azimuths, half_fov_deg=15.0, right_handed=True)
         colors = nmr.UVTexture(texture, uv, wrap="clamp", filter="mipmap")
         lights = nmr.Lights(
             0.35, 0.0, smooth=True, position=lamp, point=0.9, specular=shine, shininess=12.0
