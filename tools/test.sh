@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Installs the package with everything its tests need into .venv and runs the tests.
 # Usage: bash tools/test.sh [--all] [PYTEST ARGUMENTS]
-#   --all   the slow tests as well: trainings of minutes, sanitizers, long kills; and the coverage (what CI runs)
+#   --all   the slow tests as well: trainings of minutes, sanitizers, long kills (what CI runs)
+# Add --cov for the coverage of the Python code, which takes longer.
 # JOBS: number of test processes (default: one per core, at most 8; 0: pytest's own process, for --pdb).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -10,7 +11,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 which=(-m "not slow") room=2
 if [ "${1:-}" = --all ]; then
     shift
-    which=(--cov --cov-report=term:skip-covered --durations=40) room=5
+    which=(--durations=60) room=5
 fi
 setup test
 step "Style"
