@@ -22,6 +22,7 @@ DOCS = Path(__file__).parent
 PAGES = (DOCS / "results.md", DOCS / "short-trainings.md", DOCS / "methods" / "plus.md")
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) (\w+)((?: [\w-]+)*) -->\n)(?:\|.*\n)*")
 VOXELS, NO_CLAMP = "here (voxels)", "here (kato18, without clamp)"  # sources of rows in "main"
+MEAN_SHAPE = "Mean shape"
 #: Methods by the names of their runs, for "measures".
 METHODS = {
     "vanilla": "Vanilla-AE",
@@ -72,13 +73,13 @@ def measures(tables: dict[str, list[list[str]]]) -> list[list[str]]:
 
 
 def add_baselines(lines: list[list[str]], part: str, name: str) -> None:
-    """Append the rows of the mean shape and the other baselines of a file to a table.
+    """Append the row of the mean shape of a file to a table.
 
-    Differences to the table's baseline have no interval, as its objects are not in the file.
+    Its difference to the table's baseline has no interval, as the table's objects are not in the file.
     """
     header, *found = read(name)["main"]
     for label, source, *values in found:
-        if source != VOXELS:
+        if source != VOXELS or label != MEAN_SHAPE:
             continue
         by_column = dict(zip(header[2:], values, strict=True))
         if part != "side" and header[2:] != lines[0][2:]:
@@ -99,7 +100,7 @@ def rows(name: str, part: str) -> list[list[str]]:
     part: a table of the file, or one made of others: "both" puts the difference under each method,
     "side" puts paper, here and difference of a single category side by side, "seeds" adds the mean difference over
     seeds as a last column, "means" leaves the means over seeds of "poses", "measures" is made by `measures`,
-    "baselines" leaves the rows of the mean shape and the others.
+    "baselines" leaves the rows of the mean shape and the others, of this file and of the others side by side.
     """
     tables = read(name)
     if part == "measures":
@@ -150,11 +151,25 @@ def rows(name: str, part: str) -> list[list[str]]:
     return lines
 
 
+def plain(cell: str, source: str) -> str:
+    """A cell without what the protocol on the page says: the usual measure, and the interval of a value.
+
+    source: the second cell of its row. Intervals of differences stay.
+    """
+    cell = re.sub(r" \((kato18|mmd|voxels)\b[^)]*\)", "", cell)
+    return cell if source.startswith("minus") else re.sub(r"(?<=\d) \[\d[^]]*\]", "", cell)
+
+
 def table(name: str, part: str, baselines: list[str]) -> str:
     """One table as Markdown. Repeated names in the first column are shown once."""
     lines = rows(name, part)
     for file in baselines:
-        add_baselines(lines, part, file)
+        if part == "baselines":
+            more = [[file.removeprefix("baselines-")], *(row[1:] for row in rows(file, part)[1:])]
+            lines = [[*row, *cells] for row, cells in zip(lines, more, strict=True)]
+        else:
+            add_baselines(lines, part, file)
+    lines = [[plain(cell, row[1]) for cell in row] for row in lines]
     header, *body = lines
     firsts = [body[0][0], *("" if a[0] == b[0] else b[0] for a, b in pairwise(body))]
     lines = [header, *([first, *row[1:]] for first, row in zip(firsts, body, strict=True))]

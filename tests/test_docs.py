@@ -376,14 +376,17 @@ def test_rows_of_another_file_are_added_below_a_table(
     (tmp_path / "results" / "old.json").write_text(json.dumps(content))
     baseline = ["Mean shape", "here (voxels)", "0.712 [0.7, 0.8]", "0.712 [0.7, 0.8]"]
     content["main"] = [content["main"][0], baseline]
-    (tmp_path / "results" / "extra.json").write_text(json.dumps(content))
+    for name in ("extra", "baselines-extra"):
+        (tmp_path / "results" / f"{name}.json").write_text(json.dumps(content))
     monkeypatch.setattr(make_results, "DOCS", tmp_path)
     text = make_results.filled("<!-- results: old side extra -->\n")
-    assert "| Vanilla-AE | 0.5 | 0.600 [0.5, 0.7] |  | 0.400 |" in text
-    assert "| Mean shape | - | 0.712 [0.7, 0.8] | +0.112 |  |" in text
+    assert "| Vanilla-AE | 0.5 | 0.600 |  | 0.400 |" in text
+    assert "| Mean shape | - | 0.712 | +0.112 |  |" in text
     assert make_results.filled(text) == text, "a second time changes nothing"
     text = make_results.filled("<!-- results: old main extra -->\n")
-    assert "| Mean shape | here (voxels) | 0.712 [0.7, 0.8] | 0.712 [0.7, 0.8] |" in text
+    assert "| Mean shape | here | 0.712 | 0.712 |" in text
+    text = make_results.filled("<!-- results: extra baselines baselines-extra -->\n")
+    assert "| Mean shape | 0.712 | 0.712 |" in text
     (_, row) = make_results.rows("old", "measures")
     assert row == [
         *("car", "Vanilla-AE", "0.550", "0.800", "0.100"),

@@ -55,3 +55,21 @@ learn3d experiment kato --data CARS --output CARS_OUTPUT --category car --method
 learn3d experiment kato --data CARS100 --output CARS100_OUTPUT --category car --methods Vanilla-AE Proposed --report-only
 learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --methods Vanilla-AE Proposed --report-only
 learn3d experiment kato --data DATA --output OUTPUT --category airplane --methods Vanilla-AE Proposed --report-only
+
+# docs/short-trainings.md
+
+# Table 5
+learn3d experiment bins --data KAR --output OUTPUT --category airplane --iterations 2000 --batch-size 32 --set clamp_to_cube=true views_per_object=12 validate_every=1000
+
+# Table 7
+learn3d make-dataset --layout pascal3d --output PASCAL --category airplane --source models/airplane --front z --augment 2
+learn3d experiment pascal --data PASCAL --output OUTPUT --category airplane --methods Baseline Proposed Plus --iterations 250 --batch-size 32 --seeds 1
+
+# Plus and the recipe on six categories
+learn3d experiment plus --data DATA --output SHORT --category airplane,chair,table,cabinet,sofa,lamp --methods Vanilla-AE "Vanilla-AE, all that is shared" Proposed Plus --iterations 400 --seeds 3 --set clamp_to_cube=true
+
+# Supervision
+learn3d experiment supervision --data DATA --output SUPERVISION --category airplane,chair,table --iterations 400 --seeds 3
+
+# Unknown poses
+learn3d experiment poses --data DATA --output POSES --category airplane,chair,table --iterations 400 --seeds 3
