@@ -14,13 +14,7 @@ from steps import TINY, make_method
 
 import nmr
 from learn3d import tasks
-from learn3d.data.dataset import (
-    DEPTH_REACH,
-    Batch,
-    ViewDataset,
-    depth_levels,
-    depth_of_levels,
-)
+from learn3d.data.dataset import DEPTH_REACH, ViewDataset, depth_levels, depth_of_levels
 from learn3d.data.layouts import load_dataset
 from learn3d.data.poses import LookAtPoses
 from learn3d.data.sampling import GROUP_SIZE, augment, sample_indices
@@ -29,40 +23,6 @@ from learn3d.losses import depth_losses
 from learn3d.methods.multi_view import ManyViews, MultiViewSettings
 from learn3d.studio.make_data import render
 from learn3d.training import take_step
-
-
-def make_batch(objects: list[int]) -> Batch:
-    count = len(objects)
-    images = torch.randint(
-        0, 256, (count, 4, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
-    )
-    masks = torch.zeros(count, 64, 64)
-    for i in range(count):
-        masks[i, 16 + 2 * i : 46, 20 : 40 + 2 * i] = 1
-    views = torch.arange(count) * 5 % 24
-    poses = LookAtPoses(-15.0 * views, 30.0, 2.732, 15.0)
-    return Batch(images, masks, poses, views, torch.tensor(objects), 0 * views, None)
-
-
-def test_loss_is_the_mean_over_both_shapes_in_both_views() -> None:
-    method = make_method(MultiViewSettings(encoder="conv-small"))
-    batch = make_batch([4, 7, 4, 7])
-    with torch.no_grad():
-        batch.images[:2] //= 8  # shapes that differ
-        method.generator.layers[-1].weight *= 10
-        vertices = method.decode(method.encode(batch.images)).vertices
-        faces = method.generator.faces
-        losses = []
-        for shapes, views in itertools.product(([0, 1], [2, 3]), repeat=2):
-            cameras = batch.poses[torch.tensor(views)].cameras()
-            silhouettes = nmr.render_silhouette(vertices[shapes], faces, cameras, image_size=64)
-            losses.append(float(nmr.losses.soft_iou_loss(silhouettes, batch.masks[views])))
-        smoothness = float(nmr.losses.smoothness_loss(vertices, method.generator.edges))
-    assert len({round(loss, 4) for loss in losses}) == 4
-    values = method.losses(batch, 1)
-    assert [weight for weight, _ in values.values()] == [1.0, 0.001]
-    assert values["projection"][1].item() == pytest.approx(sum(losses) / 4, abs=1e-6)
-    assert values["smoothness"][1].item() == pytest.approx(smoothness, rel=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +41,27 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> ViewDataset:
         patch.setattr(tasks, "run_tasks", stub_work.run_tasks_here)
         assert render.make_shards(render.DatasetConfig(output=folder, shards=True, **options)) == 0
     return load_dataset("around", folder, "table", "train")
+
+
+def test_loss_is_the_mean_over_both_shapes_in_both_views(dataset: ViewDataset) -> None:
+    method = make_method(MultiViewSettings(encoder="conv-small"))
+    batch = dataset.batch(sample_indices(dataset, "pairs", 4, seed=0, step=1))
+    with torch.no_grad():
+        batch.images[:2] //= 8  # shapes that differ
+        method.generator.layers[-1].weight *= 10
+        vertices = method.decode(method.encode(batch.images)).vertices
+        faces = method.generator.faces
+        losses = []
+        for shapes, views in itertools.product(([0, 1], [2, 3]), repeat=2):
+            cameras = batch.poses[torch.tensor(views)].cameras()
+            silhouettes = nmr.render_silhouette(vertices[shapes], faces, cameras, image_size=64)
+            losses.append(float(nmr.losses.soft_iou_loss(silhouettes, batch.masks[views])))
+        smoothness = float(nmr.losses.smoothness_loss(vertices, method.generator.edges))
+    assert len({round(loss, 4) for loss in losses}) == 4
+    values = method.losses(batch, 1)
+    assert [weight for weight, _ in values.values()] == [1.0, 0.001]
+    assert values["projection"][1].item() == pytest.approx(sum(losses) / 4, abs=1e-6)
+    assert values["smoothness"][1].item() == pytest.approx(smoothness, rel=1e-5)
 
 
 def create(dataset: ViewDataset, **changes) -> ManyViews:
