@@ -56,11 +56,16 @@ class Page(NamedTuple):
     def get(self, path: str = "about") -> bytes:
         return f"GET /{path} HTTP/1.1\r\nHost: {self.host}\r\n\r\n".encode()
 
+    @property
+    def quick(self) -> str:
+        """The address of a mesh that takes a tenth of the time."""
+        return f"{self.url}{self.box.address}&smooth=1"
+
     def visit(self, source: str = "127.0.0.1") -> list[dict]:
         """The messages to a visitor with a picture."""
         transport = httpx.HTTPTransport(local_address=source)
         with httpx.Client(transport=transport, timeout=300) as client:
-            answer = client.post(self.url + self.box.address, content=self.box.content)
+            answer = client.post(self.quick, content=self.box.content)
         assert answer.status_code == 200, answer.text
         return [json.loads(line) for line in answer.text.splitlines()]
 
@@ -147,14 +152,14 @@ def silent_crowd(page: Page) -> None:
     """Six visitors come beside 250 silent connections: all get a place, and in the end their mesh."""
 
     def visit(_: int) -> list[dict]:
-        with httpx.stream("POST", address, content=page.box.content, timeout=300) as answer:
+        with httpx.stream("POST", page.quick, content=page.box.content, timeout=300) as answer:
             assert answer.status_code == 200
             lines = answer.iter_lines()
             first = next(lines)
             together.wait(60)  # all are there at once
             return [json.loads(line) for line in (first, *lines)]
 
-    address, together = page.url + page.box.address, threading.Barrier(6, page.goes_on.set)
+    together = threading.Barrier(6, page.goes_on.set)
     page.goes_on.clear()
     with contextlib.ExitStack() as crowd, ThreadPoolExecutor(6) as visitors:
         crowd.callback(page.goes_on.set)
@@ -316,21 +321,13 @@ def odd_origins_and_hosts(page: Page) -> None:
 
 def odd_numbers(page: Page) -> None:
     for number in ("٦٤", "６４", "6_4", "+64", " 64", "64.0", "6e1", "9" * 5000, ""):
-        answers = [
-            httpx.post(
-                page.url + "mesh",
-                params={"width": number, "height": page.box.size},
-                content=page.box.content,
-            )
-        ]
-        answers += [
-            httpx.post(
-                page.url + page.box.address,
-                params={"box": f"8,8,{number},40"},
-                content=page.box.content,
-            )
-        ]
-        assert [answer.status_code for answer in answers[:1]] == [400], number
+        side = page.box.size
+        for query in (
+            {"width": number, "height": side},
+            {"width": side, "height": side, "box": f"8,8,{number},40"},
+        ):
+            answer = httpx.post(page.url + "mesh", params=query, content=page.box.content)
+            assert answer.status_code == 400, query
 
 
 def large_header(page: Page) -> None:
