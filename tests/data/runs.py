@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,14 @@ import pytest
 import torch
 
 from learn3d import training
+from learn3d.config import TrainConfig
 from learn3d.data.dataset import Batch, DatasetInfo
 from learn3d.methods.method import Method
 from learn3d.presets import configure
 from learn3d.runs import checkpoint
 from learn3d.runs import folder as run_folder
 from learn3d.runs.checkpoint import Metadata, Progress
+from learn3d.training import train
 
 
 def check_same(folder: Path, other: Path) -> None:
@@ -50,6 +53,12 @@ def metadata(step: int = 3, **changes: Any) -> Metadata:
     return dataclasses.replace(about, **changes)
 
 
+def contents(folder: Path, pattern: str = "**/*") -> dict[str, bytes]:
+    """The files of a folder."""
+    files = (path for path in sorted(folder.glob(pattern)) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
 def same_tensors(ours: dict[str, torch.Tensor], theirs: dict[str, torch.Tensor]) -> None:
     """Two checkpoints have the same tensors, to the bit."""
     assert ours.keys() == theirs.keys()
@@ -58,6 +67,15 @@ def same_tensors(ours: dict[str, torch.Tensor], theirs: dict[str, torch.Tensor])
 
 def same_bits(a: torch.Tensor, b: torch.Tensor) -> bool:
     return a.dtype == b.dtype and a.shape == b.shape and a.numpy().tobytes() == b.numpy().tobytes()
+
+
+def stop_and_resume(config: TrainConfig, step: int) -> None:
+    """A run that a signal stops after a step, and that then goes on to its end."""
+    with pytest.MonkeyPatch.context() as patch:
+        before_step(patch, step, lambda: signal.raise_signal(signal.SIGTERM))
+        assert train(config).progress.step == step
+    torch.manual_seed(99)
+    assert train(config, resume=True).finished
 
 
 def before_step(patch: pytest.MonkeyPatch, step: int, action: Callable[[], object]) -> None:

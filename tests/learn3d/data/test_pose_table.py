@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from runs import before_step, same_tensors
+from runs import same_tensors, stop_and_resume
 from steps import TINY, TINY_VPL
 
 from learn3d.config import TrainConfig
@@ -107,19 +106,12 @@ def table(tmp_path: Path, tiny_folder: Path) -> Path:
 
 
 def test_weights_of_poses_survive_a_stop(
-    table: Path,
-    tmp_path: Path,
-    tiny_names: None,
-    tiny_config: Callable[..., TrainConfig],
-    monkeypatch: pytest.MonkeyPatch,
+    table: Path, tmp_path: Path, tiny_names: None, tiny_config: Callable[..., TrainConfig]
 ) -> None:
     """Reweighted after the steps 1 and 3, stopped after step 4."""
     options = {"preset": "plus-kato", "poses": table, "iterations": 6, "pose_updates": 2} | TINY
     assert train(tiny_config(tmp_path / "whole", **options)).finished
-    with monkeypatch.context() as patch:
-        before_step(patch, 4, lambda: signal.raise_signal(signal.SIGINT))
-        assert not train(tiny_config(tmp_path / "stopped", **options)).finished
-    assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
+    stop_and_resume(tiny_config(tmp_path / "stopped", **options), 4)
     whole, stopped = (
         checkpoint.load(tmp_path / name / "last.safetensors")[0] for name in ("whole", "stopped")
     )

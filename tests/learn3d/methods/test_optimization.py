@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copy
 import math
-import signal
 from pathlib import Path
 from typing import get_args
 
 import pytest
 import torch
-from runs import before_step, same_tensors
+from runs import same_tensors, stop_and_resume
 from steps import TINY, TINY_PRGAN, TINY_VPL, make_method
 from torch import nn
 from torch.optim.swa_utils import AveragedModel
@@ -176,7 +175,7 @@ def test_every_method_has_a_tiny_run() -> None:
 
 @pytest.mark.parametrize("name", TINY_RUNS)
 def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
-    name: str, tiny_names, tiny_config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tiny_names, tiny_config, tmp_path: Path
 ) -> None:
     options = TINY_RUNS[name] | {
         "lr_schedule": "cosine",
@@ -185,11 +184,7 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
         "validate_every": 2,
     }
     train(tiny_config(tmp_path / "straight", **options))
-    with monkeypatch.context() as patch:
-        before_step(patch, 2, lambda: signal.raise_signal(signal.SIGTERM))
-        assert train(tiny_config(tmp_path / "stopped", **options)).progress.step == 2
-    torch.manual_seed(99)
-    assert train(tiny_config(tmp_path / "stopped", **options), resume=True).finished
+    stop_and_resume(tiny_config(tmp_path / "stopped", **options), 2)
     for file in ("last", "best"):
         runs = (tmp_path / "straight", tmp_path / "stopped")
         same_tensors(*(checkpoint.load(run / f"{file}.safetensors")[0] for run in runs))

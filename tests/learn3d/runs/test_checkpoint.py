@@ -16,7 +16,7 @@ import pytest
 import torch
 from fuzz_targets import StandIn
 from reader_checks import at_most
-from runs import check_same, metadata, same_tensors
+from runs import check_same, contents, metadata, same_tensors
 from safetensors.torch import save_file
 
 from learn3d import training
@@ -211,10 +211,6 @@ def flip(path: Path, at: int | None = None) -> None:
     at = len(content) * 2 // 3 if at is None else at
     content[at] ^= 1 << at % 8
     path.write_bytes(content)
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*.safetensors")}
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,22 @@ def test_its_own_page_can(client, name) -> None:
 
 
 @pytest.mark.parametrize(
+    "header",
+    [
+        *(("Origin", odd) for odd in ("http://[", "http://[::1", "null", "http://evil.example")),
+        *(("Origin", odd) for odd in ("http://127.0.0.1:1@evil.example", "\x80")),
+        *(("Host", odd) for odd in ("evil.example", "", "[", "[::1", "localhost.evil.example")),
+        ("Host", "127.0.0.1.evil.example"),
+    ],
+)
+def test_other_pages_cannot(client, server, box, header) -> None:
+    headers = {header[0]: header[1].encode("latin-1")}
+    for method in ("GET", "POST"):
+        assert client.request(method, box.address, headers=headers).status_code == 403
+    assert server.errors.read_text() == ""
+
+
+@pytest.mark.parametrize(
     "path", ["", "page.js", "about", "examples/chair.png", "none", "../server.py"]
 )
 def test_browsers_are_told_to_run_and_fetch_nothing_else(client, path) -> None:
@@ -86,6 +102,10 @@ def test_a_picture_becomes_meshes_and_nothing_of_it_comes_back(client, box) -> N
         {"params": {"width": 600, "height": 1}, "content": bytes(2400)},
         {"params": {"width": "\x1b]0;title\x07", "height": 64}},
         {"params": {"width": 64, "height": 64, "box": "1,2,3"}},
+        *(
+            {"params": {"width": odd, "height": 64}}
+            for odd in ("٦٤", "６４", "6_4", "+64", " 64", "64.0", "6e1", "9" * 5000, "")
+        ),
         {"content": b"<script>alert(1)</script>"},
     ],
 )

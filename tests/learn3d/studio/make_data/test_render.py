@@ -11,8 +11,8 @@ import torch
 import trimesh
 from lopsided_meshes import lopsided_mesh, make, write_meshes
 from PIL import Image
+from runs import contents
 
-from learn3d.commands import main
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
@@ -165,27 +165,11 @@ def test_settings_and_folders_that_are_refused(tmp_path, folder, settings, messa
     assert not out.is_dir() or not list(out.iterdir())
 
 
-def test_command_line(tmp_path, folder, monkeypatch, capsys):
-    command = [
-        "make-dataset",
-        "--output",
-        str(tmp_path / "data"),
-        "--category",
-        "chair",
-        "--source",
-        str(folder),
-    ]
-    monkeypatch.setattr("sys.argv", ["learn3d", *command])
-    assert main() == 0 and "6 meshes used" in capsys.readouterr().out
-    assert main() == 1 and capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
+def test_command_line(tmp_path, folder, command):
+    words = ("make-dataset", "--output", tmp_path, "--category", "chair", "--source", folder)
+    assert "6 meshes used" in command(*words)[1]
+    status, _, said = command(*words)
+    assert status == 1 and said.splitlines()[-1].startswith("error: ")
 
 
 @pytest.mark.parametrize("layout", [name for name, writer in WRITERS.items() if writer.write])
