@@ -103,8 +103,9 @@ def test_a_picture_becomes_meshes_and_nothing_of_it_comes_back(client, box) -> N
         {"params": {"width": "\x1b]0;title\x07", "height": 64}},
         {"params": {"width": 64, "height": 64, "box": "1,2,3"}},
         *(
-            {"params": {"width": odd, "height": 64}}
-            for odd in ("٦٤", "６４", "6_4", "+64", " 64", "64.0", "6e1", "9" * 5000, "")
+            {"params": {"width": 64, "height": 64} | odd}
+            for text in ("٦٤", "６４", "6_4", "+64", " 64", "64.0", "6e1", "9" * 5000, "")
+            for odd in ({"width": text}, {"box": f"8,8,{text},40"})
         ),
         {"content": b"<script>alert(1)</script>"},
     ],
