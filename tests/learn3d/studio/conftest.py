@@ -1,4 +1,4 @@
-"""Chromium for the pages of the studio, and pages whose errors and requests are watched."""
+"""Short turntables; Chromium for the pages of the studio, and pages whose errors and requests are watched."""
 
 from __future__ import annotations
 
@@ -14,6 +14,15 @@ from PIL import Image
 PATIENCE = 100_000  # milliseconds; a second or two on an idle machine
 # WebGL without a graphics card
 _OPTIONS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+
+
+@pytest.fixture
+def short_turntables(monkeypatch) -> None:
+    """Turntables take most of the time of a reconstruction."""
+    monkeypatch.setattr(
+        "learn3d.studio.picture_to_mesh.write.turntable",
+        lambda _: np.zeros((2, 32, 32, 3), np.uint8),
+    )
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from PIL import Image
 
 from learn3d.studio.picture_to_mesh import cutting
 from learn3d.studio.picture_to_mesh.cutting import cut_out, find_doubt, find_outline, is_plain
+
+needs_opencv = pytest.mark.skipif(find_spec("cv2") is None, reason="needs the extra photos")
 
 
 @pytest.fixture
@@ -34,9 +37,9 @@ def overlap(mask: np.ndarray, inside: np.ndarray) -> float:
     return ((mask > 0) & inside).sum() / ((mask > 0) | inside).sum()
 
 
+@needs_opencv
 @pytest.mark.parametrize("box", [None, (80, 50, 220, 220)])
 def test_an_object_is_cut_out_of_a_busy_background(scene, box) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
     colors, inside = scene
     assert not is_plain(colors)
     mask, sureness = cut_out(colors, box)
@@ -47,20 +50,20 @@ def test_an_object_is_cut_out_of_a_busy_background(scene, box) -> None:
     assert np.array_equal(mask, again), "the same mask every time"
 
 
+@needs_opencv
 @pytest.mark.parametrize(
     "box", [(-1, 0, 50, 50), (0, 0, 401, 300), (10, 10, 0, 5), (0, 0, 400, 300)]
 )
 def test_a_box_must_leave_some_background(scene, box) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
     with pytest.raises(
         ValueError, match=r"box .*(must lie within the 400x300 pixels|covers the whole picture)"
     ):
         cut_out(scene[0], box)
 
 
+@needs_opencv
 @pytest.mark.parametrize("change", ["odd", "small", "grey", "large"])
 def test_pictures_of_all_sizes_are_cut_out(room, change) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
     colors, inside = room
     if change == "grey":
         colors = np.repeat(colors.mean(axis=2, keepdims=True).astype(np.uint8), 3, axis=2)
@@ -72,9 +75,9 @@ def test_pictures_of_all_sizes_are_cut_out(room, change) -> None:
     assert mask.shape == inside.shape and overlap(mask, inside) > 0.75
 
 
+@needs_opencv
 @pytest.mark.parametrize("shape", [(2, 2), (3, 40), (40, 3), (9, 7)])
 def test_tiny_pictures_have_a_mask_of_their_size(shape) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
     colors = np.random.default_rng(0).integers(0, 256, (*shape, 3)).astype(np.uint8)
     mask, sureness = cut_out(colors)
     assert mask.shape == shape and 0 <= sureness <= 1
@@ -105,8 +108,10 @@ def test_plain_backgrounds_need_no_opencv(scene, monkeypatch) -> None:
         find_outline(colors)
 
 
-def test_reconstruct_takes_a_box(scene, finished_run, tmp_path: Path, command) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
+@needs_opencv
+def test_reconstruct_takes_a_box(
+    scene, finished_run, tmp_path: Path, command, short_turntables
+) -> None:
     Image.fromarray(scene[0]).save(tmp_path / "disc.png")
     words = (
         "reconstruct",
@@ -162,9 +167,9 @@ def room() -> tuple[np.ndarray, np.ndarray]:
     return (colors + rng.normal(0, 2, colors.shape)).clip(0, 255).astype(np.uint8), inside
 
 
+@needs_opencv
 @pytest.mark.parametrize("box", [None, (114, 136, 192, 130)])
 def test_wall_floor_and_shadow_stay_outside(room, box) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
     colors, inside = room
     assert not is_plain(colors)
     outline = find_outline(colors, box)
@@ -230,10 +235,10 @@ def test_rembg_is_used_if_installed_and_says_so(rembg, room, capsys) -> None:
     assert not capsys.readouterr().err, "said once"
 
 
+@needs_opencv
 @pytest.mark.parametrize("failure", [OSError("no route to host"), RuntimeError("odd weights")])
 @pytest.mark.parametrize("box", [None, (114, 136, 192, 130)])
 def test_the_packages_network_does_what_rembg_cannot(rembg, room, failure, box) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
     colors, inside = room
     rembg.failure = failure
     outline = find_outline(colors, box)
@@ -249,8 +254,8 @@ def test_outlines_on_which_two_networks_disagree_are_doubted(rembg, room) -> Non
     assert find_outline(other).doubt == "two networks see different outlines"
 
 
+@needs_opencv
 def test_a_box_leaves_out_a_picture_on_the_wall_that_the_object_touches(room) -> None:
-    pytest.importorskip("cv2", reason="needs the extra photos")
     colors, inside = room
     colors = colors.copy()
     colors[80:141, 170:240] = np.where(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from painted import seen
 from PIL import Image
 
 import nmr
@@ -16,7 +17,6 @@ from learn3d.data.layouts import load_dataset
 from learn3d.methods import create_method
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import centre
-from learn3d.pictures import photograph
 from learn3d.presets import PRESETS
 from learn3d.studio.picture_to_mesh.coloring import _alike, color_mesh
 from learn3d.studio.picture_to_mesh.export import export
@@ -128,11 +128,7 @@ def test_colours_of_the_seen_side_are_the_pictures_and_the_others_those_of_the_m
     # red above, blue below
     paint = np.where(centres[:, 1:2] > 0, [[0.9, 0.1, 0.1]], [[0.1, 0.1, 0.9]])
     view = frame_view(vertices[None], torch.tensor([20.0]), torch.tensor([10.0]))
-    lights = nmr.Lights(1.0, 0.0)
-    rgb, alpha = photograph(
-        view.place(vertices[None])[0], faces, paint, view.cameras(), image_size=256, lights=lights
-    )
-    picture = Target(torch.from_numpy(np.concatenate([rgb[0].transpose(2, 0, 1), alpha])) / 255)
+    picture = seen(vertices, faces, paint, view)
     reflection = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
     surface = color_mesh((vertices, faces), view, picture, reflection)
     _, y, z = surface.vertices.T
@@ -171,13 +167,7 @@ def test_hidden_sides_have_the_colours_at_their_height() -> None:
     high = vertices[faces].mean(1)[:, 1:2] > 0
     paint = np.where(high, [[0.1, 0.2, 0.8]], [[0.8, 0.2, 0.1]])
     view = frame_view(vertices[None], torch.tensor([0.0]), torch.tensor([5.0]))
-    placed, look = (
-        view.place(vertices[None])[0],
-        {"image_size": 256, "lights": nmr.Lights(1.0, 0.0)},
-    )
-    rgb, alpha = photograph(placed, faces, paint, view.cameras(), **look)
-    target = Target(torch.from_numpy(np.concatenate([rgb[0].transpose(2, 0, 1), alpha])) / 255)
-    surface = color_mesh((vertices, faces), view, target)
+    surface = color_mesh((vertices, faces), view, seen(vertices, faces, paint, view))
     behind = (surface.vertices[:, 2] > 0.19) & (surface.vertices[:, 0].abs() < 0.3)
     for side, wanted in ((surface.vertices[:, 1] > 0.1, 2), (surface.vertices[:, 1] < -0.1, 0)):
         found = surface.colors[behind & side].mean(0)

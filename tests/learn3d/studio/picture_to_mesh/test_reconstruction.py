@@ -22,14 +22,6 @@ from learn3d.studio.picture_to_mesh.write import export_mesh
 from learn3d.studio.shapes import make_shape
 
 
-@pytest.fixture
-def short_turntables(monkeypatch) -> None:
-    monkeypatch.setattr(
-        "learn3d.studio.picture_to_mesh.write.turntable",
-        lambda _: np.zeros((2, 32, 32, 3), np.uint8),
-    )
-
-
 def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
     stored = tiny_set.images[3]
     again = prepare_image(255 - stored[:3].transpose(1, 2, 0), stored[3], crop=False)

@@ -8,11 +8,14 @@ import json
 
 import numpy as np
 import pytest
+import stub_work
 import torch
 import trimesh
+from painted import seen
 from PIL import Image
 
 import nmr
+from learn3d import tasks
 from learn3d.data.layouts import load_dataset
 from learn3d.pictures import Surface, photograph
 from learn3d.studio.make_data.render import DatasetConfig, make_shards
@@ -66,16 +69,10 @@ def test_lines_inside_the_same_outline_tell_a_shape() -> None:
     faces = [torch.tensor(each.faces) for each in (plain, crossed)]
     view = frame_view(shapes[1], torch.tensor([180.0, 180.0]), torch.tensor([20.0, 20.0]))
     for number in range(2):
-        (rgb,), (alpha,) = photograph(
-            view.place(shapes)[number],
-            faces[number],
-            (0.2, 0.5, 0.3),
-            view.select(torch.tensor([number])).cameras(),
-            image_size=256,
-        )
-        seen = torch.from_numpy(np.concatenate([np.moveaxis(rgb, -1, 0), alpha[None]])) / 255
+        own = view.select(torch.tensor([number]))
+        target = seen(shapes[number], faces[number], (0.2, 0.5, 0.3), own, lights=None)
         found = Candidates(shapes, faces, ["panel", "panel"], view, torch.zeros(2))
-        lines = compare_lines(found, Target(seen), DEFAULTS.match)
+        lines = compare_lines(found, target, DEFAULTS.match)
         assert int(lines.argmin()) == number
 
 
@@ -124,14 +121,10 @@ def test_colours_that_are_not_mirror_images_tell_a_wrong_camera() -> None:
     centres = vertices[faces].mean(1)
     paint = np.where(centres[:, :1].abs() > 0.2, [[0.9, 0.1, 0.1]], [[0.1, 0.9, 0.1]])
     view = frame_view(vertices, torch.tensor([0.0]), torch.tensor([10.0]))
-    placed, look = (
-        view.place(vertices[None])[0],
-        {"image_size": 256, "lights": nmr.Lights(1.0, 0.0)},
-    )
-    (rgb,), (alpha,) = photograph(placed, faces, paint, view.cameras(), **look)
-    pixels = torch.from_numpy(np.concatenate([np.moveaxis(rgb, -1, 0), alpha[None]])) / 255
-    right = clash((vertices, faces), view, Target(pixels), MIRROR)
-    lop_sided = Target(torch.where(torch.arange(256) < 128, pixels, pixels[[2, 1, 0, 3]]))
+    target = seen(vertices, faces, paint, view)
+    right = clash((vertices, faces), view, target, MIRROR)
+    others = target.pixels[[2, 1, 0, 3]]
+    lop_sided = Target(torch.where(torch.arange(256) < 128, target.pixels, others))
     assert right < 0.05 < 0.2 < clash((vertices, faces), view, lop_sided, MIRROR)
 
 
@@ -153,7 +146,10 @@ def test_guesses_differ_and_a_known_category_is_obeyed(model: Model) -> None:
         reconstruct_picture(model, *shown, category="boat")
 
 
-def test_generated_shapes_of_a_training_set_become_templates(model: Model, tmp_path) -> None:
+def test_generated_shapes_of_a_training_set_become_templates(
+    model: Model, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(tasks, "run_tasks", stub_work.run_tasks_here)
     make_shards(
         DatasetConfig(tmp_path, "lamp", layout="around", procedural=8, test=1, val=1, shards=True)
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,3 +42,15 @@ def make(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
 def read_report(tmp_path: Path) -> Callable[[str], str]:
     """The report of a table in `tmp_path / "out"`."""
     return lambda table="kato": (tmp_path / "out" / f"{table}.md").read_text()
+
+
+@pytest.fixture
+def change_result(tmp_path: Path) -> Callable[[Callable[[dict], dict]], None]:
+    """Adds to the stored result of a run of the method "proposed"."""
+
+    def change(make: Callable[[dict], dict]) -> None:
+        path = tmp_path / "out/runs/airplane/proposed-seed0/test.json"
+        stored = json.loads(path.read_text())
+        path.write_text(json.dumps(stored | make(stored)))
+
+    return change

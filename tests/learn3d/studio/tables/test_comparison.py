@@ -116,12 +116,10 @@ def test_baselines_stand_below_the_methods(
     assert "Mean shape" not in read_report("mmd"), "that table compares codes"
 
 
-def test_measures_that_disagree_are_named(tmp_path, make, request_for, read_report) -> None:
+def test_measures_that_disagree_are_named(make, request_for, read_report, change_result) -> None:
     make(request_for())
     assert "disagree" not in read_report(), "Chamfer-L1 and F-score are equal"
-    path = tmp_path / "out/runs/airplane/proposed-seed0/test.json"
-    changed = json.loads(path.read_text()) | {"chamfer_l1": 0.2, "f_score": 0.7}
-    path.write_text(json.dumps(changed))
+    change_result(lambda stored: {"chamfer_l1": 0.2, "f_score": 0.7})
     make(request_for(report_only=True))
     wanted = (
         "Measures disagree on airplane: voxel IoU and F-score for Proposed, Chamfer-L1 for "
@@ -131,14 +129,12 @@ def test_measures_that_disagree_are_named(tmp_path, make, request_for, read_repo
 
 
 def test_both_checkpoints_the_angles_and_the_unclamped_iou_are_reported(
-    tmp_path, make, request_for, read_report
+    tmp_path, make, request_for, read_report, change_result
 ) -> None:
     make(request_for())
-    path = tmp_path / "out/runs/airplane/proposed-seed0/test.json"
-    changed = json.loads(path.read_text())
-    best = changed | {"checkpoint": "run/best.safetensors", "step": 3, "voxel_iou": 0.5}
-    changed |= {"other": best, "angles": [[0, 0.9], [180, 0.7]], "voxel_iou_unclamped": 0.3}
-    path.write_text(json.dumps(changed))
+    best = {"checkpoint": "run/best.safetensors", "step": 3, "voxel_iou": 0.5}
+    more = {"angles": [[0, 0.9], [180, 0.7]], "voxel_iou_unclamped": 0.3}
+    change_result(lambda stored: more | {"other": stored | best})
     make(request_for(report_only=True))
     tables = json.loads((tmp_path / "out/kato.json").read_text())
     networks = [row[1] for row in tables["runs"] if row[0] == "airplane/proposed-seed0"]
@@ -159,11 +155,10 @@ def test_mmd_is_compared_by_ratio(make, request_for, read_report) -> None:
 
 
 def test_results_on_different_objects_have_no_interval(
-    tmp_path, make, request_for, read_report
+    make, request_for, read_report, change_result
 ) -> None:
     make(request_for())
-    path = tmp_path / "out/runs/airplane/proposed-seed0/test.json"
-    path.write_text(path.read_text().replace('"a"', '"another"'))
+    change_result(lambda stored: {"objects": [["another", 24, 0.4, 0.4], *stored["objects"][1:]]})
     make(request_for(report_only=True))
     assert "| Proposed | +0.100 | +0.100 |" in read_report()
 
