@@ -33,6 +33,7 @@ METHODS = {
     "kar-vanilla": "Vanilla-AE",
     "bins-15x20": "Proposed",
 }
+_POSES = ("category", "Acc@30", "up to half a turn", "IoU, known poses", "IoU, estimated poses")
 _SHOWN = ("voxel IoU", "unclamped IoU", "Chamfer-L1", "F-score", "MMD", "shuffled MMD")
 
 
@@ -99,7 +100,7 @@ def rows(name: str, part: str) -> list[list[str]]:
 
     part: a table of the file, or one made of others: "both" puts the difference under each method,
     "side" puts paper, here and difference of a single category side by side, "seeds" adds the mean difference over
-    seeds as a last column, "means" leaves the means over seeds of "poses", "measures" is made by `measures`,
+    seeds as a last column, "means" leaves the most important means over seeds of "poses", "measures" is made by `measures`,
     "baselines" leaves the rows of the mean shape and the others, of this file and of the others side by side.
     """
     tables = read(name)
@@ -116,7 +117,7 @@ def rows(name: str, part: str) -> list[list[str]]:
         return [[*header, f"{title}: {spread}"], *lines, *last]
     if part == "means":
         header, *lines = tables["poses"]
-        kept = [k for k, name in enumerate(header) if name != "seed"]
+        kept = [k for k, name in enumerate(header) if name in _POSES]
         return [
             [line[k] for k in kept]
             for line in [header, *(line for line in lines if line[1] == "mean")]

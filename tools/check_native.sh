@@ -1,7 +1,13 @@
 #!/usr/bin/env bash
 # Checks the kernels (csrc/) without Python, in separate builds under build/native. Usage: bash tools/check_native.sh CHECK [ARGUMENTS]
-# CHECK: tests, asan, tsan, fuzz SECONDS, keep, count, count-base, variants or coverage (docs/contributing.md). Exit status 77: a
-# tool is missing. PYTHON: an interpreter that has cmeel-eigen and gcovr; default .venv/bin/python.
+#   tests             C++ tests; every instruction set must give the same bits
+#   asan, tsan        the same under AddressSanitizer and UndefinedBehaviorSanitizer; under ThreadSanitizer
+#   fuzz SECONDS      libFuzzer looks for inputs that reach new code; keep stores them in corpus.hex
+#   count             instructions of every kernel under callgrind, at most 5 % above instructions.json; --store stores
+#                     new bounds. count-base: without AVX
+#   variants          the same bits from each compiler and instruction set, arm64 under qemu included
+#   coverage          lines and branches that the tests and the corpus reach
+# Exit status 77: a tool is missing. PYTHON: an interpreter that has cmeel-eigen and gcovr; default .venv/bin/python.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

@@ -48,6 +48,9 @@ learn3d experiment mmd --data DATA --output OUTPUT --category airplane,chair,tab
 # Table 6, longer
 learn3d experiment mmd --data DATA --output LONG --category airplane,chair,table --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500
 
+# docs/methods/plus.md
+learn3d experiment plus --data DATA --output OUTPUT --category airplane,chair,table --methods Proposed Plus --iterations 2000 --seeds 3 --set clamp_to_cube=true
+
 # The mean shape and the nearest training object of each data set
 learn3d make-dataset --output AIRPLANES --category airplane --procedural 2000
 learn3d experiment kato --data AIRPLANES --output AIRPLANES_OUTPUT --category airplane --methods Vanilla-AE Proposed --report-only
