@@ -24,4 +24,6 @@ check_room "${TMPDIR:-/tmp}" $room
 # One thread per process: threads that wait for each other on shared cores take many times as long. The tests of a file
 # stay together, as they share trained runs and compiled programs. Files go in the order of their names.
 export OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-exec .venv/bin/pytest -n "${JOBS:-auto}" --maxprocesses 8 --dist loadfile --no-loadscope-reorder "${which[@]}" "$@"
+# A test that hangs ends its process with the stacks of all threads, and counts as failed.
+limit=(-o faulthandler_timeout=1200 -o faulthandler_exit_on_timeout=true)
+exec .venv/bin/pytest -n "${JOBS:-auto}" --maxprocesses 8 --dist loadfile --no-loadscope-reorder "${limit[@]}" "${which[@]}" "$@"

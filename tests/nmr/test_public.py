@@ -1,7 +1,8 @@
 """Properties of every public function that takes tensors: clones, changes in place, threads, modes of torch."""
 
 import functools
-import multiprocessing
+import subprocess
+import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from children import environment
 from scenes import bumpy_sphere, leaf_of, same_bits, uniform
 
 import nmr
@@ -596,10 +598,21 @@ def values_under(mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_first_call_under_a_mode_changes_nothing(mode):
+def test_a_first_call_under_a_mode_changes_nothing(mode, tmp_path):
     """In a new process: nothing that a function keeps for later belongs to inference mode, or to a default device."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        values, found = pool.apply(values_under, (mode,))
+    made = tmp_path / "made.pt"
+    code = (
+        "import sys, torch\n"
+        "sys.path.insert(0, sys.argv[1])\n"
+        "import test_public\n"
+        "torch.save(test_public.values_under(sys.argv[2]), sys.argv[3])"
+    )
+    command = [sys.executable, "-c", code, str(Path(__file__).parent), mode, str(made)]
+    ended = subprocess.run(
+        command, env=environment(), cwd=tmp_path, capture_output=True, text=True, timeout=600
+    )
+    assert ended.returncode == 0, ended.stderr
+    values, found = torch.load(made)
     for name, wanted in everything().items():
         assert same_bits(found[name], wanted), name
         assert near(values[name], wanted[: len(values[name])]), name
