@@ -167,7 +167,7 @@ def parameter_texts(function: Any) -> dict[str, Parameter]:
     entries = [
         entry
         for entry in FunctionDoc(function)["Parameters"]
-        if not entry.desc[0].startswith("As :func:")
+        if entry.desc and not re.fullmatch(r"As in :func:`\w+`\.", entry.desc[0])
     ]
     return {name: entry for entry in entries for name in entry.name.split(", ")}
 

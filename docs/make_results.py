@@ -100,7 +100,7 @@ def rows(name: str, part: str) -> list[list[str]]:
 
     part: a table of the file, or one made of others: "both" puts the difference under each method,
     "side" puts paper, here and difference of a single category side by side, "seeds" adds the mean difference over
-    seeds as a last column, "means" leaves the most important means over seeds of "poses", "measures" is made by `measures`,
+    seeds as a last column, "means" leaves some means over seeds of "poses", "measures" is made by `measures`,
     "baselines" leaves the rows of the mean shape and the others, of this file and of the others side by side.
     """
     tables = read(name)

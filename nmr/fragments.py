@@ -30,36 +30,31 @@ if TYPE_CHECKING:
 class Fragments:
     """The nearest face at each centre of the raster, made by :func:`nmr.render_fragments`.
 
-    H and W are those of the image, or twice as many with anti-aliasing. Row 0 is the top. For
-    shading of your own, compute an image ``[B, H, W, C]`` from these and call :meth:`resolve`,
-    which averages pixels and gives the vertices NMR's gradient.
+    H and W are the image's, or twice as many with anti-aliasing; row 0 is the top. For shading of
+    your own, compute an image ``[B, H, W, C]`` and call :meth:`resolve`, which averages pixels and
+    gives the vertices NMR's gradient.
 
     Attributes
     ----------
     sided_face_index : int32 Tensor [B, H, W]
-        Face index as :mod:`nmr.ops` takes it. ``sided_face_index[b, y, x] = f``: face f is
-        nearest and seen from its front; ``F + f``: from its back; -1: background. ``face_index``
-        and ``is_back`` say the same as two tensors.
+        ``sided_face_index[b, y, x] = f``: face f is nearest and seen from its front; ``F + f``:
+        from its back; -1: background. ``face_index`` and ``is_back`` say the same.
     weights : Tensor [B, H, W, 3]
         Barycentric weights in space (perspective-correct) of the face's vertices in their own
-        order; their sum is 1. 0 on background. Differentiable in the vertices (at fixed face
-        indices). Use ``weights.detach()`` for NMR's definition, in which colours move vertices
-        only through edges.
+        order, of sum 1; 0 on background. Differentiable in the vertices (at fixed face indices);
+        ``weights.detach()`` is NMR's definition, in which colours move vertices through edges only.
     depth : Tensor [B, H, W]
-        z of the nearest point, ``far`` on background. Differentiable in the vertices (at fixed
-        face indices).
+        z of the nearest point, ``far`` on background. Differentiable in the vertices.
     vertices, faces
-        The meshes in renderer space, ``[B, V, 3]``; for a list of meshes ``[N, 3]``, one mesh
-        after the other.
+        The meshes in renderer space, ``[B, V, 3]``; of a list ``[N, 3]``, one after the other.
 
     distances : Tensor [B, H, W, K], or None without blur_radius
-        Squared distance of the pixel from the border of the face, in units of half the shorter
-        side of the image; negative inside of the face. Differentiable in x and y of the vertices.
+        Squared distance from the border of the face, in units of half the shorter side of the
+        image; negative inside. Differentiable in x and y of the vertices.
 
-    With ``faces_per_pixel`` K > 1 or a ``blur_radius`` these have one more axis: sided_face_index
-    and depth ``[B, H, W, K]``, weights ``[B, H, W, K, 3]``, nearest first. So do the results of
-    :meth:`interpolate`, :meth:`per_face`, :meth:`normals`, of colours and lights, and of the
-    properties. :meth:`resolve` takes one image.
+    With ``faces_per_pixel`` K > 1 or a ``blur_radius`` these, and all that is computed of them,
+    have one more axis, nearest first: sided_face_index and depth ``[B, H, W, K]``, weights ``[B, H,
+    W, K, 3]``. :meth:`resolve` takes one image.
 
     Examples
     --------

@@ -44,74 +44,66 @@ def render_soft(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
-    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
-        Without them the meshes are white.
+        Such as :class:`nmr.LookAt`.
+    colors : Colors, optional
+        As in :func:`render`.
     lights : Lights, optional
-        Colours are multiplied by the light. Without lights they are drawn unchanged.
+        They multiply colours; without, these are drawn unchanged.
     background : number, [C], or Tensor [B, C]
         Colour of pixels without a face.
     sigma : float or Tensor []
-        Blur beyond the border of faces, as in :func:`render_soft_silhouette`:
-        ``D = sigmoid(+-d^2 / sigma)``, + inside.
+        As in :func:`render_soft_silhouette`: ``D = sigmoid(+-d^2 / sigma)``, + inside.
     gamma : float or Tensor []
         How sharply nearer faces hide others.
     faces_per_pixel : int
-        K in 1..1024: the nearest K of the faces that reach a pixel are blended. SoftRas takes
-        all.
+        K in 1..1024: the nearest K faces of a pixel are blended (SoftRas: all).
     dist_eps : float
-        Faces for which D would be less than this at a pixel outside are left out there. In (0,
-        0.5).
+        In (0, 0.5): faces with a smaller D at a pixel outside are left out there.
     background_eps : float
         Closeness e of the background: 1e-3 in SoftRas, 1e-10 in PyTorch3D.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
 
     Returns
     -------
     Images
-        ``rgb, alpha = render_soft(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With C_j the colour
-        of face j at the pixel, lit, and ``c_j = (far - z_j) / (far - near)`` the closeness of its
-        depth::
+        ``rgb [B, h, w, C], alpha [B, h, w]``. With C_j the lit colour of face j at the pixel, and
+        ``c_j = (far - z_j) / (far - near)`` the closeness of its depth::
 
             rgb = (sum_j w_j C_j + w_b background) / (sum_j w_j + w_b)
             w_j = D_j exp(c_j / gamma),    w_b = exp(e / gamma),    alpha = 1 - product_j (1 - D_j)
 
-        Of a face that does not contain the pixel, C_j and z_j belong to the weights that are
-        clamped to [0, 1] and divided by their sum.
+        Outside of a face, C_j and z_j belong to its weights, clamped to [0, 1] and divided by their
+        sum.
 
     Notes
     -----
-    Source: Liu et al. 2019, equations 2 and 3, and the published code, in which ``near`` is 1 by
-    default. There colours are interpolated on the screen, here in space. PyTorch3D also keeps
-    ``w_b`` above 1e-10 of the nearest ``exp(c_j / gamma)``.
+    Liu et al. 2019, equations 2 and 3, and the published code, in which ``near`` is 1 by default.
+    There colours are interpolated on the screen, here in space. PyTorch3D also keeps ``w_b`` above
+    1e-10 of the nearest ``exp(c_j / gamma)``.
 
-    Differentiable in all three coordinates of the vertices, in colours, lights, background, sigma
-    and gamma: the true derivative of the image, up to the jumps where faces come within reach or
-    leave the K nearest. The memory is that of B h w K faces, about 100 bytes each with gradients
-    in float32. There is no second derivative.
+    The true derivative in vertices, colours, lights, background, sigma and gamma, up to the jumps
+    where faces come within reach or leave the K nearest. The memory is that of B h w K faces, about
+    100 bytes each with gradients in float32. There is no second derivative.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit, a
-        sigma or gamma that is not positive, a dist_eps outside (0, 0.5), and a faces_per_pixel
-        that is not an integer in 1..1024.
+        For wrong types, shapes and ranges: sigma and gamma are positive, dist_eps in (0, 0.5),
+        faces_per_pixel an integer in 1..1024; and for colours, lights and backgrounds that do not
+        fit.
 
     Examples
     --------
@@ -182,63 +174,56 @@ def render_transparent(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
-    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
-        Without them the meshes are white.
+        Such as :class:`nmr.LookAt`.
+    colors : Colors, optional
+        As in :func:`render`.
     lights : Lights, optional
-        Colours are multiplied by the light. Without lights they are drawn unchanged.
+        They multiply colours; without, these are drawn unchanged.
     background : number, [C], or Tensor [B, C]
         Colour of pixels without a face.
     opacity : number in [0, 1], Tensor [] or [B], or colours of one channel
-        How much of the light from behind a surface is held back. For instance ``nmr.FaceColors``
-        of ``[F, 1]``.
+        The share of the light from behind that is held back; for instance ``nmr.FaceColors`` of
+        ``[F, 1]``.
     faces_per_pixel : int
         K in 1..1024. Surfaces behind the K nearest are left out.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
     eps : float
-        In NMR's gradient, added to the distance between an edge and a pixel.
+        As in :func:`render_silhouette`.
     interpolation_gradient : bool
-        Adds the true derivative of interpolated colours with respect to the position of a pixel
-        on its face, so that vertices also move to shift colours under the pixels. The published
-        renderer does not have this: there colours move vertices only through edges.
+        As in :func:`render`.
 
     Returns
     -------
     Images
-        ``rgb, alpha = render_transparent(...)``: ``[B, h, w, C]`` and ``[B, h, w]``. With o_k the
-        opacity and C_k the colour, lit, of the k-th nearest surface and
-        ``T_k = product over j < k of (1 - o_j)``::
+        ``rgb [B, h, w, C], alpha [B, h, w]``. With o_k the opacity and C_k the lit colour of the
+        k-th nearest surface and ``T_k = product over j < k of (1 - o_j)``::
 
             rgb = sum_k T_k o_k C_k + T_K background,    alpha = 1 - T_K
 
     Notes
     -----
-    This is the "over" operator (Porter and Duff 1984). Colours, opacity, lights and background
-    have true derivatives. x and y of the vertices have NMR's edge gradient at the edges that are
-    seen, as in :func:`render_rgb`; the hidden edges of other layers have none.
+    The "over" operator (Porter and Duff 1984). Colours, opacity, lights and background have true
+    derivatives, x and y of the vertices NMR's edge gradient at the edges that are seen; hidden
+    edges have none.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for colours, lights and backgrounds that do not fit,
-        an opacity outside [0, 1] or of several channels, and a faces_per_pixel that is not an
-        integer in 1..1024.
+        For wrong types, shapes and ranges (opacity in [0, 1], of one channel; faces_per_pixel an
+        integer in 1..1024), and for colours, lights and backgrounds that do not fit.
 
     Examples
     --------

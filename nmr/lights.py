@@ -66,61 +66,54 @@ class Lights:
         light = ambient ambient_color + sum over lights of c relu(n . l) + sum over i of harmonics_i Y_i(n)
         highlight = specular * sum over lights with n . l > 0 of c relu(r . v)^shininess        (Phong)
 
-    A directional light has ``l = direction`` and ``c = directional directional_color``. A point
-    light has l of length 1 towards its position and
-    ``c = point point_color / (1 + falloff |position - x|^2)``. r is l, reflected by the surface,
-    and v points towards the eye; highlights use the unit vector along direction, and multiply c
-    by its length. n is the normal of the face, as in the published renderer, or, if ``smooth``,
-    the interpolated normal of the vertices. The defaults are the published ones.
+    A directional light has ``l = direction`` and ``c = directional directional_color``; a point
+    light l of length 1 towards its position and ``c = point point_color / (1 + falloff |position -
+    x|^2)``. r is l, reflected by the surface, v points towards the eye; highlights use the unit
+    vector along direction, and multiply c by its length. n is the face's normal or, if ``smooth``,
+    interpolated. The defaults are the published ones.
 
     Parameters
     ----------
     ambient : number, or Tensor [] or [B]
-        Intensity of the light without direction.
+        Intensity without direction.
     directional : number, or Tensor [], [L] or [B, L]
-        Intensity of each light with a direction.
+        Intensity of each directional light.
     direction : [3], [L, 3] or [B, L, 3]
-        World-space direction towards the light. It is not normalised: a longer vector gives more
-        light.
+        World-space direction towards the light, not normalised: a longer vector gives more light.
     ambient_color : [3] or [B, 3]
     directional_color : [3], [L, 3] or [B, L, 3]
     smooth : bool
     position : [3], [L, 3] or [B, L, 3], optional; keyword only, as all that follow
-        World-space positions of point lights (default: no point lights). Their number may differ
-        from that of the directional lights.
+        World-space positions of point lights (default: none); their number may differ from that of
+        the directional ones.
     point : number, or Tensor [], [L] or [B, L]
         Intensity of each point light.
     point_color : [3], [L, 3] or [B, L, 3]
     falloff : number, or Tensor [], [L] or [B, L]
-        0: as bright at every distance. Otherwise the light falls to one half at the distance
-        ``falloff^(-1/2)``.
+        The light falls to one half at the distance ``falloff^(-1/2)``; 0: never.
     specular : number, or Tensor [] or [B]
-        Strength of highlights. They have the colour of the light, not of the surface. The number
-        0: none.
+        Strength of highlights, which have the colour of the light. 0: none.
     shininess : number, or Tensor [] or [B]
-        The larger, the smaller a highlight is.
+        The larger, the smaller the highlight.
     harmonics : [9, 3] or [B, 9, 3], optional
         Light from all around as a function of n: coefficients of the real, orthonormal spherical
-        harmonics of bands 0, 1, 2, that is of 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2, for
-        each colour. From those of an environment map L, ``harmonics = L * [1, 2/3, 1/4]`` by band
-        (Ramamoorthi and Hanrahan 2001, divided by pi). It may be negative.
+        harmonics 1; y, z, x; xy, yz, 3 z^2 - 1, xz, x^2 - y^2, for each colour. From those of an
+        environment map L, ``harmonics = L * [1, 2/3, 1/4]`` by band (Ramamoorthi and Hanrahan 2001,
+        divided by pi). It may be negative.
     normals : Tensor [V, 3], [B, V, 3], a list of [V_b, 3], :class:`NormalMap` or any object with ``sample``, optional
-        Own normals in world space in place of those of the mesh: of the vertices, interpolated
-        and normalised (as :func:`vertex_normals` they point outward), or of pixels:
-        ``sample(fragments) -> [B, H, W, 3]``. If a face shows the side from which its
-        :func:`face_normals` points away, they are turned. ``smooth`` is then ignored.
+        World-space normals in place of the mesh's: of the vertices, outward as
+        :func:`vertex_normals`, interpolated and normalised; or of pixels: ``sample(fragments) ->
+        [B, H, W, 3]``. They are turned with the side of the face that is seen.
 
-    Tensors are differentiable, and so are the vertices: through their normals, and through the
-    points that are lit. The eye is known for nmr's cameras (without a camera the viewer looks
-    along z); for highlights, a camera of your own needs an attribute ``eye``, [3] or [B, 3]. The
-    eye counts as a constant. B is the number of images.
+    Tensors are differentiable, and so are the vertices, through normals and lit points. Highlights
+    need the eye, a constant: a camera of your own has an attribute ``eye``, [3] or [B, 3]; without
+    a camera the viewer looks along z. B is the number of images.
 
     Raises
     ------
     TypeError, ValueError
-        For values that are not floats or not finite, a negative shininess, wrong shapes, and if
-        the numbers of lights differ; when drawn, also if values per image do not match the number
-        of images.
+        For values that are not floats or not finite, a negative shininess, wrong shapes, different
+        numbers of lights; when drawn, also of images.
 
     Examples
     --------

@@ -1,8 +1,7 @@
 """Losses on silhouettes and meshes.
 
-Most losses on meshes take a table of edges, which is made once per mesh.
-``edges = nmr.edge_table(faces)`` works for all of these; those that do not use faces also take
-:func:`nmr.unique_edges`, which accepts any mesh.
+Most losses on meshes take ``edges = nmr.edge_table(faces)``, made once per mesh; those that do not
+use faces also take :func:`nmr.unique_edges`, for any mesh.
 """
 
 from __future__ import annotations

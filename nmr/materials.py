@@ -27,30 +27,29 @@ GREY = 0.5  # of faces without a material
 class Materials:
     """The colours of a mesh of several materials: an image each, or one colour.
 
-    A face shows the image of its material. If it has no texture coordinates, or the material no
-    image, it has the colour of the material; without a material it is grey (0.5).
+    A face shows the image of its material, without one (or texture coordinates) its colour, without
+    a material grey (0.5).
 
     Parameters
     ----------
     colors : float Tensor [M, C]
         One colour for each material. Differentiable.
     images : sequence of M float Tensors [H_m, W_m, C], or None
-        Of any sizes; row 0 is the top. Differentiable: ask for the gradient of each.
+        Of any sizes; row 0 is the top. Differentiable, each.
     face_material : integer Tensor [F]; for a list of meshes a list of [F_b]
         Row of ``colors``, and image, of each face; -1 without a material.
     uv : float Tensor [T, 2], optional; for a list of meshes a list of [T_b, 2]
         As in :class:`UVTexture`; needed if there are images. Differentiable.
     uv_faces : integer Tensor [F, 3], or a list of [F_b, 3], optional
-        Row of uv at each corner of each face; -1 at the corners of faces without texture
-        coordinates.
+        Row of uv at each corner of each face; -1 without texture coordinates.
     wrap, filter
         Of all images: see :class:`UVTexture`.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, missing materials and rows of uv; when drawn, also if they do
-        not fit the meshes.
+        For wrong types and shapes, missing materials and rows of uv; when drawn, if they do not
+        fit.
 
     Examples
     --------

@@ -100,20 +100,19 @@ def edge_table(faces: Tensor, *, open_mesh: bool = False) -> Tensor:
     ----------
     faces : integer Tensor [F, 3]
     open_mesh : bool
-        Leave out border edges, which have one face. By default they are an error.
+        Leave out border edges, which have one face; else they are an error.
 
     Returns
     -------
     int64 Tensor [E, 4]
-        Row ``(v0, v1, v2, v3)``: the edge's vertices with v0 < v1, then the opposite corners of
-        its two faces (in face order). Rows are sorted by (v0, v1).
+        Row ``(v0, v1, v2, v3)``: the edge's vertices, v0 < v1, then the opposite corners of its two
+        faces (in face order). Rows are sorted.
 
     Raises
     ------
     TypeError, ValueError
-        For a wrong type or shape, and for a mesh with an edge that does not have exactly two
-        faces (a border, unless `open_mesh`; a non-manifold edge or a degenerate face): the
-        message says how many edges and names the first.
+        For a wrong type or shape, and an edge without exactly two faces (a border, unless
+        `open_mesh`; a non-manifold edge or a degenerate face); the message names the first.
 
     Examples
     --------
@@ -167,7 +166,7 @@ def face_vertices(vertices: Tensor, faces: Tensor) -> Tensor:
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, and for faces that refer to missing vertices.
+        For wrong types and shapes, and missing vertices of faces.
     """
     batched = check_vertices(vertices)
     faces = check_faces(faces, batched.shape[0], batched.device)
@@ -180,8 +179,7 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Unit normals of the faces: ``(p1 - p0) x (p2 - p0)``, normalised, p0, p1, p2 the face's
     corners in order.
 
-    Counter-clockwise faces of a right-handed world (as those of :func:`icosphere`) have normals
-    that point outwards.
+    Those of counter-clockwise faces of a right-handed world point outwards.
 
     Parameters
     ----------
@@ -191,13 +189,12 @@ def face_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Returns
     -------
     Tensor [B, F, 3], or [F, 3] for vertices [V, 3]
-        Of length 1; 0 for a face without area. Differentiable in ``vertices`` (a face without
-        area has no gradient).
+        Of length 1; 0, without gradient, for a face without area. Differentiable in ``vertices``.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, and for faces that refer to missing vertices.
+        For wrong types and shapes, and missing vertices of faces.
 
     Examples
     --------
@@ -226,7 +223,7 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, and for faces that refer to missing vertices.
+        For wrong types and shapes, and missing vertices of faces.
 
     Examples
     --------

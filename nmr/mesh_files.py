@@ -48,36 +48,34 @@ class MeshFile(NamedTuple):
 def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) -> MeshFile:
     """Read a Wavefront OBJ file.
 
-    Polygons are cut into triangles; concave ones keep their outline. Relative numbers count from
-    their line. Groups, points, lines and normals are skipped, and so are the texture coordinates
-    of a face that has them at some corners only.
+    Polygons are cut into triangles; concave ones keep their outline. Groups, points, lines and
+    normals are skipped, and so are the texture coordinates of a face that has them at some corners
+    only.
 
     Parameters
     ----------
     filename : str or path
     dtype : torch.float32 or torch.float64
-        Type of the floating-point tensors. For coordinates as large as UTM's take float64,
-        subtract the middle, then call ``.float()``.
+        Of the floating-point tensors. For coordinates as large as UTM's take float64, subtract the
+        middle, then call ``.float()``.
 
     Returns
     -------
     MeshFile
         A named tuple of tensors on the default device. ``faces[f]`` and ``uv_faces[f]`` are the
-        rows of ``vertices [V, 3]`` and ``uv [T, 2]`` at the corners of face f, in the order of
-        the file; (0, 0) of ``uv`` is the lower left corner of an image.
-        ``materials[face_material[f]]`` has name, colour and image path of its material:
-        :meth:`Materials.from_mesh` reads the images, to draw the mesh. ``colors [V, 3]`` are
-        those of the lines ``v x y z r g b``, None if there are none. Values above 1 count as
-        0..255; vertices without a colour are grey (0.5).
+        rows of ``vertices [V, 3]`` and ``uv [T, 2]`` at the corners of face f; (0, 0) of ``uv`` is
+        the lower left corner of an image. ``materials[face_material[f]]`` has name, colour and
+        image path of its material, for :meth:`Materials.from_mesh`. ``colors [V, 3]`` are those of
+        the lines ``v x y z r g b``, None if there are none; values above 1 count as 0..255,
+        vertices without are grey (0.5).
 
     Raises
     ------
     FileNotFoundError
-        If the file is missing. A missing MTL file is a warning, and so are faces without a known
-        material.
+        If the file is missing. A missing MTL file and unknown materials are warnings.
     ValueError
-        If the file has no vertices or no faces, or if a line cannot be read or refers to a
-        missing element: the message has the number of the line.
+        If there are no vertices or no faces, or a line, which is numbered, cannot be read or refers
+        to a missing element.
 
     Examples
     --------
@@ -124,28 +122,28 @@ def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) ->
 def load_gltf(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) -> MeshFile:
     """Read a glTF 2.0 file, .glb or .gltf: the meshes of its default scene, as one.
 
-    They are at their places in the scene, not animated. Points, lines, normals and everything of
-    a material but its base colour are skipped.
+    They are at their places in the scene, not animated. Points, lines, normals and all of a
+    material but its base colour are skipped.
 
     Parameters
     ----------
     filename : str or path
     dtype : torch.float32 or torch.float64
-        Type of the floating-point tensors.
+        Of the floating-point tensors.
 
     Returns
     -------
     MeshFile
-        As :func:`load_obj` returns it. Images are those of the base colour; ``colors`` are the
-        file's vertex colours, white at vertices without, None if there are none.
+        As of :func:`load_obj`, with images of the base colour; ``colors`` are white at vertices
+        without, None if there are none.
 
     Raises
     ------
     FileNotFoundError
-        If the file is missing, or one that it refers to.
+        If the file, or one that it refers to, is missing.
     ValueError
-        If the file has no faces, cannot be read, needs an extension that is not supported, or
-        refers to a file outside of its folder.
+        If it has no faces, cannot be read, needs an unsupported extension, or refers to a file
+        outside of its folder.
 
     Examples
     --------
@@ -196,19 +194,18 @@ def save_obj(
     Parameters
     ----------
     filename : str or path
-        Ends in .obj. Materials are in ``name.mtl``, images in ``name.png`` or, if there are
-        several, in ``name_1.png`` and so on.
+        Ends in .obj. Materials are in ``name.mtl``, images in ``name.png``, or ``name_1.png`` and
+        so on.
     vertices : float32 or float64 Tensor [V, 3]
         :func:`load_obj` gives the same values.
     faces : integer Tensor [F, 3]
     colors : VertexColors, UVTexture or Materials of this mesh, optional
-        In [0, 1]; values outside are clamped. Images are written with 8 bits, which needs Pillow.
+        In [0, 1], or clamped. Images have 8 bits, and need Pillow.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, values of several meshes, or another ending. Nothing is
-        written then.
+        For wrong types and shapes, several meshes, another ending; nothing is written.
     ImportError
         If there are images and Pillow is missing.
 

@@ -42,81 +42,72 @@ def render(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space: x, y in [-1, 1], z = depth.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
         Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+        Such as :class:`nmr.LookAt`. B poses of one mesh give B images.
     outputs : "rgb", "alpha", "depth", "normals", "fragments", or a sequence of these
-        What to draw. These are also the names of the attributes of the result.
-    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
-        Without them the meshes are white.
+        Also the names of the result's attributes.
+    colors : Colors, optional
+        VertexColors, FaceColors, TextureCubes, UVTexture, Materials or any object with
+        ``sample(fragments)``. Without them the meshes are white.
     lights : Lights, optional
-        Colours are multiplied by the light. Without lights they are drawn unchanged.
+        They multiply colours; without, these are drawn unchanged.
     background : number, [C], or Tensor [B, C]
         Colour of pixels without a face.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind (clockwise on the screen).
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        Cut faces at the plane ``near`` (see :func:`render_silhouette`).
     eps : float
-        In NMR's gradient, added to the distance between an edge and a pixel; in the local one the
-        least difference of two rates.
+        As in :func:`render_silhouette`.
     gradient : "nmr", "local" or "none"
-        The definition of the gradient at edges. The images are the same.
+        At edges; the images are the same.
     smooth : bool
-        For the output "normals": interpolated normals of the vertices instead of normals of the
-        faces.
+        For normals: interpolated ones of the vertices, not those of the faces.
     space : "world" or "camera"
-        For the output "normals": "camera" means x to the right of the image, y up, z away from
-        the viewer.
+        For normals; "camera": x to the right of the image, y up, z away from the viewer.
     interpolation_gradient : bool
-        Adds the true derivative of interpolated colours with respect to the position of a pixel
-        on its face, so that vertices also move to shift colours under the pixels. The published
-        renderer does not have this: there colours move vertices only through edges.
+        Adds the true derivative of interpolated colours, so that vertices also move to shift
+        colours under the pixels. As published, colours move vertices through edges only.
 
     Returns
     -------
     Images
-        ``images.rgb[b, y, x]`` is the colour [C] of the pixel in row y from the top, mean of 2x2
-        with anti-aliasing (background mixed in at edges). alpha ``[B, h, w]`` is the covered part
-        of the pixel; depth ``[B, h, w]`` is z of the nearest face, ``far`` on background; normals
-        ``[B, h, w, 3]`` are those of the side that is seen; fragments have the resolution of the
-        raster (2h x 2w with anti-aliasing).
+        ``images.rgb[b, y, x]`` is the colour [C] in row y from the top, with the background mixed
+        in at edges if anti-aliased; alpha ``[B, h, w]`` the covered part of the pixel; depth ``[B,
+        h, w]`` z of the nearest face, ``far`` on background; normals ``[B, h, w, 3]`` those of the
+        side that is seen; fragments those of the raster (2h x 2w with anti-aliasing).
 
     Notes
     -----
-    In vertices and camera, rgb and alpha have NMR's edge gradient (if both are outputs, it sums
-    the change of the loss over all their channels, as the published renderer does); depth and
-    normals have their true derivatives at fixed coverage. Colours, background and the parameters
-    of lights have true derivatives. There are no second derivatives.
+    In vertices and camera, rgb and alpha have NMR's edge gradient (of the loss over all their
+    channels, if both are drawn); depth and normals have true derivatives at fixed coverage.
+    Colours, background and lights have true derivatives. There are no second derivatives.
 
-    NMR's gradient follows whole lines of the image at every edge of every face.
-    ``gradient="local"`` reaches one pixel and is many times as fast for large meshes and images.
-    It is the definition in :func:`render_silhouette` with products of I and g summed over
-    channels, and it applies to depth and normals, too, beside their true derivatives (their
-    background is ``far`` and 0). A surface ends before the background, and before another surface
-    behind it: a face that has no corner in common with it (by place, so that seams are no ends),
-    and whose plane is farther away at the centres of both pixels, by more than 1e-4 of the depth.
-    Edges on one surface have no gradient then; for textures add ``interpolation_gradient=True``.
-    ``gradient="none"`` leaves all of this out, for example to fit depth or colours alone. The
-    images are the same (depth and normals up to rounding). ``docs/examples/draw_gradients.py``
-    draws the three.
+    NMR's gradient follows whole lines of the image at every edge. ``gradient="local"`` reaches one
+    pixel and is many times as fast for large meshes and images: the definition in
+    :func:`render_silhouette` with products of I and g summed over channels, also for depth and
+    normals, beside their true derivatives (on a background of ``far`` and 0). A surface ends before
+    the background, and before a face without a corner in common (by place) whose plane is farther
+    away at the centres of both pixels, by more than 1e-4 of the depth. Edges on one surface have no
+    gradient; for textures add ``interpolation_gradient=True``. ``"none"`` leaves edges out.
+    ``docs/examples/draw_gradients.py`` draws the three. The images are the same (depth and normals
+    up to rounding).
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for faces that refer to missing vertices, for unknown
-        outputs, and for colours, lights and backgrounds that do not fit.
+        For wrong types, shapes and ranges, missing vertices of faces, unknown outputs, and colours,
+        lights and backgrounds that do not fit.
 
     Examples
     --------
@@ -235,51 +226,44 @@ def render_rgb(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
-    colors : VertexColors, FaceColors, TextureCubes, UVTexture or any object with ``sample(fragments)``, optional
-        Without them the meshes are white.
+        Such as :class:`nmr.LookAt`.
+    colors : Colors, optional
+        As in :func:`render`.
     lights : Lights, optional
-        Colours are multiplied by the light. Without lights they are drawn unchanged.
+        They multiply colours; without, these are drawn unchanged.
     background : number, [C], or Tensor [B, C]
         Colour of pixels without a face.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
     eps : float
-        In NMR's gradient, added to the distance between an edge and a pixel; in the local one the
-        least difference of two rates.
+        As in :func:`render_silhouette`.
     gradient : "nmr", "local" or "none"
-        The definition of the gradient at edges. The images are the same.
+        At edges; the images are the same.
     interpolation_gradient : bool
-        Adds the true derivative of interpolated colours with respect to the position of a pixel
-        on its face, so that vertices also move to shift colours under the pixels. The published
-        renderer does not have this: there colours move vertices only through edges.
+        As in :func:`render`.
 
     Returns
     -------
     Tensor [B, h, w, C]
-        ``rgb[b, y, x]`` is the colour of the pixel in row y from the top, with as many channels
-        as ``colors`` have.
+        ``rgb[b, y, x]`` is the colour in row y from the top, with the channels of ``colors``.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for faces that refer to missing vertices, and for
-        colours, lights and backgrounds that do not fit.
+        For wrong types, shapes and ranges, missing vertices of faces, and colours, lights and
+        backgrounds that do not fit.
 
     Examples
     --------
@@ -325,44 +309,38 @@ def render_silhouette(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        With a camera: world coordinates. Without: coordinates in renderer space (x right, y up,
-        both in [-1, 1] across the image, z = depth). One mesh and a camera with B poses give B
-        images. The meshes of a list may have different sizes; they are not padded, and each is
-        drawn as if it were alone.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space (x right, y up, both in [-1, 1] across the
+        image, z = depth). B poses of one mesh give B images. The meshes of a list may have
+        different sizes; each is drawn as if it were alone.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices. A face is seen from its front if its vertices run counter-clockwise on the
-        screen.
+        Vertex indices, counter-clockwise on the screen if a face is seen from its front.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`.
+        Such as :class:`nmr.LookAt`.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square. x and y in renderer space go from -1 to 1 across
+        Pixels h, w; an int is a square. x and y in renderer space go from -1 to 1 across
         the whole image. LookAt, Look and Orthographic have square pixels: their field of view
         belongs to the shorter side.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen). LookAt, Look and
-        Orthographic show mesh files mirrored, so that their outsides are clockwise, unless they
-        are ``right_handed``.
+        Also draw faces from behind (clockwise on the screen: with LookAt, Look and Orthographic the
+        outsides of mesh files, unless ``right_handed``).
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near``, so that their part in front
-        is drawn where it is seen, with gradients to their corners. Without this, as in the
-        published renderer, corners behind the eye land mirrored on the image, and the whole face
-        is drawn wrongly. Scenes in front of the plane are the same. The plane lies at far / 1e5
-        if near is 0, at far / 1e8 if near is smaller than that: nothing nearer is drawn. Without
-        a camera, x and y are taken as divided by z (perspective). In float32, a near of less than
-        a thousandth of a scene around the eye can leave single pixels open where cut faces meet;
-        take float64 or a larger near (a warning says so).
+        Cut faces that reach behind the plane at depth ``near``; the part in front is drawn, with
+        gradients to the corners. Without this, as published, corners behind the eye land mirrored
+        on the image. The plane lies at far / 1e5 if near is 0, at far / 1e8 if near is smaller.
+        Without a camera, x and y count as divided by z (perspective). In float32, a near of less
+        than a thousandth of the scene can leave pixels open where cut faces meet: take float64 or a
+        larger near (a warning says so).
     eps : float
-        In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1,
-        1]). In the local one, the gradient is 0 if the two directions lower the loss at rates
-        that differ by less than eps. Both as published. (It also limits coordinates in texture
-        cubes to ts - 1 - eps: see :class:`nmr.TextureCubes`.)
+        In NMR's gradient, added to the distance between an edge and a pixel (in units of [-1, 1]).
+        The local one is 0 if the two directions lower the loss at rates that differ by less than
+        eps. Both as published. (In texture cubes: see :class:`nmr.TextureCubes`.)
     gradient : "nmr", "local" or "none"
-        The definition of the gradient. The images are the same.
+        The images are the same.
 
     Returns
     -------
@@ -372,39 +350,36 @@ def render_silhouette(
 
     Notes
     -----
-    Differentiable in x and y of ``vertices`` (and through the camera); z in renderer space gets
-    0. NMR's gradient is a definition, not the derivative of the image (Kato et al. 2018, section
-    3). On each raster line that crosses an edge of a visible face, every pixel m whose change
-    would lower the loss by D pulls the two vertices of the edge with D / d, where d is how far
-    the vertex must move until the edge reaches m. The values equal those of the published kernels
-    in float32; ``docs/conventions.md`` lists the differences. Results do not depend on the number
-    of threads or on the batch size. There are no second derivatives.
+    Differentiable in x and y of ``vertices`` and in the camera; z gets 0. NMR's gradient is a
+    definition, not the derivative of the image (Kato et al. 2018, section 3): on each raster line
+    that crosses an edge of a visible face, every pixel m whose change would lower the loss by D
+    pulls the edge's two vertices with D / d, d being how far the vertex must move until the edge
+    reaches m (``docs/gradients.md``). The values equal those of the published kernels in float32,
+    for any number of threads and batch size. There are no second derivatives.
 
-    The local gradient is that of Kato and Harada 2019 (view prior learning). I is the coverage (0
-    or 1) of pixels of the raster, R is its width (for y its height). g is the gradient of the
-    loss with respect to I (with anti-aliasing a quarter of the gradient of the image pixel). i
-    and j are neighbours, j to the right of i::
+    The local gradient is that of Kato and Harada 2019. I is the coverage (0 or 1) of pixels of the
+    raster, R its width (for y its height), g the gradient of the loss with respect to I (with
+    anti-aliasing a quarter of that of the image pixel). i and j are neighbours, j to the right of
+    i::
 
         right(i, j) = -(I_i - I_j) g_j R / 2    rate at which the loss falls if the content of i moves to j
         left(i, j)  = -(I_j - I_i) g_i R / 2    rate at which the loss falls if the content of j moves to i
 
-    For each covered pixel, ``right`` and ``left`` are summed over its pairs with the left and the
-    right neighbour. Pairs of two covered pixels, and pairs across the border of the image,
-    contribute 0. The derivative of the loss with respect to x of the point seen in the pixel is
-    then -right if right > left, and +left otherwise; it is 0 if neither sum is positive, or if
-    they differ by less than ``eps``. It is distributed to the corners of the pixel's face by
-    their screen-space weights at the pixel's centre (clamped to [0, 1], normalised, treated as
-    constants). y is treated in the same way, upwards. So only pixels at the rim of an object have
-    a gradient, and a target that is farther than one pixel from the rim has no effect.
+    For each covered pixel, ``right`` and ``left`` are summed over its pairs with its two
+    neighbours; pairs of covered pixels, and across the border of the image, contribute 0. The
+    derivative of the loss with respect to x of the point in the pixel is -right if right > left,
+    else +left; 0 if neither sum is positive, or if they differ by less than ``eps``. It goes to the
+    corners of the face by their screen-space weights at the pixel's centre (clamped to [0, 1],
+    normalised, constants). y is treated likewise, upwards. A target farther than one pixel from the
+    rim has no effect.
 
-    No mesh gives a NaN: faces with a corner that is not finite draw nothing and get no gradient.
-    (A gradient of the loss that is not finite is passed on.)
+    Faces with a corner that is not finite draw nothing and get no gradient; a gradient of the loss
+    that is not finite is passed on.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for faces that refer to missing vertices, and for an
-        unknown gradient.
+        For wrong types, shapes and ranges, missing vertices of faces, and an unknown gradient.
 
     Examples
     --------
@@ -439,52 +414,45 @@ def render_soft_silhouette(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+        Such as :class:`nmr.LookAt`.
     sigma : float or Tensor []
-        How soft the image is. A pixel at the distance d from the border of a face is covered by
-        it with probability ``D = sigmoid(d^2 / sigma)`` if it is inside, else
-        ``sigmoid(-d^2 / sigma)``. d is in units of half the shorter side of the image: at
-        sqrt(sigma) from the border D is 0.27 or 0.73.
+        A pixel at the distance d from the border of a face is covered by it with probability ``D =
+        sigmoid(d^2 / sigma)`` if it is inside, else ``sigmoid(-d^2 / sigma)``. d is in units of
+        half the shorter side of the image.
     dist_eps : float
-        Faces for which D would be less than this at a pixel outside are left out there. In (0,
-        0.5).
+        In (0, 0.5): faces with a smaller D at a pixel outside are left out there.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
 
     Returns
     -------
     Tensor [B, h, w]
-        ``alpha = 1 - product over all faces of (1 - D)``. Faces count whether they are seen or
-        hidden.
+        ``alpha = 1 - product over all faces of (1 - D)``, hidden ones too.
 
     Notes
     -----
-    Differentiable in x and y of the vertices (and through the camera): this is the true
-    derivative of the image (up to the jump of dist_eps), and in sigma. z gets 0. Formulas and
-    constants are the published ones. Unlike there, faces wholly nearer than ``near`` or farther
-    than ``far`` are left out, and ``fill_back=False`` leaves out those seen from behind. There is
-    no second derivative.
+    The true derivatives in x and y of the vertices, the camera and sigma, up to the jump of
+    dist_eps; z gets 0. As published, but faces wholly nearer than ``near`` or farther than ``far``
+    are left out, and with ``fill_back=False`` those seen from behind. There is no second
+    derivative.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for faces that refer to missing vertices, for a sigma
-        that is not positive, and a dist_eps outside (0, 0.5).
+        For wrong types, shapes and ranges, missing vertices of faces, a sigma that is not positive,
+        and a dist_eps outside (0, 0.5).
 
     Examples
     --------
@@ -522,42 +490,37 @@ def render_depth(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+        Such as :class:`nmr.LookAt`.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
 
     Returns
     -------
     Tensor [B, h, w]
-        ``depth[b, y, x]`` is z of the nearest face at the pixel in row y from the top, ``far`` on
-        background. With anti-aliasing it is the mean of 2x2 pixels, so that edges mix in ``far``,
-        as published; else z is exact.
+        ``depth[b, y, x]`` is z of the nearest face in row y from the top, ``far`` on background.
+        With anti-aliasing it is the mean of 2x2 pixels, so that edges mix in ``far``, as published.
 
     Notes
     -----
-    Differentiable in x, y and z of the vertices (and through the camera): the true derivative of
-    z at each pixel. Coverage is treated as fixed: depth does not move edges. There is no second
-    derivative.
+    The true derivative of z at each pixel, in vertices and camera, at fixed coverage: depth does
+    not move edges. There is no second derivative.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, and for faces that refer to missing vertices.
+        For wrong types, shapes and ranges, and missing vertices of faces.
 
     Examples
     --------
@@ -589,47 +552,43 @@ def render_normals(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+        Such as :class:`nmr.LookAt`.
     smooth : bool
-        Interpolated normals of the vertices instead of normals of the faces.
+        Interpolated normals of the vertices, not those of the faces.
     space : "world" or "camera"
         "camera": x to the right of the image, y up, z away from the viewer.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
 
     Returns
     -------
     Tensor [B, h, w, 3]
-        ``normals[b, y, x]`` is the unit normal of the side that is seen
-        (:meth:`Fragments.normals`) at the pixel in row y from the top: the normal of the face or,
-        with ``smooth``, the interpolated normal of its vertices. 0 on background. With
-        anti-aliasing it is the mean of 2x2 pixels, and shorter than 1 at edges.
+        ``normals[b, y, x]`` is the unit normal of the side that is seen (:meth:`Fragments.normals`)
+        in row y from the top, 0 on background. With anti-aliasing it is the mean of 2x2 pixels,
+        shorter than 1 at edges.
 
     Notes
     -----
-    Differentiable in the vertices: the true derivative at fixed coverage.
+    The true derivative in the vertices, at fixed coverage.
     ``fragments.resolve(fragments.normals())`` is the same image, with NMR's edge gradient in
     addition.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, and for faces that refer to missing vertices.
+        For wrong types, shapes and ranges, and missing vertices of faces.
 
     Examples
     --------
@@ -663,53 +622,47 @@ def render_fragments(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+        Such as :class:`nmr.LookAt`.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     anti_aliasing : bool
-        Render 2h x 2w pixels and average 2x2 of them.
+        Average 2x2 of 2h x 2w pixels.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
     eps : float
         That of NMR's gradient in :meth:`Fragments.resolve`.
     faces_per_pixel : int
-        K in 1..1024: how many surfaces to return, one behind the other. 1 means the nearest,
-        without an axis for K.
+        K in 1..1024 surfaces, one behind the other. 1: the nearest, without an axis for K.
     blur_radius : float
-        If positive, faces count also for pixels outside whose squared distance from their border
-        (in units of half the shorter side of the image) is less than this, and there is an axis
-        for K. Weights outside are clamped to [0, 1] and divided by their sum, as in SoftRas, and
-        depth follows from them. See :attr:`Fragments.distances`.
+        If positive, faces also count for pixels outside whose squared distance from their border
+        (in units of half the shorter side of the image) is less than this, and there is an axis for
+        K. Weights outside are clamped to [0, 1] and divided by their sum, as in SoftRas; depth
+        follows from them. See :attr:`Fragments.distances`.
 
     Returns
     -------
     Fragments
-        h x w pixels; with ``anti_aliasing`` 2h x 2w pixels, which :meth:`Fragments.resolve`
-        averages. With K > 1, ``sided_face_index[b, y, x, k]`` is the face of the k-th nearest
-        surface, -1 behind the last one (there weights are 0 and depth is ``far``). Of equally
-        near faces the first one comes first.
+        h x w pixels; with ``anti_aliasing`` 2h x 2w, which :meth:`Fragments.resolve` averages. With
+        K > 1, ``sided_face_index[b, y, x, k]`` is the face of the k-th nearest surface, -1 behind
+        the last (weights 0, depth ``far``). Of equally near faces the first comes first.
 
     Notes
     -----
-    In the vertices, weights and depth have true derivatives; :meth:`Fragments.resolve` has NMR's
-    gradient.
+    Weights and depth have true derivatives; :meth:`Fragments.resolve` has NMR's gradient.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, for faces that refer to missing vertices, and for a
-        faces_per_pixel that is not an integer in 1..1024.
+        For wrong types, shapes and ranges, missing vertices of faces, and a faces_per_pixel that is
+        not an integer in 1..1024.
 
     Examples
     --------
@@ -753,34 +706,30 @@ def render_face_index(
 
     Parameters
     ----------
-    vertices : Tensor [B, V, 3] or [V, 3], or a list of Tensors [V_b, 3]; float32 or float64
-        World coordinates; without a camera renderer space: x right, y up, both in [-1, 1],
-        z = depth.
+    vertices : float32 or float64 Tensor [B, V, 3] or [V, 3], or a list of [V_b, 3]
+        World space; without a camera renderer space.
     faces : integer Tensor [F, 3] or [B, F, 3], or a list of [F_b, 3]
-        Vertex indices.
     camera : Camera, optional
-        For example :class:`nmr.LookAt`. One mesh and a camera with B poses give B images.
+        Such as :class:`nmr.LookAt`.
     image_size : int or (height, width)
-        Pixels: h and w; an int means a square.
+        Pixels h, w; an int is a square.
     fill_back : bool
-        Also draw faces that are seen from behind (clockwise on the screen).
+        Also draw faces from behind.
     near, far : float
-        A pixel is covered only if near < depth < far.
+        Limits of the depth, exclusive.
     clip : bool
-        Cut the faces that reach behind the plane at depth ``near`` (details:
-        :func:`render_silhouette`).
+        As in :func:`render_silhouette`.
 
     Returns
     -------
     int32 Tensor [B, h, w]
-        ``face_index[b, y, x] = f`` means face f is nearest there (seen from either side); -1 is
-        background. Row 0 is the top. Of equally near faces the first one is taken. Not
-        differentiable.
+        ``face_index[b, y, x] = f``: face f is nearest there, seen from either side; -1: background.
+        Row 0 is the top. Of equally near faces the first is taken. Not differentiable.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and ranges, and for faces that refer to missing vertices.
+        For wrong types, shapes and ranges, and missing vertices of faces.
 
     Examples
     --------

@@ -60,12 +60,12 @@ class VertexColors:
     Parameters
     ----------
     colors : float Tensor [V, C] or [B, V, C]; for a list of meshes a list of [V_b, C]
-        Any number of channels; values are not clamped. Differentiable.
+        Any number of channels, not clamped. Differentiable.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes; when drawn, also if there is not one colour per vertex.
+        For wrong types and shapes; when drawn, for another number of vertices.
 
     Examples
     --------
@@ -92,12 +92,12 @@ class FaceColors:
     Parameters
     ----------
     colors : float Tensor [F, C] or [B, F, C]; for a list of meshes a list of [F_b, C]
-        Any number of channels; values are not clamped. Differentiable.
+        Any number of channels, not clamped. Differentiable.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes; when drawn, also if there is not one colour per face.
+        For wrong types and shapes; when drawn, for another number of faces.
 
     Examples
     --------
@@ -122,10 +122,10 @@ class TextureCubes:
     """A cube of texels per face, as in the Neural Mesh Renderer.
 
     The point with barycentric weights (b0, b1, b2) has the colour at ``(ts - 1) (b0, b1, b2)`` in
-    the cube of its face, interpolated between the eight nearest texels. Texel [ts - 1, 0, 0] is
-    the colour of the face's first vertex. As in the published renderer, colours do not move
-    vertices through the weights, even with ``interpolation_gradient``, and the place in the cube
-    ends at ts - 1 - ``eps`` of the render function: a large eps changes colours at the vertices.
+    the cube of its face, interpolated between the eight nearest texels. Texel [ts - 1, 0, 0] is the
+    colour of the face's first vertex. As published, colours do not move vertices through the
+    weights, even with ``interpolation_gradient``, and the place in the cube ends at ts - 1 -
+    ``eps`` of the render function.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class TextureCubes:
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes; when drawn, also if there is not one cube per face.
+        For wrong types and shapes; when drawn, for another number of faces.
 
     Examples
     --------
@@ -182,36 +182,33 @@ class UVTexture:
     Parameters
     ----------
     image : float Tensor [H, W, C] or [B, H, W, C]; for a list of meshes a list of [H_b, W_b, C]
-        Row 0 is the top; any number of channels. Differentiable.
+        Row 0 is the top. Any number of channels. Differentiable.
     uv : float Tensor [T, 2] or [B, T, 2]; for a list of meshes a list of [T_b, 2]
         (0, 0) is the bottom left corner of the image, (1, 1) its top right one; texel centres are
-        at half texels. Differentiable. Coordinates that are not finite, or larger than 1e6, count
-        as 0.
+        at half texels. Differentiable. Beyond 1e6, or not finite, counts as 0.
     uv_faces : integer Tensor [F, 3] or [B, F, 3], or a list; optional
-        Row of uv at each corner of each face. Without it there is one uv per vertex. At a seam,
-        faces that share a vertex have different rows.
+        Row of uv at each corner of each face, so that faces may differ at a seam. Without it there
+        is one uv per vertex.
     wrap : "repeat", "clamp" or "mirror"
         How the image continues outside [0, 1].
     filter : "bilinear" or "mipmap"
-        "bilinear": interpolated between the four nearest texels. If the image is drawn smaller
-        than it is, most texels are skipped: pictures flicker, and those texels get no gradient.
-        "mipmap" takes such colours from smaller copies of the image, linearly between the two
-        that fit best (trilinear), so that each pixel shows the mean of about the texels that it
-        covers, and every texel gets a gradient.
+        "bilinear": between the four nearest texels. If the image is drawn smaller than it is, most
+        texels are skipped, flicker, and get no gradient. "mipmap" takes colours from smaller copies
+        of the image, linearly between the two that fit best (trilinear): about the mean of the
+        texels that the pixel covers.
 
     Notes
     -----
-    Mipmaps: each level has half the height and half the width of the one before, rounded down,
-    until one texel is left; a texel is the mean of the area that it covers. The level of a pixel
-    is OpenGL's, ``log2(max(|d(x, y)/dX|, |d(x, y)/dY|))``, where (x, y) is the position in texels
-    of the full image and (X, Y) that in pixels of the raster, clamped to the levels that there
-    are. The derivatives are those of the pixel's face, not differences of neighbours. The level
-    counts as a constant in gradients: it chooses a resolution, not a place.
+    Mipmaps: each level has half the height and width of the one before, rounded down, until one
+    texel is left; a texel is the mean of the area that it covers. The level of a pixel is OpenGL's,
+    ``log2(max(|d(x, y)/dX|, |d(x, y)/dY|))``, where (x, y) is the position in texels of the full
+    image and (X, Y) that in pixels of the raster, clamped to the levels. The derivatives are those
+    of the pixel's face. The level counts as a constant in gradients.
 
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes; when drawn, also if they do not fit the meshes.
+        For wrong types and shapes; when drawn, if they do not fit the meshes.
 
     Examples
     --------
@@ -315,14 +312,12 @@ def sample_texture(
     Parameters
     ----------
     image : float Tensor [h, w, C] or [B, h, w, C]
-        Row 0 is the top; any number of channels. Differentiable.
+        Row 0 is the top. Any number of channels. Differentiable.
     uv : float Tensor [B, H, W, 2]
-        (0, 0) is the bottom left corner of the image, (1, 1) its top right one. Differentiable.
-        Coordinates that are not finite, or larger than 1e6, count as 0.
+        As in :class:`UVTexture`. Differentiable.
     derivatives : float Tensor [B, H, W, 4], optional
-        (du/dX, du/dY, dv/dX, dv/dY) per pixel: colours then come from mipmaps, as those of
-        :class:`UVTexture` with ``filter="mipmap"``. Without gradient. By default, colours are
-        bilinear.
+        (du/dX, du/dY, dv/dX, dv/dY) per pixel, for colours from mipmaps as in :class:`UVTexture`;
+        without gradient. Default: bilinear.
     wrap : "repeat", "clamp" or "mirror"
         How the image continues outside [0, 1].
 
@@ -410,10 +405,10 @@ class NormalMap(UVTexture):
     those of UVTexture.
 
     A texel (x, y, z) means the direction ``x T + y B + z N``, normalised. N is the interpolated
-    normal of the vertices, outward for faces that are counter-clockwise from outside. T is the
-    direction in which u grows on the face, made orthogonal to N, and B completes the two to the
-    side in which v grows. Image files hold (texel + 1) / 2: pass ``2 * image - 1``. Frames belong
-    to faces: unlike MikkTSpace's, T and B are not interpolated between them.
+    normal of the vertices, outward for faces that are counter-clockwise from outside; T the
+    direction in which u grows on the face, made orthogonal to N; B completes the two to the side in
+    which v grows. Image files hold (texel + 1) / 2: pass ``2 * image - 1``. Unlike MikkTSpace's, T
+    and B are not interpolated between faces.
 
     Differentiable in the image, the uv coordinates and the vertices.
 

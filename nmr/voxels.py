@@ -20,21 +20,18 @@ def voxelize(
     """Filled occupancy grids, in one of the two definitions behind the published voxel IoU
     figures.
 
-    A cell is occupied if it belongs to the surface, or if it cannot be reached from the border of
-    the grid through 6-connected cells that do not. A shape that reaches beyond the grid is open
-    there, and its inside stays empty. The definitions differ in which cells belong to the
-    surface:
+    A cell is occupied if it belongs to the surface, or cannot be reached from the border of the
+    grid through 6-connected cells that do not. A shape that reaches beyond the grid is open there,
+    and stays empty. Cells of the surface are:
 
     - "kato18" (Kato et al. 2018): cells that contain a vertex, and cells with an edge that meets a
       face (tested by rays along the three axes through integer coordinates);
-    - "kato19" (Kato and Harada 2019): every cell that a face touches. A face in the plane between
-      two cells touches both. This is a separating axis test of triangle and cube; cells are
-      enlarged by 1e-9 on each side, so that the result does not depend on rounding.
+    - "kato19" (Kato and Harada 2019): every cell that a face touches, both at a plane between
+      two: a separating axis test of triangle and cube, with cells enlarged by 1e-9 on each side.
 
-    For a mesh within the grid, kato19 contains kato18, but for float32 rounding of the rays. The
-    results differ in few cells, because a surface seldom passes through a cell without crossing
-    one of its edges. The exception are faces in the planes between cells: kato18 marks only the
-    cells on the upper side, so it leaves out a face at coordinate 1.
+    Within the grid kato19 contains kato18, but for float32 rounding of the rays, and differs in few
+    cells. Of faces in the planes between cells kato18 marks only the cells on the upper side: it
+    leaves out a face at coordinate 1.
 
     Parameters
     ----------
@@ -46,12 +43,11 @@ def voxelize(
         s, cells per side.
     normalize : bool
         First fit the batch into the grid: subtract the least coordinate per axis, divide by the
-        largest extent times s / (s - 1), and centre each axis. Minimum and extent are those of
-        the whole batch, as published.
+        largest extent times s / (s - 1), and centre each axis; all of the whole batch, as
+        published.
     definition : "kato18" or "kato19"
-        Definition of the surface. In kato19 a face touches nothing if a corner is not finite or
-        farther than 2^20 cells from 0 on an axis (the published code fills the whole grid for a
-        NaN).
+        In kato19 a face touches nothing if a corner is not finite or farther than 2^20 cells from 0
+        on an axis (published: a NaN fills the grid).
 
     Returns
     -------
@@ -61,8 +57,7 @@ def voxelize(
     Raises
     ------
     TypeError, ValueError
-        For wrong types, shapes and sizes, for faces that refer to missing vertices, and for an
-        unknown definition.
+        For wrong types, shapes and sizes, missing vertices of faces, and an unknown definition.
 
     Examples
     --------

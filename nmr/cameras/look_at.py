@@ -154,23 +154,22 @@ _FOV = _NARROWEST_DEG, 90.0, "between 0 and 90 degrees"
 class LookAt(_Placed):
     """A perspective camera at ``eye`` that looks at ``at``.
 
-    A vertex v maps to ``u = R (v - eye)`` with rows of R
-    ``x = n(up x z), y = n(z x x), z = n(at - eye)``, then to
-    ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5). An eye straight
-    above or below ``at`` gives x = y = 0, as published: an empty image, and a UserWarning that
-    asks for another ``up``. The world is left-handed (x right, y up, z away), as in the published
-    renderer, and mesh files appear mirrored.
+    A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at -
+    eye)``, then to ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5).
+    An eye straight above or below ``at`` gives x = y = 0, as published: an empty image, and a
+    UserWarning. The world is left-handed (x right, y up, z away), as published, and mesh files
+    appear mirrored.
 
     Parameters
     ----------
     eye, at, up : [3] or [B, 3], tensors or sequences, world units
         A camera whose pose is not finite, or farther away than 1e15, sees nothing.
     half_fov_deg : float, or Tensor [] or [B]
-        a: half of the field of view across the shorter side of the image, in degrees (the
-        published ``viewing_angle``).
+        a: half of the field of view across the shorter side of the image (the published
+        ``viewing_angle``).
     right_handed : bool
-        The world is right-handed, as that of mesh files: ``x = n(z x up)``. Nothing is mirrored
-        then, and the outside of counter-clockwise faces is their front.
+        The world is right-handed, as that of mesh files: ``x = n(z x up)``, and the outside of
+        counter-clockwise faces is their front.
 
     Differentiable in every parameter that is given as a tensor.
 
@@ -249,9 +248,8 @@ class Orthographic(_Placed):
     """A camera without perspective, posed as :class:`LookAt`: ``(scale u_x, scale u_y, u_z)``.
 
     ``scale``: a positive number, or a Tensor [] or [B]; 1 / scale is half the extent of the view
-    across the shorter side of the image, in world units. The published renderer's
-    ``perspective=False`` has scale 1. Differentiable in every parameter given as a tensor.
-    ``right_handed`` as in :class:`LookAt`.
+    across the shorter side of the image, in world units (published: 1). Differentiable in every
+    parameter given as a tensor.
 
     Raises
     ------

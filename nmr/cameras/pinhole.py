@@ -28,10 +28,10 @@ class Pinhole(ProjectingCamera):
     camera.
 
     ``c = R v + t``; ``p = (c_x, c_y) / c_z``, distorted; pixel ``(u, v) = K (p_x, p_y, 1)``, u
-    right and v DOWN; then ``x = 2 u / width - 1``, ``y = 1 - 2 v / height``, depth ``c_z``.
-    Pixels are counted from the corner of the first one, whose centre is (0.5, 0.5);
-    :func:`nmr.cameras.from_opencv` converts from OpenCV's, which has it at (0, 0). Camera axes
-    are x right, y down, z away: a right-handed world is not mirrored.
+    right and v DOWN; then ``x = 2 u / width - 1``, ``y = 1 - 2 v / height``, depth ``c_z``. The
+    centre of the first pixel is (0.5, 0.5); :func:`nmr.cameras.from_opencv` converts from OpenCV's,
+    which has it at (0, 0). Camera axes are x right, y down, z away: a right-handed world is not
+    mirrored.
 
     Parameters
     ----------
@@ -40,16 +40,14 @@ class Pinhole(ProjectingCamera):
     R : [3, 3] or [B, 3, 3]
     t : [3], [B, 3] or [B, 1, 3]
     dist_coeffs : [5], [8] or [4], or [B, 5] and so on, optional
-        k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1, k2, k3, k4 of OpenCV's fisheye.
-        Beyond the radius at which the formula turns back (or comes near to it, with p1 and p2),
-        where no lens follows it, the image goes on straight: nothing is folded into the picture,
-        and vertices there have no gradient to the coefficients. Edges of faces are drawn
+        k1, k2, p1, p2, k3; with 8 also k4, k5, k6; with 4 the k1 to k4 of OpenCV's fisheye. Beyond
+        the radius at which the formula turns back (or comes near to it, with p1 and p2) the image
+        goes on straight, and vertices have no gradient to the coefficients. Edges are drawn
         straight: subdivide large faces.
     orig_size : number or (height, width), keyword only
-        The image that K belongs to. It is mapped onto the whole rendered image: stretched, if
-        that has another shape.
+        The image that K belongs to, stretched over the whole rendered image.
 
-    All but orig_size are tensors or sequences, and differentiable if tensors.
+    Tensors are differentiable.
 
     Raises
     ------

@@ -23,12 +23,11 @@ Numbers = float | Sequence | np.ndarray | Tensor
 class Camera(Protocol):
     """The interface of cameras: any object that takes vertices to renderer space, differentiably.
 
-    For batches ``[B, V, 3]``, a camera of your own needs only ``transform(vertices)``. For lists
-    of meshes of different sizes, ``transform`` must also take ``starts``. It may have the
-    attributes ``perspective``, whether x and y were divided by the depth (default: True; False:
-    depth, colours and weights are linear on the screen), and, for normals and light,
-    ``right_handed``, whether the world is right-handed (default: False). Highlights need ``eye``,
-    ``[3]`` or ``[B, 3]``.
+    A camera of your own needs only ``transform(vertices)``, for lists of meshes also with
+    ``starts``. It may have the attributes ``perspective``, whether x and y were divided by the
+    depth (default: True; False: depth, colours and weights are linear on the screen),
+    ``right_handed``, the handedness of the world for normals and light (default: False), and, for
+    highlights, ``eye``, ``[3]`` or ``[B, 3]``.
 
     Examples
     --------
