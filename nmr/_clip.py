@@ -64,6 +64,11 @@ def clip_plane(near: float, far: float) -> float:
     return max(float(near), (_SMALLEST if near else _NEAREST) * float(far))
 
 
+def can_read() -> bool:
+    """Whether values of tensors can be read: not in torch.compile and torch.func.vmap."""
+    return not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active()
+
+
 def clip_near(
     world: Tensor, mesh: MeshBatch, camera: Camera | None, plane: float, nearest: Tensor | None
 ) -> Clipped | None:
@@ -102,10 +107,9 @@ def clip_near(
 def _room(mesh: MeshBatch, plane: float, nearest: Tensor | None) -> list[tuple[int, int]] | None:
     """New vertices and drawn faces of each mesh; None if nothing is cut.
 
-    Meshes whose values are not known yet (torch.compile, torch.func.vmap) get room for every face
-    to be cut.
+    Meshes whose values cannot be read get room for every face to be cut.
     """
-    if not torch.compiler.is_compiling() and not torch._C._are_functorch_transforms_active():
+    if can_read():
         depth = mesh.vertices.detach()[..., 2] if nearest is None else nearest
         return ops.clip_count(*mesh[:3], plane).tolist() if (depth < plane).any() else None
     return [(2 * n, 2 * n) for n in mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch]

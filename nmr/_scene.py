@@ -4,6 +4,7 @@ operators.
 
 from __future__ import annotations
 
+import functools
 import math
 import warnings
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from . import ops
-from ._clip import Clipped, clip_near, clip_plane
+from ._clip import Clipped, can_read, clip_near, clip_plane
 from ._packing import MeshBatch, is_list, pack_meshes
 from ._validate import (
     as_floats,
@@ -31,7 +32,12 @@ from ._validate import (
     holds_for_all,
 )
 from .cameras import Camera
-from .cameras.projection import ProjectingCamera, has_perspective, transform
+from .cameras.projection import (
+    ProjectingCamera,
+    has_perspective,
+    is_projecting,
+    transform,
+)
 from .fragments import Fragments
 from .lights import Lights
 from .textures import Colors
@@ -74,12 +80,14 @@ class Scene(NamedTuple):
     def silhouette(self, gradient: str) -> tuple[Tensor, Tensor]:
         vertices, faces, starts = self.drawn[:3]
         vertices = vertices.detach() if gradient == "none" else vertices
-        return ops.silhouette(vertices, faces, starts, *self.settings, gradient == "local")
+        camera, how = ops.no_camera(self.settings.perspective), self.settings[:-1]
+        local = gradient == "local"
+        return ops.silhouette(vertices, faces, starts, *camera, *how, False, local)[:2]
 
     def soft_silhouette(self, sigma: Tensor, dist_eps: float) -> Tensor:
         settings, reach = self.settings, math.log(1 / dist_eps - 1)
         transmittance = ops.soft_silhouette(
-            *self.drawn[:3], *settings.raster, sigma.double(), *settings[3:6], reach
+            *self.drawn[:3], sigma.double(), *settings.raster, *settings[3:6], reach
         )
         return 1 - average(transmittance.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
@@ -108,7 +116,7 @@ class Scene(NamedTuple):
         settings = self.settings
         how = *settings[3:6], settings.perspective
         drawn_index = ops.soft_layers(
-            *self.drawn[:3], *settings.raster, layers, sigma.detach().double(), *how, reach
+            *self.drawn[:3], sigma.detach().double(), *settings.raster, layers, *how, reach
         )
         of_drawn = ops.soft_fragments(
             *self.drawn[:3], drawn_index, settings.far, settings.perspective
@@ -148,26 +156,108 @@ def make_scene(
     clip: bool,
     eps: float = 1e-4,
 ) -> Scene:
-    height, width = check_image_size(image_size, LARGEST_IMAGE)
-    packed = is_list(vertices) or is_list(faces)
-    if packed:
+    how = image_size, anti_aliasing, fill_back, near, far, clip, eps
+    return _transform_and_clip(*_check_arguments(vertices, faces, camera, *how))
+
+
+def draw_silhouette(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None,
+    image_size: int | tuple[int, int],
+    anti_aliasing: bool,
+    fill_back: bool,
+    near: float,
+    far: float,
+    clip: bool,
+    eps: float,
+    gradient: str,
+) -> Tensor:
+    """alpha ``[B, h, w]``: by one operator, unless faces are cut or the camera is a user's."""
+    how = image_size, anti_aliasing, fill_back, near, far, clip, eps
+    mesh, camera, settings, clip = _check_arguments(vertices, faces, camera, *how)
+    if is_projecting(camera) and gradient != "none" and can_read():
+        posed, batch = camera._arguments(mesh.vertices.dtype, mesh.batch, mesh.starts)
+        faces = check_faces(mesh.faces, batch, mesh.vertices.device)
+        alpha, _, _, _, cut = ops.silhouette(
+            mesh.vertices, faces, mesh.starts, *posed, *settings[:-1], clip, gradient == "local"
+        )
+        if not cut.item():
+            return alpha
+    return _transform_and_clip(mesh, camera, settings, clip).silhouette(gradient)[0]
+
+
+def _check_arguments(
+    vertices: Meshes,
+    faces: Meshes,
+    camera: Camera | None,
+    image_size: int | tuple[int, int],
+    anti_aliasing: bool,
+    fill_back: bool,
+    near: float,
+    far: float,
+    clip: bool,
+    eps: float,
+) -> tuple[MeshBatch, Camera | None, ops.RasterSettings, bool]:
+    """The meshes in the world, the camera of this image, the settings, and whether to clip. Faces
+    are not checked yet, as the number of images is not known.
+    """
+    if is_list(vertices) or is_list(faces):
         mesh = pack_meshes(vertices, faces)
     else:
         mesh = MeshBatch(check_vertices(vertices, ", or a list of [V_b, 3]"), faces)
-    world, nearest = mesh.vertices, None
     if camera is not None:
         check_camera(camera, mesh.starts is not None)
-        if isinstance(camera, ProjectingCamera):
-            camera = camera.for_image(height, width)
+    numbers = image_size, anti_aliasing, fill_back, near, far, clip, eps
+    plain = not torch.compiler.is_compiling() and _PLAIN.issuperset(map(type, numbers))
+    check = _check_plain_settings if plain else _check_settings
+    settings, clip = check(mesh.vertices.dtype, has_perspective(camera), *numbers)
+    if isinstance(camera, ProjectingCamera):
+        camera = camera.for_image(settings.height, settings.width)
+    return mesh, camera, settings, clip
+
+
+def _check_settings(
+    dtype: torch.dtype,
+    perspective: bool,
+    image_size: int | tuple[int, int],
+    anti_aliasing: bool,
+    fill_back: bool,
+    near: float,
+    far: float,
+    clip: bool,
+    eps: float,
+) -> tuple[ops.RasterSettings, bool]:
+    height, width = check_image_size(image_size, LARGEST_IMAGE)
+    check_depth_range(near, far, dtype)
+    check_eps(eps, dtype)
+    clip = check_flag(clip, "clip")
+    how = (
+        check_flag(anti_aliasing, "anti_aliasing"),
+        check_flag(fill_back, "fill_back"),
+        clip_plane(near, far) if clip else float(near),
+        float(far),
+        float(eps),
+    )
+    return ops.RasterSettings(height, width, *how, perspective), clip
+
+
+# The checks of numbers take as long as the kernel of a small mesh.
+_PLAIN = {int, float, bool}
+_check_plain_settings = functools.lru_cache(maxsize=64, typed=True)(_check_settings)
+
+
+def _transform_and_clip(
+    mesh: MeshBatch, camera: Camera | None, settings: ops.RasterSettings, clip: bool
+) -> Scene:
+    world, nearest, near = mesh.vertices, None, settings.near
+    if camera is not None:
         points, nearest = transform(camera, world, mesh.batch, mesh.starts)
         mesh = mesh._replace(vertices=points)
         check_transformed(points, world, mesh.starts is not None)
     mesh = mesh._replace(faces=check_faces(mesh.faces, mesh.batch, mesh.vertices.device))
-    check_depth_range(near, far, mesh.vertices.dtype)
-    check_eps(eps, mesh.vertices.dtype)
-    near = clip_plane(near, far) if check_flag(clip, "clip") else float(near)
     clipped = clip_near(world, mesh, camera, near, nearest) if clip else None
-    if clipped is not None and mesh.vertices.dtype == torch.float32 and has_perspective(camera):
+    if clipped is not None and mesh.vertices.dtype == torch.float32 and settings.perspective:
         depth = mesh.vertices.detach()[..., 2]
         if not holds_for_all(~depth.isfinite() | (depth * _NARROWEST < near)):
             warnings.warn(
@@ -175,14 +265,6 @@ def make_scene(
                 "them may show single open pixels; take a larger near, or float64",
                 stacklevel=callers_level(),
             )
-    how = (
-        check_flag(anti_aliasing, "anti_aliasing"),
-        check_flag(fill_back, "fill_back"),
-        near,
-        float(far),
-        float(eps),
-    )
-    settings = ops.RasterSettings(height, width, *how, has_perspective(camera))
     return Scene(world, mesh, camera, settings, clipped)
 
 

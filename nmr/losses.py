@@ -10,7 +10,6 @@ import math
 
 import torch
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
 
 from . import ops
 from ._validate import check_indices, check_number, check_vertices, describe
@@ -73,10 +72,7 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
         )
     dtype = torch.float64 if prediction.dtype == torch.float64 else torch.float32
     prediction, target = prediction.to(dtype), target.to(dtype)
-    compiling = torch.compiler.is_compiling()
-    forward_mode = not compiling and any(
-        unpack_dual(x).tangent is not None for x in (prediction, target)
-    )
+    forward_mode = not torch.compiler.is_compiling() and ops.in_forward_mode(prediction, target)
     if prediction.is_cpu and target.is_cpu and not forward_mode:
         return ops.soft_iou_loss(prediction, target)[0]
     return 1 - _soft_iou(prediction.flatten(1), target.flatten(1)).mean()

@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from ._packing import is_list
-from ._scene import Meshes, Scene, average, background_rows, make_scene, shade
+from ._scene import (
+    Meshes,
+    Scene,
+    average,
+    background_rows,
+    draw_silhouette,
+    make_scene,
+    shade,
+)
 from ._validate import GRADIENTS, as_positive, check_choice, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
@@ -118,9 +126,10 @@ def render(
     outputs = _check_outputs(outputs)
     check_choice(gradient, "gradient", GRADIENTS)
 
-    scene = make_scene(
-        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
-    )
+    how = image_size, anti_aliasing, fill_back, near, far, clip, eps
+    if outputs == ("alpha",):
+        return Images({"alpha": draw_silhouette(vertices, faces, camera, *how, gradient)})
+    scene = make_scene(vertices, faces, camera, *how)
     how = interpolation_gradient, gradient, smooth, space
     return Images(_draw(scene, outputs, background, colors, lights, *how))
 
@@ -389,11 +398,8 @@ def render_silhouette(
     torch.Size([2, 64, 64])
     """
     check_choice(gradient, "gradient", GRADIENTS)
-    scene = make_scene(
-        vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
-    )
-    alpha, _ = scene.silhouette(gradient)
-    return alpha
+    how = image_size, anti_aliasing, fill_back, near, far, clip, eps, gradient
+    return draw_silhouette(vertices, faces, camera, *how)
 
 
 def render_soft_silhouette(

@@ -1,5 +1,5 @@
 // Cameras: vertices to renderer space.
-#include "read.h"
+#include "camera.h"
 
 namespace nmr {
 namespace {
@@ -15,8 +15,10 @@ Parameter<P> read_parameter(Call& call, std::string_view text, int64_t size) {
   return parameter;
 }
 
+}  // namespace
+
 template <class T>
-Project<T> read_project(Call& call) {
+Project<T> read_project(Call& call, bool drawn) {
   Project<T> args{};
   const bool packed = call.has("starts");
   call.read("starts? [B + 1, 2]", args.starts);
@@ -25,8 +27,13 @@ Project<T> read_project(Call& call) {
   args.num_vertices = call["V"];
   args.cameras = call.read("camera [1|B, 22]", args.camera).shape[0];
   const Argument& distortion = call.read("distortion? [1|B, 4|5|8]", args.distortion.values);
-  if (call.backward && !call.has("grad_points")) call.let("B", 1);  // if it is not known by now
-  call.result(packed ? "points [V, 3]" : "points [B, V, 3]", args.points, args.grad_points);
+  const char* points = packed ? "points [V, 3]" : "points [B, V, 3]";
+  if (drawn) {
+    call.read(points, args.points);
+  } else {
+    if (call.backward && !call.has("grad_points")) call.let("B", 1);  // if it is not known by now
+    call.result(points, args.points, args.grad_points);
+  }
   args.batch = call["B"];
   if (packed)
     require_starts(args.starts, args.batch, args.num_vertices, args.starts[2 * args.batch + 1]);
@@ -53,17 +60,18 @@ Project<T> read_project(Call& call) {
   call.gradient("distortion", args.distortion.grad);
   args.distortion.each = args.distortion.values && distortion.shape[0] == args.batch;
   args.coefficients = args.distortion.values ? distortion.shape[1] : 0;
-  if (call.backward) {
+  if (!drawn && call.backward) {
     call.read("grad_camera? [n, 22]", args.grad_camera);
     call.skip("nearest");
-  } else {
+  } else if (!drawn) {
     call.read("nearest []", args.nearest);
   }
   args.num_threads = num_threads(call);
   return args;
 }
 
-}  // namespace
+template Project<float> read_project(Call& call, bool drawn);
+template Project<double> read_project(Call& call, bool drawn);
 
 void add_camera(Kernels& kernels) { NMR_ADD_STAGE(kernels, project); }
 

@@ -1,7 +1,8 @@
-// nmr._C: the kernels as functions of tensors (or NumPy arrays) and numbers, given by name. The
-// only file that knows Python.
+// nmr._C: the kernels as functions of tensors (or NumPy arrays) and numbers. The only file that
+// knows Python.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
 #include "../scratch.h"
 #include "call.h"
@@ -23,6 +24,21 @@ Type type_of(const py::dtype& dtype) {
     default:
       return Type::other;
   }
+}
+
+Kernels all_kernels() {
+  Kernels kernels;
+  add_camera(kernels);
+  add_raster(kernels);
+  add_soft(kernels);
+  add_fragments(kernels);
+  add_edges(kernels);
+  add_shade(kernels);
+  add_texture(kernels);
+  add_clip_space(kernels);
+  add_lights(kernels);
+  add_mesh(kernels);
+  return kernels;
 }
 
 // What is asked of tensors. They belong to the interpreter, and are never freed.
@@ -85,15 +101,16 @@ void read_tensor(py::handle tensor, Argument& argument, std::vector<py::object>&
     if (dtype.is(known)) argument.type = type;
 }
 
-// The names and values belong to the caller.
-Argument argument_of(const py::handle& name, const py::handle& value,
+// The value belongs to the caller.
+Argument argument_of(std::string_view name, const py::handle& value,
                      std::vector<py::object>& copies) {
   Argument argument;
-  argument.name = py::cast<std::string_view>(name);
+  argument.name = name;
   if (value.is_none()) return argument;
   if (PyFloat_Check(value.ptr()) || PyLong_Check(value.ptr())) {
     argument.type = Type::number;
-    argument.number = value.cast<double>();
+    argument.number = PyFloat_AsDouble(value.ptr());
+    if (argument.number == -1 && PyErr_Occurred()) throw py::error_already_set();
   } else if (PyObject_TypeCheck(value.ptr(),
                                 reinterpret_cast<PyTypeObject*>(Torch::get().tensor.ptr()))) {
     read_tensor(value, argument, copies);
@@ -109,21 +126,37 @@ Argument argument_of(const py::handle& name, const py::handle& value,
   return argument;
 }
 
-void define(py::module_& m, const std::string& name, const Kernel& kernel, bool backward) {
-  m.def(name.c_str(), [run = kernel.run, backward](const py::kwargs& given) {
-    std::vector<py::object> copies;
-    std::vector<Argument> arguments;
-    arguments.reserve(given.size());
-    for (const auto& [key, value] : given) arguments.push_back(argument_of(key, value, copies));
-    Call call(std::move(arguments), backward);
-    try {
-      const py::gil_scoped_release release;
-      run(call);
-      call.require_all_read();
-    } catch (const WrongType& error) {
-      throw py::type_error(error.what());
-    }
-  });
+void run_kernel(const Kernel& kernel, bool backward, const std::vector<std::string>& names,
+                const py::args& values) {
+  if (values.size() != names.size())
+    throw py::type_error(kernel.name + " takes " + std::to_string(names.size()) +
+                         " arguments, got " + std::to_string(values.size()));
+  std::vector<py::object> copies;
+  std::vector<Argument> arguments;
+  arguments.reserve(names.size());
+  for (size_t k = 0; k < names.size(); ++k)
+    arguments.push_back(argument_of(names[k], PyTuple_GET_ITEM(values.ptr(), k), copies));
+  Call call(std::move(arguments), backward);
+  try {
+    const py::gil_scoped_release release;
+    kernel.run(call);
+    call.require_all_read();
+  } catch (const WrongType& error) {
+    throw py::type_error(error.what());
+  }
+}
+
+// The kernel of a name, or with "<name>_backward" its backward pass, as a function of arguments
+// with these names, given by position.
+py::cpp_function bind(const std::string& name, const std::vector<std::string>& names) {
+  for (const Kernel& kernel : all_kernels()) {
+    const bool backward = name == kernel.name + "_backward";
+    if (name == kernel.name || (backward && kernel.has_backward))
+      return py::cpp_function([kernel, backward, names](const py::args& values) {
+        run_kernel(kernel, backward, names, values);
+      });
+  }
+  throw py::attribute_error("nmr._C has no kernel " + name);
 }
 
 }  // namespace
@@ -134,19 +167,5 @@ PYBIND11_MODULE(_C, m) {
       "Compiled kernels of nmr. Use the functions of the package nmr, which validate and document.";
   m.def("free_scratch", &nmr::ThreadScratch::free_all, py::call_guard<py::gil_scoped_release>(),
         "Frees the memory that threads keep between calls, except that of threads at work.");
-  nmr::Kernels kernels;
-  nmr::add_camera(kernels);
-  nmr::add_raster(kernels);
-  nmr::add_soft(kernels);
-  nmr::add_fragments(kernels);
-  nmr::add_edges(kernels);
-  nmr::add_shade(kernels);
-  nmr::add_texture(kernels);
-  nmr::add_clip_space(kernels);
-  nmr::add_lights(kernels);
-  nmr::add_mesh(kernels);
-  for (const nmr::Kernel& kernel : kernels) {
-    nmr::define(m, kernel.name, kernel, false);
-    if (kernel.has_backward) nmr::define(m, kernel.name + "_backward", kernel, true);
-  }
+  m.def("bind", &nmr::bind, "A kernel as a function of arguments with the given names.");
 }

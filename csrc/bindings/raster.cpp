@@ -1,5 +1,8 @@
 // Near-plane clipping, the rasterizer, and the silhouette with its two gradients.
-#include "read.h"
+#include <algorithm>
+
+#include "../scratch.h"
+#include "camera.h"
 
 namespace nmr {
 namespace {
@@ -37,9 +40,9 @@ ClipFaces<T> read_clip(Call& call) {
 }
 
 template <class T>
-Rasterize<T> read_rasterize(Call& call) {
+Rasterize<T> read_rasterize(Call& call, const MeshBatch<T>& mesh) {
   Rasterize<T> args{};
-  args.mesh = read_mesh<T>(call);
+  args.mesh = mesh;
   call.read("face_index [B, H, W]", args.face_index);
   args.settings =
       raster_settings<T>(call, drawn_size(call, "face_index"), call.flag("perspective"));
@@ -59,27 +62,73 @@ RasterizeLayers<T> read_layers(Call& call) {
   return args;
 }
 
+// The meshes of a silhouette in renderer space: the points of a camera, or without one the
+// vertices.
+template <class T>
+MeshBatch<T> read_drawn_mesh(Call& call) {
+  if (has_camera(call)) return read_mesh<T>(call, "starts", "points");
+  const T* nothing;
+  call.read("points [0]", nothing);
+  call.read("camera [0]", nothing);
+  return read_mesh<T>(call);
+}
+
 template <class T>
 void draw_silhouette(Call& call) {
-  Rasterize<T> args = read_rasterize<T>(call);
+  Project<T> camera{};
+  if (has_camera(call)) camera = read_project<T>(call, true);
+  Rasterize<T> args = read_rasterize<T>(call, read_drawn_mesh<T>(call));
   args.anti_aliasing = call.flag("anti_aliasing");
-  image_size(call, args.anti_aliasing);
+  const Size image = image_size(call, args.anti_aliasing);
   call.read("alpha [B, h, w]", args.alpha);
+  bool* cut;
+  call.read("cut []", cut);
+  *cut = false;
+  if (has_camera(call)) {
+    T nearest;
+    camera.nearest = &nearest;
+    project_forward(camera);
+    *cut = call.flag("clip") && nearest < args.settings.near;
+    if (*cut) {
+      const int64_t batch = args.mesh.batch, raster = args.settings.raster.pixels();
+      std::fill_n(args.face_index, batch * raster, -1);
+      std::fill_n(args.alpha, batch * image.pixels(), T(0));
+      return;
+    }
+  }
   rasterize(args);
 }
 
 template <class T>
+struct PointsScratch {
+  std::vector<T> grad;
+};
+
+template <class T>
 void pull_silhouette(Call& call) {
   SilhouetteBackward<T> args{};
-  args.mesh = read_mesh<T>(call);
+  Project<T> camera{};
+  if (has_camera(call)) camera = read_project<T>(call, true);
+  args.mesh = read_drawn_mesh<T>(call);
   args.num_threads = num_threads(call);
   args.anti_aliasing = call.flag("anti_aliasing");
   args.eps = static_cast<T>(call.number("eps"));
   read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh, args.num_threads);
   args.image = image_size(call, args.anti_aliasing);
   call.read("grad_alpha [B, h, w]", args.grad_alpha);
-  call.only_gradient("vertices", args.grad_vertices);
+  const bool* cut;
+  call.read("cut []", cut);
+  const ScratchUse use;
+  if (has_camera(call)) {
+    const int64_t rows = args.mesh.starts ? 1 : args.mesh.batch;
+    args.grad_vertices = reserve(thread_scratch<PointsScratch<T>>().grad,
+                                 static_cast<size_t>(3 * rows * args.mesh.num_vertices));
+    camera.grad_points = args.grad_vertices;
+  } else {
+    call.only_gradient("vertices", args.grad_vertices);
+  }
   call.flag("local") ? local_gradient(args) : silhouette_backward(args);
+  if (has_camera(call)) project_backward(camera);
 }
 
 }  // namespace
@@ -89,8 +138,10 @@ void add_raster(Kernels& kernels) {
               [](auto zero, Call& call) { clip_count(read_clip_count<decltype(zero)>(call)); });
   kernels.add("clip_faces",
               [](auto zero, Call& call) { clip_faces(read_clip<decltype(zero)>(call)); });
-  kernels.add("rasterize",
-              [](auto zero, Call& call) { rasterize(read_rasterize<decltype(zero)>(call)); });
+  kernels.add("rasterize", [](auto zero, Call& call) {
+    using T = decltype(zero);
+    rasterize(read_rasterize<T>(call, read_mesh<T>(call)));
+  });
   kernels.add("rasterize_layers",
               [](auto zero, Call& call) { rasterize_layers(read_layers<decltype(zero)>(call)); });
   kernels.add_with_backward("silhouette", [](auto zero, Call& call) {

@@ -33,12 +33,13 @@ inline void require_starts(const int64_t* starts, int64_t batch, int64_t rows, i
                      std::to_string(faces) + ")");
 }
 
-// A batch of meshes, with every index checked.
+// A batch of meshes, with every index checked. The names are those of its starts and its vertices.
 template <class T>
-MeshBatch<T> read_mesh(Call& call, const std::string& starts = "starts") {
+MeshBatch<T> read_mesh(Call& call, const std::string& starts = "starts",
+                       const std::string& vertices = "vertices") {
   MeshBatch<T> mesh{};
   const bool packed = call.has(starts);
-  call.read(packed ? "vertices [N, 3]" : "vertices [B, V, 3]", mesh.vertices);
+  call.read(vertices + (packed ? " [N, 3]" : " [B, V, 3]"), mesh.vertices);
   mesh.faces_per_image =
       call.read(packed ? "faces [M, 3]" : "faces [F, 3] or [B, F, 3]", mesh.faces).shape.size() ==
       3;

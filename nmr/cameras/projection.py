@@ -109,14 +109,20 @@ class ProjectingCamera(Poses):
         self, vertices: Tensor, meshes: int, starts: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """:func:`nmr.ops.project` of checked vertices."""
-        given = self._given(vertices.dtype)
+        return ops.project(vertices, starts, *self._arguments(vertices.dtype, meshes, starts)[0])
+
+    def _arguments(
+        self, dtype: torch.dtype, meshes: int, starts: Tensor | None
+    ) -> tuple[tuple, int]:
+        """The arguments of :func:`nmr.ops.project` from ``eye`` on, and the number of images."""
+        given = self._given(dtype)
         batch = ops.count_cameras(*given)
         if batch != meshes and batch != 1 and (meshes != 1 or starts is not None):
             raise ValueError(
                 f"vertices and camera must have one batch size (or 1), got {meshes} meshes and {batch} poses"
                 + ("" if starts is None else "; packed meshes need one pose each, or one for all")
             )
-        return ops.project(vertices, starts, *given, *self._stretch)
+        return (*given, *self._stretch), meshes if batch == 1 else batch
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,12 +303,16 @@ def _sum_of_three(terms: Tensor) -> Tensor:
     return (terms[:, :1] + terms[:, 1:2]) + terms[:, 2:]
 
 
+def is_projecting(camera: Camera | None) -> bool:
+    """Whether the camera is one of this package, or derived from one without another transform."""
+    return getattr(type(camera), "transform", None) is ProjectingCamera.transform
+
+
 def transform(
     camera: Camera, vertices: Tensor, meshes: int, starts: Tensor | None
 ) -> tuple[Tensor, Tensor | None]:
     """Checked vertices in renderer space, and the least depth of all, if the camera computes it."""
-    own = getattr(type(camera), "transform", None)
-    if own is ProjectingCamera.transform:
+    if is_projecting(camera):
         points, _, nearest = camera._project(vertices, meshes, starts)
         return points, nearest
     return (

@@ -15,13 +15,22 @@ same; row 0 = top. A face index map is int32:
 -1 = background, f = face f is nearest, ``F + f`` = its reversed copy is (F = number of faces of that mesh).
 """
 
+from ._kernel import in_forward_mode
 from .camera import count_cameras, project
 from .clip_space import antialias, clip_weights
 from .edges import resolve
 from .fragments import depth_image, fragments
 from .losses import soft_iou_loss
 from .mesh import smoothness, voxels
-from .raster import RasterSettings, clip_count, clip_faces, rasterize, rasterize_layers, silhouette
+from .raster import (
+    RasterSettings,
+    clip_count,
+    clip_faces,
+    no_camera,
+    rasterize,
+    rasterize_layers,
+    silhouette,
+)
 from .shade import interpolate, lit, normals, texture_cubes
 from .soft import soft_fragments, soft_layers, soft_silhouette
 from .texture import WRAPS, mipmaps, sample_uv, uv_levels
@@ -36,9 +45,11 @@ __all__ = [
     "count_cameras",
     "depth_image",
     "fragments",
+    "in_forward_mode",
     "interpolate",
     "lit",
     "mipmaps",
+    "no_camera",
     "normals",
     "project",
     "rasterize",

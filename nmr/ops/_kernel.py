@@ -1,8 +1,8 @@
 """Makes operators of the compiled kernels: ``@kernel`` turns the shapes of a kernel's results
 into an operator.
 
-An operator is a function of tensors and numbers, given by position, without default values (torch
-would leave out arguments equal to them). Calls with plain tensors reach the kernel through a
+An operator is a function of tensors, then numbers, given by position, without default values
+(torch would leave out arguments equal to them). Calls with plain tensors reach the kernel through a
 ``torch.autograd.Function``, or directly if no gradient is wanted: for small meshes the dispatcher
 takes longer than the kernel. Everything else (torch.compile, torch.export, fake tensors) reaches
 it through ``torch.ops.nmr``.
@@ -40,6 +40,8 @@ _TYPES = {
     float: "float",
     list[bool]: "bool[]",
 }
+# Kernels by name: the names of their arguments, and the function that takes them by position.
+COMPILED: dict[str, tuple[list[str], Callable]] = {}
 _PLAIN = {Tensor, torch.nn.Parameter, type(None), bool, int, float, list}
 
 
@@ -101,7 +103,8 @@ def _operator(
     several = get_origin(returned) is tuple
     first = next(k for k, hint in enumerate(hints.values()) if hint is Tensor)
     has_wanted = "wanted" in hints  # the last argument: the results that the kernel is to compute
-    names = (*(hint for hint in hints if hint != "wanted"), *results)
+    names = [*(hint for hint in hints if hint != "wanted"), *results, "num_threads"]
+    COMPILED[name] = names, _C.bind(name, names)
 
     def run(*args):
         like = args[first]
@@ -114,9 +117,8 @@ def _operator(
             return tuple(x if x is None else x.to(to.device) for x, to in pairs)
         outputs = allocate(*args)
         found = outputs if several else (outputs,)
-        given = dict(zip(names, (*args[: len(args) - has_wanted], *found), strict=True))
-        given["num_threads"] = torch.get_num_threads()
-        getattr(_C, name)(**given)
+        given = args[:-1] if has_wanted else args
+        COMPILED[name][1](*given, *found, torch.get_num_threads())
         return outputs
 
     def filled(compute, args):
@@ -134,8 +136,11 @@ def _operator(
             return op(*args)
         if torch._C._are_functorch_transforms_active():
             return call.transformed(*args)
-        if call.direct is not None and _gradient_is_wanted(args):
-            return call.direct(*args)
+        if call.direct is not None:
+            if in_forward_mode(*args):
+                return call.transformed(*args)  # an error
+            if torch.is_grad_enabled() and any([_wants(args[k]) for k in call.differentiable]):
+                return call.direct(*args)
         return run(*args)
 
     def one_by_one(info, in_dims, *args):
@@ -162,21 +167,21 @@ def _operator(
     if hasattr(torch.library, "register_vmap"):  # torch < 2.5 loops, too, but warns that it is slow
         torch.library.register_vmap(op, one_by_one, lib=_LIBRARY)
     call.op, call.vmap, call.direct, call.transformed = op, one_by_one, None, op
+    call.differentiable = [k for k, hint in enumerate(hints.values()) if hint in (Tensor, _MAYBE)]
     return call
 
 
-def _gradient_is_wanted(args) -> bool:
-    """In reverse mode, or in forward mode, which is an error."""
-    reverse, forward = torch.is_grad_enabled(), forward_ad._current_level >= 0
-    if not reverse and not forward:
+def _wants(x: object) -> bool:
+    return x is not None and x.requires_grad
+
+
+def in_forward_mode(*values: object) -> bool:
+    """Whether a tensor among them has a tangent."""
+    if forward_ad._current_level < 0:
         return False
-    for x in args:
-        if isinstance(x, Tensor) and (
-            (reverse and x.requires_grad)
-            or (forward and forward_ad.unpack_dual(x).tangent is not None)
-        ):
-            return True
-    return False
+    return any(
+        isinstance(x, Tensor) and forward_ad.unpack_dual(x).tangent is not None for x in values
+    )
 
 
 def _add_gradient(
@@ -189,10 +194,10 @@ def _add_gradient(
 ) -> Callable:
     """Registers the operator of the gradients, and with it the gradient of ``forward``."""
     names, count = list(hints), len(hints)
-    tensors = [k for k, name in enumerate(names) if hints[name] in (Tensor, _MAYBE)]
+    num_tensors = sum(hint in (Tensor, _MAYBE) for hint in hints.values())  # which come first
     of = [names.index(name) for name in gradients]
-    kept = [k for k, name in enumerate(results) if name in (*keep, *constant)]
     without = [k for k, name in enumerate(results) if name in constant]
+    kept = [k for k, name in enumerate(results) if name in (*keep, *constant)]
     upstream = [k for k in range(len(results)) if k not in without]
 
     def allocate(*args):  # None: not wanted
@@ -212,13 +217,21 @@ def _add_gradient(
     )
     backward = _operator(name, hints | added | {"wanted": list[bool]}, returned, allocate, found)
 
+    def save(ctx, inputs, outputs):
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs[:num_tensors], *[outputs[k] for k in kept])
+        ctx.numbers = inputs[num_tensors:]
+
+    def go_back(ctx, saved, grads, wanted):
+        tensors, results = saved[:num_tensors], saved[num_tensors:]
+        found = backward(*tensors, *ctx.numbers, *results, *grads, wanted)
+        return (found,) if len(of) == 1 else found
+
     def set_up(ctx, inputs, output):
         outputs = (output,) if len(results) == 1 else output
-        ctx.set_materialize_grads(False)
         if without:
             ctx.mark_non_differentiable(*(outputs[k] for k in without))
-        ctx.save_for_backward(*(inputs[k] for k in tensors), *(outputs[k] for k in kept))
-        ctx.arguments = [None if k in tensors else value for k, value in enumerate(inputs)]
+        save(ctx, inputs, outputs)
 
     def pull(ctx, *grads):
         grads, wanted = [grads[k] for k in upstream], [ctx.needs_input_grad[k] for k in of]
@@ -226,15 +239,48 @@ def _add_gradient(
         if any(wanted) and any([grad is not None for grad in grads]):
             # a pullback of torch.func.vjp runs after the transform whose wrappers it has saved
             saved = [x if x is None else unwrap_if_dead(x) for x in ctx.saved_tensors]
-            arguments = list(ctx.arguments)
-            for k, value in zip(tensors, saved, strict=False):
-                arguments[k] = value
-            grads = backward(*arguments, *saved[len(tensors) :], *grads, wanted)
-            for k, want, grad in zip(of, wanted, (grads,) if len(of) == 1 else grads, strict=True):
+            pulled = go_back(ctx, saved, grads, wanted)
+            for k, want, grad in zip(of, wanted, pulled, strict=True):
                 found[k] = grad if want else None
         return tuple(found)
 
     _register_autograd(forward, pull, set_up)
+
+    # For plain tensors. torch takes about a microsecond for each argument and result of a
+    # Function: here these are the arguments as one, those that want a gradient, and the results
+    # that have one.
+    def forward_directly(ctx, args, wanted, *_):
+        output = forward.run(*args)
+        outputs = (output,) if len(results) == 1 else output
+        save(ctx, args, outputs)
+        ctx.wanted, ctx.outputs = wanted, outputs if without else None
+        return tuple([outputs[k] for k in upstream])
+
+    def pull_directly(ctx, *grads):
+        needed = iter(ctx.needs_input_grad[2:])
+        wanted = [want and next(needed) for want in ctx.wanted]
+        found = [None] * len(of)
+        if any(wanted) and any([grad is not None for grad in grads]):
+            found = go_back(ctx, ctx.saved_tensors, grads, wanted)
+        return None, None, *[grad for want, grad in zip(ctx.wanted, found, strict=True) if want]
+
+    function = _function(forward.op, forward=forward_directly, backward=pull_directly)
+    apply = super(torch.autograd.Function, function).apply
+
+    def direct(*args):
+        wanted = [_wants(args[k]) for k in of]
+        differentiable = apply(
+            args, wanted, *[args[k] for k, want in zip(of, wanted, strict=True) if want]
+        )
+        if not without:
+            return differentiable[0] if len(results) == 1 else differentiable
+        node = differentiable[0].grad_fn
+        outputs, node.outputs = list(node.outputs), None
+        for k, x in zip(upstream, differentiable, strict=True):
+            outputs[k] = x
+        return tuple(outputs)
+
+    forward.direct, forward.differentiable = direct, of
     return backward
 
 
@@ -280,7 +326,7 @@ def _add_second(backward: Callable, twice: Callable) -> None:
 
 def _register_autograd(operator: Callable, backward: Callable, set_up: Callable) -> None:
     """``backward`` and ``set_up`` are of the form that ``torch.library.register_autograd`` has."""
-    op, run, name = operator.op, operator.run, operator.op.name().replace("::", "_")
+    op, run = operator.op, operator.run
     torch.library.register_autograd(op, backward, setup_context=set_up, lib=_LIBRARY)
 
     def forward(*args):
@@ -291,21 +337,22 @@ def _register_autograd(operator: Callable, backward: Callable, set_up: Callable)
         set_up(ctx, args, output)
         return output
 
+    # torch binds the arguments of a Function with setup_context by its signature, which takes
+    # longer than the kernel of a small mesh. Only torch.func needs that form, and the apply of
+    # Function, which prepares for it.
+    direct = _function(op, forward=forward_with_context, backward=backward)
+    operator.direct = super(torch.autograd.Function, direct).apply
+    operator.transformed = _function(
+        op, forward=forward, setup_context=set_up, backward=backward, vmap=operator.vmap
+    ).apply
+
+
+def _function(op: Callable, **parts: Callable) -> type[torch.autograd.Function]:
     def jvp(ctx, *tangents):
         raise RuntimeError(
             f"{op.name()} has no forward-mode derivative (torch.func.jvp, torch.autograd.forward_ad); "
             "use reverse mode: backward(), or torch.func.grad, vjp or jacrev"
         )
 
-    def function(**parts):
-        parts = {part: staticmethod(code) for part, code in parts.items()}
-        return type(name, (torch.autograd.Function,), parts)
-
-    # torch binds the arguments of a Function with setup_context by its signature, which takes
-    # longer than the kernel of a small mesh. Only torch.func needs that form, and the apply of
-    # Function, which prepares for it.
-    direct = function(forward=forward_with_context, backward=backward, jvp=jvp)
-    operator.direct = super(torch.autograd.Function, direct).apply
-    operator.transformed = function(
-        forward=forward, setup_context=set_up, backward=backward, jvp=jvp, vmap=operator.vmap
-    ).apply
+    methods = {name: staticmethod(code) for name, code in (parts | {"jvp": jvp}).items()}
+    return type(op.name().replace("::", "_"), (torch.autograd.Function,), methods)

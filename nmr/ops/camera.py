@@ -16,6 +16,18 @@ def count_cameras(*parameters: Tensor | None) -> int:
     return 1
 
 
+def allocate_points(
+    vertices: Tensor, starts: Tensor | None, *parameters: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Points and cameras of :func:`project`, given its parameters from ``eye`` to ``distortion``."""
+    *posed, distortion = parameters
+    cameras = count_cameras(*posed)
+    sizes = vertices.shape[0], cameras, 1 if distortion is None else distortion.shape[0]
+    batch = next((size for size in sizes if size != 1), 1)
+    shape = vertices.shape if starts is not None else (batch, *vertices.shape[1:])
+    return vertices.new_empty(shape), vertices.new_empty((cameras, 22))
+
+
 @kernel(
     "points camera nearest",
     gradients="vertices eye at up view matrix intrinsics origin extent distortion",
@@ -55,9 +67,5 @@ def project(
     The second result are the parts of the cameras, as rows ``[n, 22]`` of ``[A | t]``, K (both
     rows multiplied), origin and extent.
     """
-    cameras = count_cameras(eye, at, up, view, matrix, intrinsics, origin, extent)
-    sizes = vertices.shape[0], cameras, 1 if distortion is None else distortion.shape[0]
-    batch = next((size for size in sizes if size != 1), 1)
-    shape = vertices.shape if starts is not None else (batch, *vertices.shape[1:])
-    rows = vertices.new_empty((cameras, 22))
-    return vertices.new_empty(shape), rows, vertices.new_empty(())
+    parameters = eye, at, up, view, matrix, intrinsics, origin, extent, distortion
+    return *allocate_points(vertices, starts, *parameters), vertices.new_empty(())

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ._kernel import kernel
+from .camera import allocate_points
 
 
 class RasterSettings(NamedTuple):
@@ -104,13 +105,35 @@ def rasterize_layers(
     )
 
 
+def no_camera(perspective: bool) -> tuple:
+    """The arguments of :func:`silhouette` from ``eye`` to ``down`` for vertices in renderer space."""
+    return *(None,) * 9, False, False, perspective, 1.0, 1.0
+
+
 @kernel(
-    "alpha face_index", gradients="vertices", constant="face_index", used_by="render_silhouette"
+    "alpha face_index points camera cut",
+    gradients="vertices eye at up view matrix intrinsics origin extent distortion",
+    constant="face_index points camera cut",
+    used_by="render_silhouette",
 )
 def silhouette(
     vertices: Tensor,
     faces: Tensor,
     starts: Tensor | None,
+    eye: Tensor | None,
+    at: Tensor | None,
+    up: Tensor | None,
+    view: Tensor | None,
+    matrix: Tensor | None,
+    intrinsics: Tensor | None,
+    origin: Tensor | None,
+    extent: Tensor | None,
+    distortion: Tensor | None,
+    along: bool,
+    right_handed: bool,
+    perspective: bool,
+    across: float,
+    down: float,
     height: int,
     width: int,
     anti_aliasing: bool,
@@ -118,15 +141,26 @@ def silhouette(
     near: float,
     far: float,
     eps: float,
-    perspective: bool,
+    clip: bool,
     local: bool,
-) -> tuple[Tensor, Tensor]:
-    """Silhouettes ``alpha [B, height, width]`` and the face index map ``[B, H, W]`` of meshes in
-    renderer space.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Silhouettes ``alpha [B, height, width]`` and the face index map ``[B, H, W]`` of meshes,
+    points and cameras of :func:`project`, whose camera comes first, and a bool ``[]``: whether a
+    point is nearer than ``near`` with ``clip``. Both images are empty then. Without a camera
+    (:func:`no_camera`) these three are not used.
 
     The gradient is NMR's silhouette gradient or, if ``local``, Kato and Harada's, which reaches
-    one pixel. Zero in z.
+    one pixel. Zero in z of renderer space.
     """
-    batch, scale = batch_size(vertices, starts), 2 if anti_aliasing else 1
+    parameters = eye, at, up, view, matrix, intrinsics, origin, extent, distortion
+    if eye is None and matrix is None:
+        points, cameras = vertices.new_empty(0), vertices.new_empty(0)
+        batch = batch_size(vertices, starts)
+    else:
+        points, cameras = allocate_points(vertices, starts, *parameters)
+        batch = batch_size(points, starts)
+    scale = 2 if anti_aliasing else 1
     alpha = vertices.new_empty((batch, height, width))
-    return alpha, vertices.new_empty((batch, scale * height, scale * width), dtype=torch.int32)
+    raster = (batch, scale * height, scale * width)
+    face_index = vertices.new_empty(raster, dtype=torch.int32)
+    return alpha, face_index, points, cameras, vertices.new_empty((), dtype=torch.bool)

@@ -16,10 +16,11 @@ from nmr import _C
 
 # The arguments of each kernel: names, or "name=key" if the array has another name in the table below.
 MESH = "vertices faces starts"
+DRAWN = "points camera cut eye matrix"
 CALLS = {
     "rasterize": f"{MESH} face_index fill_back near far perspective",
-    "silhouette": f"{MESH} face_index alpha anti_aliasing fill_back near far perspective",
-    "silhouette_backward": f"{MESH} face_index grad_alpha=alpha grad_vertices anti_aliasing eps local",
+    "silhouette": f"{MESH} {DRAWN} face_index alpha anti_aliasing fill_back near far perspective",
+    "silhouette_backward": f"{MESH} {DRAWN} face_index grad_alpha=alpha grad_vertices anti_aliasing eps local",
     "smoothness": "vertices edges loss",
 }
 NUMBERS = dict(near=0.1, far=100.0, eps=1e-4, fill_back=True, perspective=True, anti_aliasing=True)
@@ -33,13 +34,22 @@ def integers(*shape, value=0):
 def call(name, table):
     names = [pair.partition("=")[::2] for pair in CALLS[name].split()]
     given = {key: table[other or key] for key, other in names}
-    getattr(_C, name)(**given, num_threads=1)
+    run(name, given | dict(num_threads=1))
+
+
+def run(name, given):
+    _C.bind(name, list(given))(*given.values())
 
 
 ARRAYS = dict(
     vertices=np.random.default_rng(0).random((2, 12, 3)) + 0.5,
     faces=np.arange(12).reshape(4, 3),
     starts=None,
+    points=np.zeros(0),
+    camera=np.zeros(0),
+    cut=np.zeros((), bool),
+    eye=None,
+    matrix=None,
     face_index=integers(2, 8, 8),
     alpha=np.zeros((2, 4, 4)),
     grad_vertices=np.zeros((2, 12, 3)),
@@ -107,12 +117,16 @@ def test_nothing_is_converted_silently(name, value, words):
     table = ARRAYS | NUMBERS
     arguments = {key: table[key] for key in CALLS["rasterize"].split()} | {name: value}
     with pytest.raises(TypeError, match=words):
-        _C.rasterize(**arguments, num_threads=1)
+        run("rasterize", arguments | dict(num_threads=1))
 
 
 def test_arguments_that_are_missing_are_named():
     with pytest.raises(TypeError, match="the argument faces is missing"):
-        _C.rasterize(vertices=ARRAYS["vertices"], starts=None)
+        run("rasterize", dict(vertices=ARRAYS["vertices"], starts=None))
+    with pytest.raises(TypeError, match="rasterize takes 1 arguments, got 2"):
+        _C.bind("rasterize", ["vertices"])(1, 2)
+    with pytest.raises(AttributeError, match="no kernel rasterise"):
+        _C.bind("rasterise", [])
 
 
 def promised(gigabytes, dtype):

@@ -25,7 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import nmr
 import nmr.nvdiffrast.torch as dr
-from nmr import _C
+from nmr.ops._kernel import COMPILED
 
 
 def noise(*shape, seed=0):
@@ -433,19 +433,20 @@ def test_no_kernel_reads_or_writes_outside_an_array(monkeypatch):
     """An array of another shape, or an index beyond another array, is a ValueError: the last check in the bindings."""
     calls = {}
 
-    def record(name, kernel):
-        def call(**args):
+    def record(name, names, kernel):
+        def call(*values):
+            args = dict(zip(names, values, strict=True))
             tensors = {key: x for key, x in args.items() if isinstance(x, torch.Tensor)}
             arrays = {key: x.detach().numpy().copy() for key, x in tensors.items()}
             calls[name, tuple((key, x.ndim) for key, x in arrays.items())] = args | arrays
-            return kernel(**args)
+            return kernel(*values)
 
-        return call
+        return names, call
 
-    kernels = {name: x for name, x in vars(_C).items() if callable(x) and name != "free_scratch"}
+    kernels = dict(COMPILED)
     with monkeypatch.context() as patch:
-        for name, kernel in kernels.items():
-            patch.setattr(_C, name, record(name, kernel))
+        for name, (names, kernel) in kernels.items():
+            patch.setitem(COMPILED, name, record(name, names, kernel))
         for packed in (False, True):
             call_everything(torch.float32, packed)
     assert {name for name, _ in calls} == set(kernels)
@@ -470,7 +471,9 @@ def mostly_refused(kernels, calls):
                 for key, x in arrays.items():
                     copies[key][...] = x
                 try:
-                    kernels[name](**args | copies | {changed: guarded(other)})
+                    names, kernel = kernels[name]
+                    given = args | copies | {changed: guarded(other)}
+                    kernel(*(given[argument] for argument in names))
                 except ValueError:
                     refused += 1
                     continue
