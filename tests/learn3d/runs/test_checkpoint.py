@@ -114,9 +114,10 @@ def test_sizes_and_shapes_come_before_tensors_are_read(finished_run, tmp_path, m
     refused(rf"a.safetensors: does not fit: {name} is \(7,\), its networks need \(")
     checkpoint.save(path, {k: v for k, v in loaded.items() if k != name}, about)
     refused(f"does not fit: {name} is None, its networks need")
-    many = torch.zeros(1, dtype=torch.uint8).expand(500_000_000)
+    monkeypatch.setattr(checkpoint.limits, "WEIGHTS_BYTES", 0)
+    many = torch.zeros(1, dtype=torch.uint8).expand(6 * sum(t.numel() for t in loaded.values()))
     checkpoint.save(path, loaded | {"optimizer.more": many}, about)
-    refused(r"has 5\d{8} numbers; its networks have \d+$")
+    refused(r"has \d+ numbers; its networks have \d+$")
     values = dataclasses.asdict(about)
     values["config"]["settings"]["encoder"] = "conv"
     text = json.dumps(values, default=str)
