@@ -1,7 +1,9 @@
-"""The environment of programs that tests start."""
+"""The environment of programs that tests start, and waiting for them."""
 
 import os
 import sys
+import time
+from collections.abc import Callable
 
 
 def environment(**more: str) -> dict[str, str]:
@@ -14,3 +16,11 @@ def environment(**more: str) -> dict[str, str]:
         "CUDA_VISIBLE_DEVICES": "",
     }
     return os.environ | fixed | more
+
+
+def wait_until(what: Callable[[], object], seconds: float = 60) -> None:
+    """Return when `what` is true. Raises AssertionError if that takes longer."""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, f"it did not happen within {seconds} seconds"
+        time.sleep(0.01)

@@ -8,13 +8,12 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import stub_steps
+from children import wait_until
 from dask_cluster import dask_cluster
 
 from learn3d import tasks
@@ -41,13 +40,6 @@ def finished(folder: Path, *names: str) -> bool:
     return all((folder / f"{name}.txt").read_text().split() == wanted for name in names)
 
 
-def wait_for(condition: Callable[[], bool], what: str, seconds: float = 60) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f"waited for {what}"
-        time.sleep(0.05)
-
-
 def begun(folder: Path, *names: str) -> bool:
     return all((folder / f"{name}.txt").exists() for name in names)
 
@@ -68,7 +60,7 @@ def test_an_interruption_lets_tasks_save_and_the_next_call_goes_on(
     workers, tmp_path, capsys
 ) -> None:
     def interrupt() -> None:
-        wait_for(lambda: begun(tmp_path, "a"), "the task")
+        wait_until(lambda: begun(tmp_path, "a"))
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
@@ -82,7 +74,7 @@ def test_an_interruption_lets_tasks_save_and_the_next_call_goes_on(
 
 def test_a_task_goes_on_when_its_worker_is_killed(cluster, tmp_path, capsys) -> None:
     def kill() -> None:
-        wait_for(lambda: begun(tmp_path, "a"), "the task")
+        wait_until(lambda: begun(tmp_path, "a"))
         worker = (tmp_path / "a.log").read_text().split(" of ")[1].split()[0]
         os.kill(int(worker), signal.SIGKILL)
 
@@ -101,7 +93,7 @@ def test_a_scheduler_that_is_missing_or_ends(tmp_path, capsys) -> None:
     with dask_cluster() as (address, process):
 
         def kill() -> None:
-            wait_for(lambda: begun(tmp_path, "a"), "the task")
+            wait_until(lambda: begun(tmp_path, "a"))
             process.kill()
 
         threading.Thread(target=kill).start()
@@ -110,7 +102,7 @@ def test_a_scheduler_that_is_missing_or_ends(tmp_path, capsys) -> None:
         "the Dask scheduler ended; start it, and the same command goes on"
         in capsys.readouterr().err
     )
-    wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
+    wait_until(lambda: "saved" in (tmp_path / "a.log").read_text())
 
 
 def test_another_version_of_dask_is_refused() -> None:
@@ -137,9 +129,9 @@ folder = Path({str(tmp_path)!r})
 run_tasks([Task("a", stub_steps.steps, (folder, "a", 0.3), folder / "a.log")], ONE_WORKER)
 """
     with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL) as parent:
-        wait_for(lambda: begun(tmp_path, "a"), "the task")
+        wait_until(lambda: begun(tmp_path, "a"))
         parent.kill()
-    wait_for(lambda: "saved" in (tmp_path / "a.log").read_text(), "the orphan")
+    wait_until(lambda: "saved" in (tmp_path / "a.log").read_text())
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,11 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
+from children import wait_until
 
 from learn3d.terminal import align, say, without_traceback
 
@@ -36,10 +36,8 @@ def test_an_interrupted_data_set_leaves_nothing(tmp_path) -> None:
     with subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        deadline = time.monotonic() + 120
-        while not list(tmp_path.glob("data/.make_dataset_*/new")) and time.monotonic() < deadline:
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.05)
+        begun = "data/.make_dataset_*/new"
+        wait_until(lambda: list(tmp_path.glob(begun)) or process.poll() is not None, 120)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=120)
     assert (process.returncode, out) == (130, "")

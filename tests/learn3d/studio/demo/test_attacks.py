@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import httpx
 import pytest
+from children import wait_until
 
 pytest.importorskip("uvicorn", reason="needs the extra demo")
 
@@ -247,8 +248,8 @@ def unread_answers(page: Page) -> None:
     with page.connect() as visitor:
         visitor.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**12)
         visitor.sendall(page.head() + page.box.content)
-        wait_for(lambda: page.connections())
-        wait_for(lambda: not page.connections())
+        wait_until(lambda: page.connections())
+        wait_until(lambda: not page.connections())
 
 
 def nonsense_behind_a_picture(page: Page) -> None:
@@ -259,14 +260,6 @@ def nonsense_behind_a_picture(page: Page) -> None:
         visitor.sendall(b"x\n" * 99)
         read_to_end(visitor, 3 * SILENCE)
     page.goes_on.set()
-
-
-def wait_for(what: Callable[[], object]) -> None:
-    for _ in range(600):
-        if what():
-            return
-        time.sleep(0.1)
-    raise AssertionError("it does not happen")
 
 
 def visitors_who_leave(page: Page) -> None:

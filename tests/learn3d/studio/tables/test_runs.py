@@ -10,11 +10,11 @@ import shlex
 import shutil
 import signal
 import threading
-import time
 
 import numpy as np
 import pytest
 import stub_work
+from children import wait_until
 
 from learn3d.commands.train import Train
 from learn3d.config import config_to_dict
@@ -214,11 +214,7 @@ def test_ctrl_c_stops_all_runs_and_the_next_call_goes_on(tmp_path, capsys, reque
     logs = [tmp_path / f"out/runs/waits/{name}-seed0/log.txt" for name in ("vanilla", "proposed")]
 
     def interrupt() -> None:
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and not all(
-            log.is_file() and "waiting" in log.read_text() for log in logs
-        ):
-            time.sleep(0.05)
+        wait_until(lambda: all(log.is_file() and "waiting" in log.read_text() for log in logs))
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
