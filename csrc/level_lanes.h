@@ -329,10 +329,8 @@ NMR_INLINE Lanes<T> floor_lanes(Lanes<T> x) {
   return select(rounded > x, rounded - splat(T(1)), rounded);
 }
 
-#if defined(__SSE2__)
-// Swaps rows and columns of four values, in each group of four lanes.
-NMR_INLINE void transpose_quads(__m128 (&q)[4]) { _MM_TRANSPOSE4_PS(q[0], q[1], q[2], q[3]); }
 #if defined(__AVX2__) || NMR_AVX2
+// Swaps rows and columns of four values, in each group of four lanes.
 NMR_INLINE void transpose_quads(__m256 (&q)[4]) {
   const __m256 a = _mm256_unpacklo_ps(q[0], q[1]), b = _mm256_unpackhi_ps(q[0], q[1]);
   const __m256 c = _mm256_unpacklo_ps(q[2], q[3]), d = _mm256_unpackhi_ps(q[2], q[3]);
@@ -346,35 +344,22 @@ NMR_INLINE void transpose_quads(__m256d (&q)[4]) {
   q[2] = _mm256_permute2f128_pd(a, c, 0x31), q[3] = _mm256_permute2f128_pd(b, d, 0x31);
 }
 #endif
-#endif
 
 // Four numbers of four or eight bytes per lane: column[c] gets row[k][c] in lane k.
 template <class T>
 NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4]) {
-#if defined(__SSE2__)
+#if defined(__AVX2__) || NMR_AVX2
   if constexpr (sizeof(T) == 4) {
     const auto quad = [&](int64_t k) {
       return _mm_loadu_ps(reinterpret_cast<const float*>(row[k]));
     };
-#if defined(__AVX2__) || NMR_AVX2
     __m256 q[4];
     for (int k = 0; k < 4; ++k)
       q[k] = _mm256_insertf128_ps(_mm256_castps128_ps256(quad(k)), quad(k + 4), 1);
     transpose_quads(q);
     for (int c = 0; c < 4; ++c) column[c] = (Lanes<T>)q[c];
-#else
-    __m128 low[4], high[4];
-    for (int k = 0; k < 4; ++k) low[k] = quad(k), high[k] = quad(k + 4);
-    transpose_quads(low);
-    transpose_quads(high);
-    for (int c = 0; c < 4; ++c) {
-      const __m128 halves[2] = {low[c], high[c]};
-      std::memcpy(&column[c], halves, sizeof halves);
-    }
-#endif
     return;
   }
-#if defined(__AVX2__) || NMR_AVX2
   if constexpr (sizeof(T) == 8) {
     __m256d low[4], high[4];
     for (int k = 0; k < 4; ++k)
@@ -388,7 +373,6 @@ NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4])
     return;
   }
 #endif
-#endif
   T value[4][kLanes];
   for (int64_t k = 0; k < kLanes; ++k)
     for (int c = 0; c < 4; ++c) value[c][k] = row[k][c];
@@ -398,9 +382,8 @@ NMR_INLINE void load_quads(const T* const (&row)[kLanes], Lanes<T> (&column)[4])
 // The other way round: row k of rows, [8, 4], gets lane k of the columns.
 template <class T>
 NMR_INLINE void store_quads(const Lanes<T> (&column)[4], T (&rows)[kLanes][4]) {
-#if defined(__SSE2__)
-  if constexpr (std::is_same_v<T, float>) {
 #if defined(__AVX2__) || NMR_AVX2
+  if constexpr (std::is_same_v<T, float>) {
     __m256 q[4];
     for (int c = 0; c < 4; ++c) q[c] = (__m256)column[c];
     transpose_quads(q);
@@ -408,20 +391,8 @@ NMR_INLINE void store_quads(const Lanes<T> (&column)[4], T (&rows)[kLanes][4]) {
       _mm_storeu_ps(rows[k], _mm256_castps256_ps128(q[k]));
       _mm_storeu_ps(rows[k + 4], _mm256_extractf128_ps(q[k], 1));
     }
-#else
-    __m128 low[4], high[4];
-    for (int c = 0; c < 4; ++c) {
-      __m128 halves[2];
-      std::memcpy(halves, &column[c], sizeof halves);
-      low[c] = halves[0], high[c] = halves[1];
-    }
-    transpose_quads(low);
-    transpose_quads(high);
-    for (int k = 0; k < 4; ++k) _mm_storeu_ps(rows[k], low[k]), _mm_storeu_ps(rows[k + 4], high[k]);
-#endif
     return;
   }
-#if defined(__AVX2__) || NMR_AVX2
   if constexpr (std::is_same_v<T, double>) {
     __m256d low[4], high[4];
     for (int c = 0; c < 4; ++c) {
@@ -435,7 +406,6 @@ NMR_INLINE void store_quads(const Lanes<T> (&column)[4], T (&rows)[kLanes][4]) {
       _mm256_storeu_pd(rows[k], low[k]), _mm256_storeu_pd(rows[k + 4], high[k]);
     return;
   }
-#endif
 #endif
   T value[4][kLanes];
   for (int c = 0; c < 4; ++c) store_lanes(value[c], column[c]);
@@ -475,19 +445,12 @@ struct LaneArray {
 // + 7)).
 template <class T>
 NMR_INLINE void add_lane_sums(Lanes<T> p, Lanes<T> q, T* sums) {
-#if defined(__SSE2__)
+#if defined(__AVX2__) || NMR_AVX2
   if constexpr (std::is_same_v<T, float>) {
-    __m128 low[2], high[2];
-    if constexpr (IsHalves<Lanes<T>>::value) {
-      low[0] = p.low, high[0] = p.high, low[1] = q.low, high[1] = q.high;
-    } else {
-      __m128 half[2];
-      std::memcpy(half, &p, sizeof half);
-      low[0] = half[0], high[0] = half[1];
-      std::memcpy(half, &q, sizeof half);
-      low[1] = half[0], high[1] = half[1];
-    }
-    const __m128 p4 = low[0] + high[0], q4 = low[1] + high[1];
+    __m128 a[2], b[2];
+    std::memcpy(a, &p, sizeof a);
+    std::memcpy(b, &q, sizeof b);
+    const __m128 p4 = a[0] + a[1], q4 = b[0] + b[1];
     const __m128 pairs = _mm_unpacklo_ps(p4, q4) + _mm_unpackhi_ps(p4, q4);  // p02 q02 p13 q13
     const __m128 sum = pairs + _mm_movehl_ps(pairs, pairs);
     __m128 total = _mm_castsi128_ps(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(sums)));
