@@ -2,6 +2,7 @@
 
 python docs/make_pictures.py views.png     # draw this one (without names: list them, and say which are out of date)
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
+REPORT=report.html python docs/make_pictures.py report.png           # of tools/quickstart.sh, vanilla in batches of 32
 OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of `learn3d experiment plus`
 OUTPUT=long python docs/make_pictures.py results-long.png         # from those of `learn3d experiment kato`, 5,000 steps
 OUTPUT=CARS_OUTPUT python docs/make_pictures.py results-cars.png  # the same for generated cars
@@ -120,6 +121,14 @@ PICTURES = {
         (
             "docs/draw_page.py",
             *(f"learn3d/studio/demo/page/{name}" for name in ("index.html", "page.css")),
+        ),
+    ),
+    "report.png": Picture(
+        'python docs/draw_report.py "$REPORT" --output {folder}',
+        "{folder}/report.png",
+        (
+            "docs/draw_report.py",
+            *(f"learn3d/studio/tables/{name}" for name in ("report.html", "report.css")),
         ),
     ),
     "quickstart.png": Picture(
