@@ -25,7 +25,7 @@ RUNS = {  # for each: its preset, options, and the bound of relative differences
     "proposed": ("peng2020-kato", TINY, 1e-5),
     "long": (
         "peng2020-kato",
-        TINY | {"iterations": 200, "validate_every": 100, "checkpoint_every": 100},
+        TINY | {"iterations": 100, "validate_every": 50, "checkpoint_every": 50},
         1e-5,
     ),
     "plus": ("plus-kato", TINY | {"symmetry": "x", "bank_size": 16, "lambda_view": 0.1}, 1e-5),
@@ -99,7 +99,7 @@ def test_every_method_has_a_run_or_is_refused(monkeypatch) -> None:
 def test_two_ranks_learn_what_one_process_learns(folders, read_metrics, name) -> None:
     bound = RUNS[name][2]
     one, two = (losses(read_metrics(folder / name)) for folder in folders)
-    assert list(one) == list(two) == list(range(1, (200 if name == "long" else 4) + 1))
+    assert list(one) == list(two) == list(range(1, (100 if name == "long" else 4) + 1))
     for step, values in one.items():
         assert two[step] == pytest.approx(values, rel=bound, abs=bound), step
     saved = [checkpoint.load(folder / name / "last.safetensors")[0] for folder in folders]
@@ -133,7 +133,7 @@ def test_killed_ranks_leave_a_run_that_goes_on_to_the_same_bits(tiny_config, tmp
     ended = run([task(config, tmp_path / "whole")], tmp_path / "tasks.json", 2)
     assert ended.returncode == 0, ended.stderr
     resume = False
-    for kill in ([1, 1], [0, 3], [1, 4], [0, 5], [1, 8]):
+    for kill in ([1, 1], [0, 4], [1, 8]):
         tasks = [task(config, tmp_path / "killed", kill=kill, resume=resume)]
         ended = run(tasks, tmp_path / "tasks.json", 2)
         assert ended.returncode == 1
