@@ -90,7 +90,7 @@ def main(
     sheet: Path | None = None,
     options: CutOptions = DEFAULTS.cut,
 ) -> None:
-    """Print the share of outlines with an IoU above 0.85, found without a hand and with a box.
+    """Print the share of outlines with an IoU above 0.85, found without a hand and with a box, and of doubts.
 
     The objects are generated, before drawn rooms and photographs out of scikit-image and
     scikit-learn.
@@ -100,22 +100,22 @@ def main(
     kinds, values, shown = [], [], []
     for number, scene in enumerate(scenes(images, seed)):
         box = scene.box(np.random.default_rng([seed, number, 1]))
-        found = [
-            keep_object(find_outline(scene.colors, each, options).mask)[0] for each in (None, box)
-        ]
-        values.append([iou(mask, scene.mask) for mask in found])
+        for each in (None, box):
+            outline = find_outline(scene.colors, each, options)
+            mask = keep_object(outline.mask)[0]
+            right, doubted = iou(mask, scene.mask) > GOOD, outline.doubt is not None
+            values.append((right, not right and not doubted, right and doubted))
+            shown.append(_draw(scene.colors, mask))
         kinds.append(scene.kind)
-        shown += [_draw(scene.colors, mask) for mask in found]
-    good, kinds = np.array(values) > GOOD, np.array(kinds)
-    print(f"{'':12}{'pictures':>12}{'no hand':>12}{'box':>12}")
-    for name, rows in [
-        *((kind, kinds == kind) for kind in ("room", "photograph")),
-        ("all", kinds != ""),
-    ]:
-        print(
-            f"{name:12}{rows.sum():12}"
-            + "".join(f"{share:12.0%}" for share in good[rows].mean(axis=0))
-        )
+    shares, kinds = np.reshape(values, (-1, 6)), np.array(kinds)
+    print(f"{'':24}{'no hand':>27}{'box':>27}")
+    titles = ("right", "silent", "asked") * 2
+    print(f"{'':12}{'pictures':>12}" + "".join(f"{title:>9}" for title in titles))
+    for name in ("room", "photograph", "all"):
+        rows = (kinds == name) | (name == "all")
+        means = shares[rows].mean(axis=0)
+        print(f"{name:12}{rows.sum():12}" + "".join(f"{share:9.0%}" for share in means))
+    print("silent: wrong without a doubt; asked: right, with a doubt")
     if sheet is not None:
         save_png(
             sheet,

@@ -17,7 +17,7 @@ from learn3d.studio.make_data.looks import natural_look
 from learn3d.studio.make_data.meshes import check, fit_to_box, mesh_sources
 from learn3d.studio.picture_to_mesh.fit import fit, frame_target, predict
 from learn3d.studio.picture_to_mesh.make import load_model, match_templates
-from learn3d.studio.picture_to_mesh.options import DEFAULTS, Options
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, FitOptions, MatchOptions, Options
 
 COLUMNS = "outline: predicted,fitted,template,voxels: predicted,fitted,template,azimuth,kind,warned".split(
     ","
@@ -29,7 +29,8 @@ def main(
     category: str,
     run: Path | None = None,
     images: int = 48,
-    options: Options = DEFAULTS,
+    fit_options: FitOptions = DEFAULTS.fit,
+    match_options: MatchOptions = DEFAULTS.match,
 ) -> None:
     """Print a line for each category: means over `images` pictures of the meshes in the folder models/CATEGORY.
 
@@ -37,9 +38,9 @@ def main(
     and random ones of Kato's 24 cameras. Columns: IoU of mask and silhouette of the predicted
     shape, the fitted one and the template, their voxel IoUs (kato18), the share of pictures whose
     azimuth is right within 20 degrees, whose template has the right category, and with a warning.
-    The model (default: the package's) must have templates. options: of the fit and the templates.
+    The model (default: the package's) must have templates.
     """
-    model = load_model(run)
+    model, options = load_model(run), Options(fit=fit_options, match=match_options)
     print(f"{'':12}", *(f"{column:>20}" for column in COLUMNS))
     for name in category.split(","):
         sources, rows = list(mesh_sources(models / name).values()), []

@@ -1,6 +1,6 @@
-"""Measures the likeness of meshes to cut-out pictures, each of which is the only one of its object.
+"""Measures the likeness of meshes to pictures, each of which is the only one of its object.
 
-python tools/measure_likeness.py --pictures cutouts --sheet likeness.png
+python tools/measure_likeness.py --pictures strangers/report --sheet likeness.png
 """
 
 import itertools
@@ -8,17 +8,27 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 import tyro
 
-from learn3d.data.framing import read_photo
-from learn3d.data.masks import keep_object
-from learn3d.pictures import draw_around, save_png, tile
+from learn3d.pictures import Surface, draw_around, draw_surface, save_png, tile
 from learn3d.studio.picture_to_mesh.fit import frame_target
 from learn3d.studio.picture_to_mesh.make import load_model, reconstruct_picture
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, Options
+from learn3d.studio.picture_to_mesh.read import Photo, read_picture
+from learn3d.studio.picture_to_mesh.write import Reconstruction
 
-SIDE = 192  # side of each picture of a sheet, in pixels
-TURNS_DEG = (0.0, 40.0, 130.0, 220.0)  # from the picture's side, from which a sheet shows a mesh
+SIDE = 128  # side of each picture of a sheet, in pixels
+PAIRS = 6  # pictures in a row of the sheet
+
+
+def draw(photo: Photo, made: Reconstruction, blind: bool) -> list[np.ndarray]:
+    """The framed picture (unless blind), the mesh from the picture's camera, and from 60 degrees beside it."""
+    pixels = frame_target(photo.colors, photo.mask).pixels[:3].movedim(0, -1)
+    placed = Surface(made.view.place(made.surface.vertices[None])[0], *made.surface[1:])
+    (own,) = draw_surface(placed, [made.view.cameras()], image_size=SIDE)
+    (beside,) = draw_around(made.surface, [made.azimuth_deg - 60], image_size=SIDE)
+    return [*([] if blind else [(255 * pixels).round().byte().numpy()]), own, beside]
 
 
 def main(
@@ -26,37 +36,43 @@ def main(
     run: Path | None = None,
     sheet: Path | None = None,
     blind: bool = False,
+    smooth: bool = False,
     options: Options = DEFAULTS,
 ) -> None:
-    """Print outline IoU, processor seconds and kind for each PNG file with transparency, and the means.
+    """Print outline IoU, processor seconds, kind and doubts for each PNG file, and the means.
 
-    A mesh is doubted if its picture resembles no kind that the model knows. sheet: PNG file with each picture beside
-    its mesh, for the eye; blind: without the picture, so that somebody says what a mesh shows
-    before seeing what it should show.
+    The kinds of files named like those of draw_strangers.py are counted. sheet: PNG file with each
+    picture beside its mesh, for the eye; blind: without the picture, so that somebody says what a
+    mesh shows before seeing what it should show. smooth: inflate the outlines instead.
     """
-    model, rows, values = load_model(run), [], []
-    for path in sorted(pictures.glob("*.png")):
-        colors, mask = read_photo(path)
-        mask = keep_object(mask)[0]
+    torch.set_num_threads(1)
+    model, shown, values, right = load_model(run), [], [], []
+    for path in sorted(pictures.rglob("*.png")):
         start = time.process_time()
-        made = reconstruct_picture(model, colors, mask, options=options)
-        values.append((made.silhouette_iou, time.process_time() - start, made.warning is not None))
-        doubt = " (doubted)" * (made.warning is not None)
-        print(
-            f"{path.stem:40} {values[-1][0]:6.3f} {values[-1][1]:6.2f} {made.kind}{doubt}",
-            flush=True,
-        )
-        pixels = frame_target(colors, mask).pixels[:3].movedim(0, -1)
-        framed = (255 * pixels).round().byte().numpy()
-        turned = [made.azimuth_deg - turn for turn in TURNS_DEG]
-        drawn = draw_around(made.surface, turned, image_size=SIDE)
-        rows.append([*([] if blind else [framed]), *drawn])
-    iou, seconds, doubted = np.mean(values, axis=0)
-    print(f"{len(values)} pictures: outline {iou:.3f}, {seconds:.2f} s, doubted {doubted:.2f}")
+        try:
+            photo = read_picture(path, options=options.cut)
+        except ValueError as error:
+            print(error)
+            continue
+        made = reconstruct_picture(model, photo.colors, photo.mask, smooth=smooth, options=options)
+        values.append((made.silhouette_iou, time.process_time() - start))
+        doubts = ", ".join(filter(None, (photo.doubt, made.warning and "other thing")))
+        wanted = path.stem.split("-")[1:2]
+        right.append((wanted == ["other"], wanted == [made.kind], bool(doubts)))
+        iou, seconds = values[-1]
+        print(f"{path.stem[:46]:46} {iou:6.3f} {seconds:6.2f} {made.kind} {doubts}", flush=True)
+        shown.append(draw(photo, made, blind))
+    print(f"{len(values)} pictures: outline {np.mean([iou for iou, _ in values]):.3f}", end=", ")
+    print(f"{np.mean([seconds for _, seconds in values]):.2f} s")
+    other, same, doubted = np.array(right).T
+    known = (
+        f"{np.sum(~other)} of known kinds: {np.sum(same)} right, {np.sum(~other & doubted)} doubted"
+    )
+    print(f"{known}, {np.sum(~other & ~same & ~doubted)} wrong without a word")
+    print(f"{np.sum(other)} other things: {np.sum(other & doubted)} doubted")
     if sheet:
-        half = (len(rows) + 1) // 2  # two pictures in each row of the sheet
-        pairs = [list(itertools.chain(*rows[k::half])) for k in range(half)]
-        save_png(sheet, tile(pairs, tile_size=SIDE))
+        rows = [list(itertools.chain(*shown[k : k + PAIRS])) for k in range(0, len(shown), PAIRS)]
+        save_png(sheet, tile(rows, tile_size=SIDE))
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
 # 2,000 generated objects of each, and from the models of Debian's furniture packages that are in the public domain or under
 # CC BY, 12 stretched forms of each; 12 random views per form. Its encoder scales every object to one size, because nobody
 # knows how far away the camera of a picture was. The first 1,000 generated objects of each category become templates. A stopped
-# run continues. Environment: STEPS, OBJECTS, OUT, BIN, OTHERS (cut-out PNG files of things to warn of, see docs/demo.md).
-# Usage: bash tools/small_model.sh. It takes an hour and a half on two cores.
+# run continues. Icons teach it at last which kind a drawing shows (learn_kinds.py, which needs npm and resvg_py).
+# Environment: STEPS, OBJECTS, OUT, BIN.
+# Usage: bash tools/small_model.sh. It takes two hours on two cores.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=${BIN:-.venv/bin}
@@ -30,4 +31,5 @@ again=$([ -e "$out/run" ] && echo --resume || true)
 "$bin/learn3d" train --data "$out/data" --category "$categories" --preset many-views-around \
     --iterations "${STEPS:-36000}" --validate-every 5000 --max-val-images 720 --output "$out/run" $again
 "$bin/learn3d" evaluate "$out/run" --data "$out/data" --json "$out/evaluation.json"
-"$bin/learn3d" export --run "$out/run" --output learn3d/studio/picture_to_mesh/small.safetensors ${OTHERS:+--others "$OTHERS"}
+"$bin/learn3d" export --run "$out/run" --output learn3d/studio/picture_to_mesh/small.safetensors
+"$bin/python" tools/learn_kinds.py

@@ -43,7 +43,7 @@ def find_outline(
         mask, how, doubt = _cut_out(colors, box, options)
         return Outline(mask, f"{how} in the box", doubt or _box_doubt(mask, box, options))
     inner = peel_frame(colors, options)
-    part, doubt = colors[inner], None
+    part, doubt, most = colors[inner], None, 1
     if is_plain(part, options):
         whole = threshold_mask(part, options)
         found = _without_frame(part, whole, options)
@@ -52,9 +52,10 @@ def find_outline(
             how = f"{how} but for an upright rectangle, probably a picture on the wall"
     else:
         found, how, doubt = _cut_out(part, None, options)
+        most = 0  # only with a plain background do people crop a picture at the object
     mask = np.zeros(colors.shape[:2], np.uint8)
     mask[inner] = found
-    return Outline(mask, how, find_doubt(keep_object(mask)[0], options) or doubt)
+    return Outline(mask, how, find_doubt(keep_object(mask)[0], most, options) or doubt)
 
 
 def peel_frame(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> tuple[slice, slice]:
@@ -93,7 +94,7 @@ def _cut_out(
             failed = f", as rembg fails ({error})"
     mask, sureness = cut_out(colors, box, options)
     doubt = "the network is not sure of its outline" if sureness < options.sure else None
-    return mask, f"by a network and GrabCut{failed}", doubt if box is None else None
+    return mask, f"by a network and GrabCut{failed}", doubt
 
 
 def _disagreement(
@@ -120,8 +121,11 @@ def _corners(box: Box) -> Box:
     return x, y, x + width, y + height
 
 
-def find_doubt(mask: np.ndarray, options: CutOptions = DEFAULTS.cut) -> str | None:
-    """A reason why a mask uint8 [H, W] is probably no object, None if there is none."""
+def find_doubt(mask: np.ndarray, most: int = 1, options: CutOptions = DEFAULTS.cut) -> str | None:
+    """A reason why a mask uint8 [H, W] is probably no object, None if there is none.
+
+    most: sides of the picture that an object may touch.
+    """
     height, width = mask.shape
     scale = min(1.0, options.side / max(height, width))
     size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -130,8 +134,8 @@ def find_doubt(mask: np.ndarray, options: CutOptions = DEFAULTS.cut) -> str | No
         line.mean() > options.touched
         for line in (inside[0], inside[-1], inside[:, 0], inside[:, -1])
     )
-    if sides > 1:
-        return f"its outline touches {sides} sides of the picture"
+    if sides > most:
+        return "its outline touches the border of the picture"
     length = np.count_nonzero(inside & ~ndimage.binary_erosion(inside))
     return (
         "its outline is ragged" if length**2 > options.ragged * np.count_nonzero(inside) else None
@@ -224,8 +228,9 @@ def cut_out(
 
     colors: uint8 [H, W, 3]. Pixels outside the box are background. A network finds the object
     (`find_object`), and GrabCut decides where it is not certain. The sureness, in 0 .. 1, is the
-    soft IoU of the mask and the network's probabilities. Raises ValueError without OpenCV, or if
-    the box exceeds or fills the picture.
+    soft IoU of the mask and the network's probabilities; without a box it is smaller if the mask
+    may be a part of a larger thing. Raises ValueError without OpenCV, or if the box exceeds or
+    fills the picture.
     """
     height, width = colors.shape[:2]
     if box is not None:
@@ -241,12 +246,22 @@ def cut_out(
     unsure = np.abs(chance - 0.5) < options.certain - 0.5
     inside = _only_object(_grab_cut(np.asarray(part), chance > 0.5, unsure, options), options)
     sureness = np.minimum(chance, inside).sum() / np.maximum(chance, inside).sum()
+    if box is None and inside.any():
+        sureness /= _growth(inside, inside | (chance > options.possible))
     larger = Image.fromarray(255 * inside.astype(np.uint8)).resize(
         (right - left, bottom - top), Image.Resampling.BILINEAR
     )
     mask = np.zeros((height, width), np.uint8)
     mask[top:bottom, left:right] = 255 * (np.asarray(larger) > 127)
     return mask if box is None else _within(mask, box), float(sureness)
+
+
+def _growth(inside: np.ndarray, possible: np.ndarray) -> float:
+    """How many times as wide or high as a mask, bool [H, W], the possible pixels are that touch it."""
+    regions, _ = ndimage.label(possible)
+    larger = np.isin(regions, np.unique(regions[inside]))
+    sides = [[1 + np.ptp(np.flatnonzero(each.any(k))) for k in (0, 1)] for each in (larger, inside)]
+    return float(np.divide(*sides).max())
 
 
 def _parts(inside: np.ndarray, options: CutOptions) -> list[np.ndarray]:

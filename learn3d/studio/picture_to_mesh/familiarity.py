@@ -16,8 +16,6 @@ from learn3d.networks.encoders import CODE_SIZE
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
 FAR = 0.82  # distance above which a picture is unknown if no other objects were learnt
-OTHER = 2.0  # logit of the network above which a picture is unknown
-NEAR = 0.55  # distance to a category below which a picture is of it, whatever the network says
 # names of the tensors of `KnownCodes` in a checkpoint
 KNOWN_CODES = (
     "known_codes",
@@ -28,17 +26,18 @@ _NEAREST = 3  # centres whose mean distance is compared
 _HIDDEN = 64  # width of a classifier
 _MEMBERS = 2  # classifiers, whose logits are averaged
 _DROPOUT = 0.3
-_STEPS = 300
+_STEPS = 120
 _SCALE = 10.0  # length of the codes that they see
 
 
 class KnownCodes(NamedTuple):
-    """Cluster centres (k-means) of normalised codes, and a network that knows codes of other objects."""
+    """Cluster centres (k-means) of normalised codes, and a network that knows kinds and other things."""
 
     kinds: Tensor  # float [N, K, C]: centres of the training images of N categories
     # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
     hidden: Tensor | None = None
-    output: Tensor | None = None  # float [H + 1]: weights of its logit, the bias last
+    # float [N + 1, H + 1]: weights of the categories' logits and of that of other things, the bias last
+    output: Tensor | None = None
 
     def fits(self, categories: int) -> bool:
         """Whether the shapes are those of so many categories."""
@@ -46,30 +45,25 @@ class KnownCodes(NamedTuple):
             return False
         if self.hidden is None or self.output is None:
             return self.kinds.numel() > 0 and self.hidden is self.output is None
-        units = self.output.numel() - 1
-        shapes = [(units, CODE_SIZE + 1), (units + 1,)]
+        units = self.hidden.numel() // (CODE_SIZE + 1)
+        shapes = [(units, CODE_SIZE + 1), (categories + 1, units + 1)]
         return self.kinds.numel() > 0 and [self.hidden.shape, self.output.shape] == shapes
 
-    def nearest_kind(self, code: Tensor) -> int:
-        """The category whose codes are nearest to a code [C]."""
-        return int(self._distances(code).argmin())
+    def probabilities(self, code: Tensor) -> Tensor:
+        """How probably a code [C] is of each category, and of another thing, [N + 1].
 
-    def distance(self, code: Tensor, kind: int | None = None) -> float:
-        """The distance of a code [C] to the nearest category, or to the category `kind`."""
-        distances = self._distances(code)
-        return float(distances.min() if kind is None else distances[kind])
-
-    def is_strange(self, code: Tensor) -> bool:
-        """Whether a code [C] is of no category: by its distance to the centres, and by the network if it was learnt."""
+        Without a network the nearest category has the probability 1, or another thing if all are
+        far away.
+        """
         if self.hidden is None:
-            return float(_distance(code, self.kinds.flatten(0, 1))) > FAR
-        if self.distance(code) < NEAR:
-            return False
+            far = float(_distance(code, self.kinds.flatten(0, 1))) > FAR
+            kind = len(self.kinds) if far else int(self.distances(code).argmin())
+            return F.one_hot(torch.tensor(kind), len(self.kinds) + 1).float()
         hidden, output = self.hidden.float(), self.output.float()
         units = F.relu(hidden[:, :-1] @ (_SCALE * F.normalize(code, dim=0)) + hidden[:, -1])
-        return float(output[:-1] @ units + output[-1]) > OTHER
+        return F.softmax(output[:, :-1] @ units + output[:, -1], dim=0)
 
-    def _distances(self, code: Tensor) -> Tensor:
+    def distances(self, code: Tensor) -> Tensor:
         """The distance of a code [C] to each category, [N]."""
         return torch.stack([_distance(code, centres) for centres in self.kinds])
 
@@ -99,35 +93,34 @@ def known_codes(
     )
     if others is None:
         return KnownCodes(kinds)
-    return KnownCodes(kinds, *learn_others(codes, _directions(method, others.split(128))))
+    unknown = torch.full((len(others),), dataset.num_classes)
+    codes = torch.cat([codes, _directions(method, others.split(128))])
+    return KnownCodes(kinds, *learn_kinds(codes, torch.cat([classes, unknown])))
 
 
-def learn_others(known: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
-    """`KnownCodes.hidden` and `.output` that tell normalised codes of training images [N, C] from others [M, C].
+def learn_kinds(codes: Tensor, kinds: Tensor) -> tuple[Tensor, Tensor]:
+    """`KnownCodes.hidden` and `.output` from normalised codes [M, C] and their kinds int64 [M], other things last.
 
-    They are small networks with dropout, trained on all codes at once; both classes have the same
+    They are small networks with dropout, trained on all codes at once; all kinds have the same
     total weight.
     """
-    codes = _SCALE * torch.cat([known, others])
-    wanted = torch.cat([torch.zeros(len(known)), torch.ones(len(others))])
-    share = torch.where(wanted > 0, 0.5 / len(others), 0.5 / len(known))
-    hidden, output, bias = [], [], []
+    count = int(kinds.max()) + 1
+    share = 1 / kinds.bincount().clamp(min=1)
+    hidden, output = [], []
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         for _ in range(_MEMBERS):
-            first, last = nn.Linear(codes.shape[1], _HIDDEN), nn.Linear(_HIDDEN, 1)
+            first, last = nn.Linear(codes.shape[1], _HIDDEN), nn.Linear(_HIDDEN, count)
             network = nn.Sequential(first, nn.ReLU(), nn.Dropout(_DROPOUT), last)
             optimizer = torch.optim.AdamW(network.parameters(), 1e-2, weight_decay=0.1)
             for _ in range(_STEPS):
                 optimizer.zero_grad()
-                F.binary_cross_entropy_with_logits(
-                    network(codes)[:, 0], wanted, share, reduction="sum"
-                ).backward()
+                F.cross_entropy(network(_SCALE * codes), kinds, share).backward()
                 optimizer.step()
             hidden.append(torch.cat([first.weight, first.bias[:, None]], 1).detach())
-            output.append(last.weight[0].detach() / _MEMBERS)
-            bias.append(last.bias.detach() / _MEMBERS)
-    return torch.cat(hidden), torch.cat([*output, torch.stack(bias).sum(0)])
+            output.append(torch.cat([last.weight, last.bias[:, None]], 1).detach() / _MEMBERS)
+    weights = torch.cat([part[:, :-1] for part in output], 1)
+    return torch.cat(hidden), torch.cat([weights, sum(part[:, -1:] for part in output)], 1)
 
 
 @torch.no_grad()

@@ -294,7 +294,7 @@ def fit(
             loss(view, method.generator(code)) + options.pull * (code - start).square().sum() / size
         )
 
-    rate = 0.07 * float(start.square().mean().sqrt())
+    rate = options.code_rate * float(start.square().mean().sqrt())
     view = minimize(code_loss, predicted.shape.view, options.code_steps, (0.01, rate), code)
     report("surface", 0.7)
     decoded = method.generator(code)
@@ -310,6 +310,6 @@ def fit(
             vertices - decoded, method.edges
         )
 
-    view = minimize(vertex_loss, view, options.vertex_steps, (0.003, 0.004), move)
+    view = minimize(vertex_loss, view, options.vertex_steps, (0.003, options.vertex_rate), move)
     vertices = moved()
     return Fit(vertices[0], method.faces, view, float(view.ious(vertices, method.faces, outline)))

@@ -12,40 +12,38 @@ from torch import Tensor
 
 from learn3d.pictures import Surface, grid_surface
 from learn3d.studio.picture_to_mesh.fit import LENS_HALF_FOV_DEG, Target, View
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, SmoothOptions
 from learn3d.studio.picture_to_mesh.smoothing import smooth
 
-GRID = 72  # cells along each side of the cube in which the surface lies
-DEPTH = 0.8  # thickness of the shape of a disc, over the disc's diameter
-_EDGE = 2  # pixels inside the outline that may have the background's colours
-_ROUNDS = 4  # of smoothing
-_THIN = 3  # pixels from the middle of a part to its sides, up to which it is thin
 _HALF = 2  # pixels of half a cell
 
 
 @torch.no_grad()
-def inflate(target: Target) -> tuple[Surface, View]:
+def inflate(target: Target, options: SmoothOptions = DEFAULTS.smooth) -> tuple[Surface, View]:
     """A shape with the outline of a picture, mirror-symmetric about the picture's plane, and its view.
 
     With u = 0 on the outline and
-    Laplace(u) = -4 within, the surface is where z^2 = DEPTH^2 u, so that a disc becomes an
+    Laplace(u) = -4 within, the surface is where z^2 = depth^2 u, so that a disc becomes an
     ellipsoid. Both sides show the picture.
     """
     mask = target.pixels[3].numpy() > 0.5
-    wide = ndimage.binary_erosion(mask, iterations=_THIN)
-    thin = mask & ~ndimage.binary_dilation(wide, iterations=_THIN + 1)
+    wide = ndimage.binary_erosion(mask, iterations=options.thin)
+    thin = mask & ~ndimage.binary_dilation(wide, iterations=options.thin + 1)
     # a thin part gets every cell that it touches, another part the cells that it half fills
     drawn = thin | ndimage.binary_erosion(mask, iterations=_HALF)
-    inside = F.adaptive_max_pool2d(torch.from_numpy(drawn)[None].float(), GRID)[0].numpy() > 0
-    square = DEPTH**2 * _solve(inside) - 4 * ndimage.distance_transform_edt(~inside)
-    z = np.arange(GRID) - (GRID - 1) / 2
+    inside = (
+        F.adaptive_max_pool2d(torch.from_numpy(drawn)[None].float(), options.grid)[0].numpy() > 0
+    )
+    square = options.depth**2 * _solve(inside) - 4 * ndimage.distance_transform_edt(~inside)
+    z = np.arange(options.grid) - (options.grid - 1) / 2
     field = square[::-1].T[:, :, None] - z**2
     surface = grid_surface(torch.from_numpy(0.5 + 0.5 * field / (np.abs(field) + 2)))
-    vertices, faces = smooth(surface.vertices, surface.faces, rounds=_ROUNDS), surface.faces
+    vertices, faces = smooth(surface.vertices, surface.faces, rounds=options.rounds), surface.faces
     zero = torch.zeros(1)  # the grid is the picture, whatever thin parts smoothing has removed
     distance = zero + 0.5 / math.tan(math.radians(LENS_HALF_FOV_DEG))
     view = View(zero, zero, distance.log(), torch.zeros(1, 2), zero)
     x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
-    image = _spread(target)
+    image = _spread(target, options.edge)
     size = image.shape[0]
     column, row = ((value * size).long().clamp(0, size - 1) for value in ((1 + x) / 2, (1 - y) / 2))
     return Surface(vertices, faces, image[row, column]), view
@@ -71,10 +69,10 @@ def _solve(inside: np.ndarray) -> np.ndarray:
     return solved[1:-1, 1:-1]
 
 
-def _spread(target: Target) -> Tensor:
+def _spread(target: Target, edge: int) -> Tensor:
     """The colours of a picture, float32 [S, S, 3]; outside of the object those of its nearest pixel."""
     inside = target.pixels[3].numpy() > 0.5
-    inner = ndimage.binary_erosion(inside, iterations=_EDGE)
+    inner = ndimage.binary_erosion(inside, iterations=edge)
     source = inner if inner.any() else inside
     y, x = ndimage.distance_transform_edt(~source, return_distances=False, return_indices=True)
     return target.pixels[:3, y, x].movedim(0, -1)

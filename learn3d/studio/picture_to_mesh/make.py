@@ -34,7 +34,7 @@ from learn3d.studio.picture_to_mesh.fit import (
     predict,
 )
 from learn3d.studio.picture_to_mesh.inflation import inflate
-from learn3d.studio.picture_to_mesh.options import DEFAULTS, Options
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, MatchOptions, Options
 from learn3d.studio.picture_to_mesh.read import fill_drawing, prepare_image
 from learn3d.studio.picture_to_mesh.refinement import refine
 from learn3d.studio.picture_to_mesh.smoothing import outer_surface
@@ -142,12 +142,12 @@ def reconstruct_guesses(
         raise ValueError(f"guesses must be at least 1, got {guesses}")
     if category is not None:
         check_category(model, category)
-    colors, mask = fill_drawing(colors, mask)
+    colors, mask = fill_drawing(colors, mask, options.cut)
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image, target = torch.from_numpy(stored), frame_target(colors, mask)
     outline = target.outline()
     if smooth:
-        surface, view = inflate(target)
+        surface, view = inflate(target, options.smooth)
         iou = float(view.ious(surface.vertices[None], surface.faces, outline))
         yield Reconstruction(surface, stored, 0.0, iou, view=view)
         return
@@ -159,7 +159,9 @@ def reconstruct_guesses(
         return
     progress("camera", 0.0)
     predicted = predict(method, image, outline, options=options.fit)
-    kind, warning = (category, None) if category else recognize(model, predicted.code[0])
+    kind, warning = (
+        (category, None) if category else recognize(model, predicted.code[0], options.match)
+    )
     if model.templates is None:
         fitted = fit(method, predicted, outline, progress, options.fit)
         mesh = outer_surface(fitted.vertices, fitted.faces)
@@ -175,6 +177,8 @@ def reconstruct_guesses(
         progress("colours", 0.9)
         mesh, view = (fitted.vertices, fitted.faces), fitted.view
         surface = color_mesh(mesh, view, target, MIRROR, fine=True, options=options.color)
+        if surface.colors.mean(1).quantile(options.cut.black) < options.color.ink:
+            surface = surface._replace(colors=(surface.colors + 1) / 2)
         azimuth_deg = float(view.azimuth_deg)
         yield Reconstruction(surface, stored, azimuth_deg, fitted.iou, kind, warning, view)
 
@@ -198,7 +202,7 @@ def match_templates(
     progress("shape", 0.3)
     target = frame_target(*photo)
     outline = target.outline()
-    warnings = {0.0: None if category else recognize(model, predicted.code[0])[1]}  # by the roll
+    warning = None if category else recognize(model, predicted.code[0], options.match)[1]
 
     def find(predicted: Prediction, level: bool = False, few: bool = False) -> Candidates:
         match = options.match
@@ -206,24 +210,36 @@ def match_templates(
             fewer = {"candidates": match.candidates // 3, "kept": match.kept // 2}
             match = dataclasses.replace(match, **fewer)
         known = model.templates, model.categories
-        return find_candidates(*known, predicted, outline, category, level, match)
+        bonus = match.kind * _chances(model, predicted.code[0], category)
+        if category is not None:
+            bonus = bonus.log()  # -inf for all others
+        return find_candidates(*known, predicted, outline, bonus, level, match)
 
     found = find(predicted)
     best = float(found.views.ious(found.shapes, found.faces, outline).max())
-    if warnings[0.0] or best < options.match.poor:
+    if warning or best < options.match.poor:
         progress("camera", 0.5)
         more = [found, find(predicted, level=True, few=True)]
         for roll_deg in _familiar_rolls(model, predicted, photo, category, options):
             turned = torch.from_numpy(model.prepare(*_turn(*photo, roll_deg)))
             rolled = predict(model.method, turned, outline, roll_deg, options.fit)
-            warnings[roll_deg] = None if category else recognize(model, rolled.code[0])[1]
             tried = find(rolled, few=True)
             more.append(tried._replace(prior=tried.prior - options.match.rolled))
         found = join(more)
         found = found._replace(prior=options.match.doubted * found.prior)
     progress("surface", 0.7)
     bent = bend_best(found, target, guesses, options.match)
-    return [(fitted, kind, warnings[float(fitted.view.roll_deg)]) for fitted, kind in bent]
+    return [(fitted, kind, warning) for fitted, kind in bent]
+
+
+def _chances(model: Model, code: Tensor, category: str | None) -> Tensor:
+    """How probably a code [C] is of each category if it is of one, float32 [N]; 1 for a given one."""
+    if category is not None:
+        return torch.tensor([float(name == category) for name in model.categories])
+    if model.known_codes is None:
+        return torch.full((len(model.categories),), 1 / len(model.categories))
+    chances = model.known_codes.probabilities(code)[:-1] + 1e-6
+    return chances / chances.sum()
 
 
 def _familiar_rolls(
@@ -233,15 +249,20 @@ def _familiar_rolls(
     category: str | None,
     options: Options,
 ) -> list[float]:
-    """The angles of the camera about its axis at which a picture is more familiar than upright, the best first."""
-    if model.known_codes is None:
+    """The angles of the camera about its axis at which a picture is more familiar than upright, the best first.
+
+    None if it hardly shows something that flies.
+    """
+    flies = torch.tensor([name in options.match.flying for name in model.categories])
+    chance = _chances(model, predicted.code[0], category)[flies].sum()
+    if model.known_codes is None or chance < options.match.flies:
         return []
     rolls = options.match.rolls_deg
     turned = [model.prepare(*_turn(*photo, roll)) for roll in rolls]
     codes = model.method.encode(torch.from_numpy(np.stack(turned)))
-    kind = None if category is None else model.categories.index(category)
     upright, *others = (
-        model.known_codes.distance(code, kind) for code in (predicted.code[0], *codes)
+        float(model.known_codes.distances(code)[flies].min())
+        for code in (predicted.code[0], *codes)
     )
     order = sorted((distance, roll) for distance, roll in zip(others, rolls, strict=True))
     return [roll for distance, roll in order if distance < upright][: options.match.retries]
@@ -263,7 +284,9 @@ def check_category(model: Model, category: str) -> None:
         )
 
 
-def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
+def recognize(
+    model: Model, code: Tensor, options: MatchOptions = DEFAULTS.match
+) -> tuple[str | None, str | None]:
     """Predicted category of a picture's code [C], and a warning if it is that of an unknown kind of object.
 
     The category is None if the model has only one.
@@ -271,8 +294,9 @@ def recognize(model: Model, code: Tensor) -> tuple[str | None, str | None]:
     if model.known_codes is None:
         return None, None
     kinds = model.categories
-    kind = kinds[model.known_codes.nearest_kind(code)] if len(kinds) > 1 else None
-    if not model.known_codes.is_strange(code):
+    *of_kinds, other = model.known_codes.probabilities(code).tolist()
+    kind = kinds[int(np.argmax(of_kinds))] if len(kinds) > 1 else None
+    if other < options.other:
         return kind, None
     known = ", ".join(kinds)
     return kind, f"this may be none of {known}: tell its kind, or ask for a smooth shape instead"

@@ -47,16 +47,29 @@ class CutOptions:
     part: float = 0.1
     """Their least area, over that of the largest."""
     touched: float = 0.03
-    """Share of a side of the picture, from which the object touches it: a doubt if it touches two."""
+    """Share of a side of the picture, from which the object touches it: a doubt in a photograph, or if
+    it touches two."""
     ragged: float = 600.0
     """Squared length of an outline over its area from which it is doubtful; a thin-legged chair has
     200."""
-    sure: float = 0.6
-    """Least soft IoU of a mask and its probabilities; less is a doubt."""
+    sure: float = 0.8
+    """Least sureness of a mask, see `cut_out`; less is a doubt."""
+    possible: float = 0.15
+    """Least probability of pixels that may belong to the same thing."""
     fills: float = 0.25
     """Least share of its box that the box of an outline fills; less is a doubt."""
     agreed: float = 0.6
     """Least IoU of rembg's mask and the package's network; less is a doubt."""
+    kept: float = 0.8
+    """Least share of a mask that is kept as the object; less is a doubt."""
+    ink: int = 16
+    """Brightness up to which a pixel of a drawing is black."""
+    black: float = 0.7
+    """Least share of a drawing's pixels that are black; areas between its lines are filled."""
+    gap: float = 0.015
+    """Half of the widest gap in a line that is closed, as a share of the drawing."""
+    drawn: float = 0.75
+    """Share of a drawing up to which it consists of lines."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +88,21 @@ class FitOptions:
     """Steps of the code, without templates."""
     vertex_steps: int = 45
     """Steps of the vertices, without templates."""
+    code_rate: float = 0.07
+    """Learning rate of the code, in units of the root mean square of its entries."""
+    vertex_rate: float = 0.004
+    """Learning rate of the vertices."""
     pull: float = 0.1
     """Weight of the squared relative distance between the code and the predicted one."""
     smoothness: float = 3e-4
     """Weight of the smoothness loss."""
     stiffness: float = 10.0
     """Weight of the Laplacian loss of the vertices' displacements."""
+
+
+KNOWN_CAMERAS = FitOptions(
+    code_steps=40, vertex_steps=40, code_rate=0.1, vertex_rate=0.002, smoothness=1e-3
+)
 
 
 @dataclass(frozen=True)
@@ -95,6 +117,10 @@ class MatchOptions:
     """Best of these, which are bent and then ranked."""
     poor: float = 0.86
     """IoU of the best stretched template below which other cameras are tried."""
+    flying: tuple[str, ...] = ("airplane",)
+    """Categories that may be turned in a picture."""
+    flies: float = 0.1
+    """Least probability of one of them with which turned pictures are tried."""
     rolls_deg: tuple[float, ...] = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
     """Angles of the picture in its plane that are tried then."""
     retries: int = 2
@@ -106,7 +132,11 @@ class MatchOptions:
     voxels: float = 0.5
     """Weight of the IoU with the predicted shape; that of the outline is 1."""
     nearness: float = 0.5
-    """Weight of the codes' cosine."""
+    """Weight of the codes' cosine and of the bonus below."""
+    other: float = 0.4
+    """Probability of other things from which a picture is doubted."""
+    kind: float = 0.4
+    """Bonus to the cosine for the templates of a category that is certain."""
     edges: float = 0.15
     """Weight of the distance of two outlines in pixels of 64."""
     farthest: float = 6.0
@@ -156,8 +186,26 @@ class ColorOptions:
     """Clearly seen vertices at a similar height whose median colour a hidden part has."""
     spreading: float = 1e-2
     """Weight of these colours; that of alike neighbours is 0.01."""
+    ink: float = 0.07
+    """Brightness of a mesh that is black as a silhouette; it becomes grey, as black shows no shape."""
     sure: float = 0.02
     """Squared reliability of a colour that counts as much as those of the neighbours."""
+
+
+@dataclass(frozen=True)
+class SmoothOptions:
+    """How an outline is inflated."""
+
+    grid: int = 72
+    """Cells along each side of the cube in which the surface lies."""
+    depth: float = 0.8
+    """Thickness of the shape of a disc, over the disc's diameter."""
+    edge: int = 2
+    """Pixels inside the outline that may have the background's colours."""
+    rounds: int = 4
+    """Rounds of smoothing."""
+    thin: int = 3
+    """Pixels from the middle of a part to its sides, up to which it is thin."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +216,7 @@ class Options:
     fit: FitOptions = field(default_factory=FitOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     color: ColorOptions = field(default_factory=ColorOptions)
+    smooth: SmoothOptions = field(default_factory=SmoothOptions)
 
 
 DEFAULTS = Options()

@@ -17,10 +17,6 @@ from learn3d.studio.picture_to_mesh.cutting import Box, check_box, find_outline
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, CutOptions
 from learn3d.terminal import note
 
-_INK = 16  # brightness up to which a pixel is black
-_BLACK = 0.7  # share of a drawing's pixels that are black
-_GAP = 0.015  # half of the widest gap in a line, as a share of the drawing
-_LINES = 0.75  # share of a drawing up to which it consists of lines
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
@@ -62,10 +58,12 @@ def read_picture(
         advice = "Give --box or --masks, or cut the object out (transparency)"
         missed = f"no object was found in this photograph. {advice}"
         raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
-    mask, left_out = keep_object(mask)
+    kept, left_out = keep_object(mask)
     if left_out:
         note(f"note: {path}: {left_out}")
-    return Photo(colors, mask, doubt)
+    if np.count_nonzero(kept > 127) < options.kept * np.count_nonzero(mask > 127):
+        doubt = doubt or "large parts beside it were left out"
+    return Photo(colors, kept, doubt)
 
 
 def _reduce(colors: np.ndarray, box: Box | None, side: int) -> tuple[np.ndarray, Box | None]:
@@ -117,23 +115,26 @@ def prepare_image(
     return frame(colors, mask, size, object_size=object_size, inverted=LAYOUTS[layout].inverted)
 
 
-def fill_drawing(colors: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Add the white areas between the black lines of a drawing to its mask.
+def fill_drawing(
+    colors: np.ndarray, mask: np.ndarray, options: CutOptions = DEFAULTS.cut
+) -> tuple[np.ndarray, np.ndarray]:
+    """Add the white areas between the black lines of a drawing to its mask, or the white lines in a silhouette.
 
-    colors, mask: uint8 [H, W, 3] and [H, W]. Lines may have small gaps. Pictures other than
-    drawings of lines stay as they are. Returns colours on white, and the mask.
+    colors, mask: uint8 [H, W, 3] and [H, W]. Lines may have small gaps. Pictures other than black
+    drawings stay as they are. Returns colours on white, and the mask.
     """
     inside = mask > 127
-    if not inside.any() or np.quantile(colors[inside].mean(1), _BLACK) > _INK:
+    if not inside.any() or np.quantile(colors[inside].mean(1), options.black) > options.ink:
         return colors, mask
     left, top, right, bottom = mask_box(mask)
-    gap = math.ceil(_GAP * max(right - left, bottom - top))
+    gap = math.ceil(options.gap * max(right - left, bottom - top))
     padded = np.pad(inside, gap + 1)
     near = ndimage.distance_transform_edt(~padded) <= gap
     closed = padded | (ndimage.distance_transform_edt(near) > gap)
-    solid = ndimage.binary_fill_holes(closed)[gap + 1 : -gap - 1, gap + 1 : -gap - 1]
-    if inside.sum() > _LINES * solid.sum():
-        return colors, mask
+    solid = ndimage.binary_fill_holes(closed)
+    if inside.sum() > options.drawn * solid.sum():  # a silhouette, whose holes are seen through
+        solid = closed
+    solid = solid[gap + 1 : -gap - 1, gap + 1 : -gap - 1]
     alpha = mask[..., None] / 255
     on_white = (alpha * colors + 255 * (1 - alpha)).round().astype(np.uint8)
     return on_white, np.where(solid, np.uint8(255), mask)

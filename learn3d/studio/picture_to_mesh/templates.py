@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
+import trimesh
 from scipy.ndimage import (
     binary_erosion,
     distance_transform_edt,
@@ -41,7 +42,7 @@ from learn3d.studio.picture_to_mesh.fit import (
     soft_ious,
 )
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, MatchOptions
-from learn3d.studio.shapes import CATEGORIES, numbered_shape
+from learn3d.studio.shapes import CATEGORIES, numbered_recipe, numbered_shape
 
 SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates
 COUNT = 1000  # templates of each category
@@ -49,6 +50,7 @@ AXES = 24  # principal axes of the codes that are kept
 WIDTH = 64  # pixels in which distances of outlines and lines are measured
 # maps most generated shapes to themselves, in the object frame
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
+_LOADED = "hatchback", "wagon", "suv", "van"  # cars, some of which have a box on the roof
 # names of the tensors in a checkpoint
 TEMPLATES = (
     "template_numbers",
@@ -72,20 +74,17 @@ class Templates(NamedTuple):
         return self.numbers.shape == shape[:2] and self.codes.shape == shape and 0 not in shape
 
     def nearest(
-        self, code: Tensor, categories: Sequence[str], category: str | None, count: int
+        self, code: Tensor, categories: Sequence[str], bonus: Tensor, count: int
     ) -> tuple[list[tuple[str, int]], Tensor]:
-        """The `count` shapes with codes nearest to a code [C]: category and number of each, and the cosines.
+        """The `count` shapes with codes nearest to a code [C]: category and number of each, and their scores.
 
-        category: only its shapes are taken; None for those of all categories.
+        A score is the cosine of the codes and the bonus [N] of the category, -inf to leave it out.
         """
         mean, *axes = self.axes.float()
         place = torch.stack(axes) @ (F.normalize(code, dim=0) - mean)
         cosines = 1 - (self.codes.float() - place).square().sum(2) / 2
-        if category is not None:
-            others = torch.tensor([name != category for name in categories])
-            cosines[others] = -math.inf
-        cosines = cosines.flatten()
-        best = cosines.topk(min(count, int(cosines.isfinite().sum())))
+        scores = (cosines + bonus[:, None]).flatten()
+        best = scores.topk(min(count, int(scores.isfinite().sum())))
         of_kind = self.numbers.shape[1]
         names = [
             (categories[row // of_kind], int(self.numbers.flatten()[row]))
@@ -112,7 +111,7 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
         if category not in found or not number.isdecimal() or len(found[category]) >= COUNT:
             continue
         batch = dataset.batch(torch.from_numpy(np.flatnonzero(dataset.object_ids == item)))
-        vertices, faces = template(category, int(number))
+        vertices, faces = template(category, int(number), whole=True)
         if (
             nmr.metrics.voxel_iou(
                 dataset.convention.voxelize(vertices[None], faces), batch.voxels[:1]
@@ -136,9 +135,18 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
 
 
 @functools.lru_cache(512)
-def template(category: str, number: int) -> tuple[Tensor, Tensor]:
-    """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame."""
+def template(category: str, number: int, whole: bool = False) -> tuple[Tensor, Tensor]:
+    """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame.
+
+    whole: with what a car carries on its roof. Hardly a picture shows that, but a box on a low
+    roof has the outline of a high one.
+    """
     shape = numbered_shape(category, SEED, number)
+    recipe = numbered_recipe(category, SEED, number)
+    if not whole and getattr(recipe, "keywords", {}).get("kind") in _LOADED:
+        parts = shape.split(only_watertight=False)
+        roof = max(parts, key=lambda part: part.area).bounds[1, 1]
+        shape = trimesh.util.concatenate([part for part in parts if part.centroid[1] < 0.9 * roof])
     vertices = np.asarray(shape.vertices) @ mesh_to_object("y", "z").T
     faces = np.asarray(shape.faces)[
         :, ::-1
@@ -178,20 +186,21 @@ def find_candidates(
     categories: Sequence[str],
     predicted: Prediction,
     outline: Tensor,
-    category: str | None = None,
+    bonus: Tensor,
     level: bool = False,
     options: MatchOptions = DEFAULTS.match,
 ) -> Candidates:
     """The templates with codes nearest to the predicted one that fit an outline [64, 64] best, stretched.
 
     Three numbers rank a template: the likeness of its outline in the predicted view, its voxel IoU
-    with the predicted shape, and the cosine of the two codes. category: the only one whose
-    templates are taken, None if unknown. level: take as many templates of each category, seen at
-    elevation 0 from four sides.
+    with the predicted shape, and the cosine of the two codes with the bonus [N] of its category,
+    see `Templates.nearest`. level: take as many templates of each category, seen at elevation 0
+    from four sides.
     """
-    kinds = categories if level and category is None else [category]
-    count = options.candidates // len(kinds)
-    nearest = [templates.nearest(predicted.code[0], categories, kind, count) for kind in kinds]
+    each_alone = torch.eye(len(bonus)).log() + bonus
+    groups = [row for row in each_alone if row.isfinite().any()] if level else [bonus]
+    count = options.candidates // len(groups)
+    nearest = [templates.nearest(predicted.code[0], categories, row, count) for row in groups]
     names = [name for each, _ in nearest for name in each]
     nearness = torch.cat([cosines for _, cosines in nearest])
     shapes, faces = map(list, zip(*(template(*name) for name in names), strict=True))

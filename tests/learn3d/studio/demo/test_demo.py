@@ -93,7 +93,7 @@ def test_a_doubtful_outline_is_said_and_gets_its_mesh(finished_run) -> None:
     shown, doubt, *steps, last = sent
     assert shown["how"] == "as all that differs from the plain background"
     assert np.unpackbits(np.frombuffer(base64.b64decode(shown["mask"]), np.uint8)).sum() == 8 * 120
-    asked = "Is this the object? Its outline touches 2 sides of the picture."
+    asked = "Is this the object? Its outline touches the border of the picture."
     assert doubt == {"doubt": f"{asked} If not, drag a box around it.", "tool": "box"}
     assert [step["part"] for step in steps] == [0.0, 0.3, 0.7, 0.9] and last["meshes"]
 

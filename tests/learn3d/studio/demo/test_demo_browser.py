@@ -291,7 +291,7 @@ def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(
     assert tab.get_by_text("away from the object").is_visible()
     wide = boxes(tmp_path / "wide.png", (slice(0, 300), BLUE), rows=slice(92, 108))
     answered(tab, lambda: tab.locator("#file").set_input_files(wide))
-    assert "touches 2 sides" in tab.locator("#doubt").inner_text(), "a doubt beside the mesh"
+    assert "touches the border" in tab.locator("#doubt").inner_text(), "a doubt beside the mesh"
     green = boxes(tmp_path / "green.png", (slice(80, 220), GREEN))
     answered(
         tab,

@@ -179,15 +179,35 @@ def test_wall_floor_and_shadow_stay_outside(room, box) -> None:
 def test_doubtful_outlines(room) -> None:
     y, x = np.indices((400, 400))
     disc = np.hypot(x - 200, y - 200)
-    cases = {
-        "its outline touches 2 sides of the picture": np.abs(y - 200) < 90,
-        "its outline touches 4 sides of the picture": disc < 230,
-        "its outline is ragged": (disc < 150) & (np.random.default_rng(0).random((400, 400)) < 0.7),
-    }
-    for doubt, mask in cases.items():
-        assert find_doubt(255 * mask.astype(np.uint8)) == doubt
-    for mask in (disc < 150, (np.abs(x - 200) < 90) & (y > 200), room[1]):
+    border = "its outline touches the border of the picture"
+    noise = np.random.default_rng(0).random((400, 400)) < 0.7
+    for mask in (np.abs(y - 200) < 90, disc < 230):
+        assert find_doubt(255 * mask.astype(np.uint8)) == border
+    assert find_doubt(255 * ((disc < 150) & noise).astype(np.uint8)) == "its outline is ragged"
+    cropped = (np.abs(x - 200) < 90) & (y > 200)
+    for mask in (disc < 150, cropped, room[1]):
         assert find_doubt(255 * mask.astype(np.uint8)) is None
+    assert find_doubt(255 * cropped.astype(np.uint8), most=0) == border
+
+
+def test_an_object_that_leaves_a_photograph_is_doubted(scene) -> None:
+    pytest.importorskip("cv2", reason="needs the extra photos")
+    found = find_outline(scene[0][:200])
+    assert found.doubt == "its outline touches the border of the picture"
+
+
+def test_a_part_of_what_may_be_a_larger_thing_is_less_sure(monkeypatch) -> None:
+    pytest.importorskip("cv2", reason="needs the extra photos")
+    colors = np.full((160, 160, 3), 200, np.uint8)
+    colors[60:100, 60:100] = (180, 30, 30)
+    logits = np.full((160, 160), -9.0, np.float32)
+    logits[60:100, 60:100] = 9
+    found = []
+    for chance in (-9.0, -1.5):  # of the pixels to the right of it
+        logits[60:100, 100:140] = chance
+        monkeypatch.setattr(cutting, "find_object", lambda *_: ((0, 0, 160, 160), logits))
+        found.append(cut_out(colors)[1])
+    assert found[0] > 0.95 and found[1] < 0.5
 
 
 class Rembg:

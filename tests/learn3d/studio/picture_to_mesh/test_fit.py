@@ -20,7 +20,7 @@ from learn3d.networks.encoders import centre
 from learn3d.presets import PRESETS
 from learn3d.studio.picture_to_mesh.coloring import _alike, color_mesh
 from learn3d.studio.picture_to_mesh.export import export
-from learn3d.studio.picture_to_mesh.familiarity import KnownCodes, known_codes, learn_others
+from learn3d.studio.picture_to_mesh.familiarity import KnownCodes, known_codes, learn_kinds
 from learn3d.studio.picture_to_mesh.fit import (
     AZIMUTHS,
     CENTRED_SIZE,
@@ -207,8 +207,8 @@ def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> No
     model = load_model(tmp_path / "small.safetensors")
     images = load_dataset("kato", tiny_folder, "airplane", "train").batch(torch.arange(20)).images
     codes = model.method.encode(images)
-    assert not any(model.known_codes.is_strange(code) for code in codes)
-    assert all(model.known_codes.is_strange(code) for code in -codes)
+    assert all(model.known_codes.probabilities(code).tolist() == [1, 0] for code in codes)
+    assert all(model.known_codes.probabilities(code).tolist() == [0, 1] for code in -codes)
     assert recognize(model, codes[0]) == (None, None), "it knows only one category"
     other = model._replace(known_codes=KnownCodes(-model.known_codes.kinds))
     assert recognize(other, codes[0])[1].startswith("this may be none of airplane: tell its kind")
@@ -219,16 +219,12 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     first, second, other = torch.nn.functional.normalize(
         torch.eye(3, 16)[:, None] + 0.05 * torch.randn(3, 40, 16), dim=2
     )
-    known = torch.cat([first[:20], second[:20]])
-    known = KnownCodes(known[None], *learn_others(known, other[:20]))
-    assert all(known.is_strange(7 * code) for code in other[20:])
-    assert not any(known.is_strange(7 * code) for code in (*first[20:], *second[20:]))
-    # calls everything another thing
-    wrong = known._replace(output=torch.tensor([0.0] * len(known.hidden) + [9.0]))
-    assert not any(wrong.is_strange(7 * code) for code in first[20:]), (
-        "it is too near to a category for that"
-    )
-    assert all(wrong.is_strange(7 * code) for code in other[20:])
+    codes = torch.cat([first[:20], second[:20], other[:20]])
+    kinds = torch.arange(3).repeat_interleave(20)
+    known = KnownCodes(codes[:40].view(2, 20, -1), *learn_kinds(codes, kinds))
+    for kind, unseen in enumerate((first[20:], second[20:], other[20:])):
+        chances = torch.stack([known.probabilities(7 * code) for code in unseen])
+        assert torch.allclose(chances.sum(1), torch.ones(20)) and (chances[:, kind] > 0.5).all()
     model = load_model(finished_run)
     with pytest.raises(ValueError, match="no PNG file in"):
         cut_out_pictures(model, tmp_path)
@@ -238,7 +234,7 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     )
     export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
     known = load_model(tmp_path / "small.safetensors").known_codes
-    assert len(known.output) == len(known.hidden) + 1 == 2 * 64 + 1
+    assert known.output.shape == (2, len(known.hidden) + 1) == (2, 2 * 64 + 1)
 
 
 def test_a_picture_is_taken_for_the_nearest_kind(finished_run, tiny_folder) -> None:
@@ -249,5 +245,5 @@ def test_a_picture_is_taken_for_the_nearest_kind(finished_run, tiny_folder) -> N
     known = known_codes(method, dataset)
     assert len(known.kinds) == 3 and known.hidden is None
     batch = dataset.batch(torch.arange(len(dataset)))
-    found = [known.nearest_kind(code) for code in method.encode(batch.images)]
+    found = [int(known.probabilities(code).argmax()) for code in method.encode(batch.images)]
     assert np.mean(np.equal(found, batch.class_ids.numpy())) > 0.9

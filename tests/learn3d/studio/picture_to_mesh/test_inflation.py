@@ -9,8 +9,9 @@ import trimesh
 
 from learn3d.pictures import draw_around
 from learn3d.studio.picture_to_mesh.fit import Target, frame_target
-from learn3d.studio.picture_to_mesh.inflation import DEPTH, GRID, inflate
+from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.make import load_model, reconstruct_picture
+from learn3d.studio.picture_to_mesh.options import DEFAULTS
 from learn3d.studio.picture_to_mesh.read import fill_drawing
 
 SIZE = 200
@@ -37,7 +38,7 @@ def test_the_shape_is_closed_symmetric_and_has_the_outline(name) -> None:
     mesh = trimesh.Trimesh(surface.vertices.numpy(), surface.faces.numpy(), process=False)
     assert mesh.is_watertight and mesh.volume > 0, "closed, normals outwards"
     mirrored = surface.vertices * torch.tensor([1, 1, -1])
-    assert torch.cdist(mirrored, surface.vertices).min(1).values.max() < 1 / GRID
+    assert torch.cdist(mirrored, surface.vertices).min(1).values.max() < 1 / DEFAULTS.smooth.grid
     wanted = {"line": 0.2, "dots": 0.2}.get(name, 0.9)
     assert float(view.ious(surface.vertices[None], surface.faces, picture.outline())) > wanted
 
@@ -47,7 +48,7 @@ def test_a_disc_becomes_an_ellipsoid_with_the_picture_on_both_sides() -> None:
     surface, _ = inflate(picture)
     low, high = surface.vertices.amin(0), surface.vertices.amax(0)
     wide, _, deep = (high - low).tolist()
-    assert deep / wide == pytest.approx(DEPTH, rel=0.05)
+    assert deep / wide == pytest.approx(DEFAULTS.smooth.depth, rel=0.05)
     front, back = (image.astype(int) for image in draw_around(surface, [0, 180], image_size=64))
     assert front[32, 44, 0] > front[32, 20, 0] + 20, "red grows to the right"
     assert back[32, 44, 0] < back[32, 20, 0] - 20, "and to the left from behind"

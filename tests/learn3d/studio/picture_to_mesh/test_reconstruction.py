@@ -61,7 +61,8 @@ def test_a_doubtful_outline_is_said_beside_the_mesh(
     paths = reconstruct_files(finished_run, tmp_path / "out", [tmp_path / "band.png"])
     said = capsys.readouterr().err
     assert (
-        paths[0].is_file() and "warning: band: its outline touches 2 sides of the picture" in said
+        paths[0].is_file()
+        and "warning: band: its outline touches the border of the picture" in said
     )
 
 

@@ -81,8 +81,12 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
         number = int(model.templates.numbers[kind, 8])
         colors, mask = picture(category, number)
         code = model.method.encode(torch.from_numpy(model.prepare(colors, mask))[None])[0]
-        names, cosines = model.templates.nearest(code.float(), model.categories, None, 128)
-        assert (category, number) in names and (cosines.diff() <= 0).all()
+        bonus = torch.zeros(len(model.categories))
+        names, scores = model.templates.nearest(code.float(), model.categories, bonus, 128)
+        assert (category, number) in names and (scores.diff() <= 0).all()
+        bonus[kind] = 9
+        favoured, _ = model.templates.nearest(code.float(), model.categories, bonus, 128)
+        assert {name for name, _ in favoured} == {category}
     made = reconstruct_picture(
         model, *(shown := picture("chair", int(model.templates.numbers[2, 8])))
     )
@@ -90,7 +94,8 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
     assert torch.allclose(
         made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08
     ), "the picture's"
-    unknown = model.known_codes._replace(output=model.known_codes.output + 100)
+    unknown = model.known_codes._replace(output=model.known_codes.output.clone())
+    unknown.output[-1, -1] += 100
     doubted = reconstruct_picture(model._replace(known_codes=unknown), *shown)
     assert "none of airplane, car, chair" in doubted.warning
     assert doubted.kind == "chair" and bodies(doubted.surface) >= 3, "the mesh comes first"
