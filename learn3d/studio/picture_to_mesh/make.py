@@ -249,23 +249,24 @@ def _familiar_rolls(
     category: str | None,
     options: Options,
 ) -> list[float]:
-    """The angles of the camera about its axis at which a picture is more familiar than upright, the best first.
-
-    None if it hardly shows something that flies.
-    """
+    """The angles of the camera about its axis at which a picture is more like something that flies, the best first."""
     flies = torch.tensor([name in options.match.flying for name in model.categories])
-    chance = _chances(model, predicted.code[0], category)[flies].sum()
-    if model.known_codes is None or chance < options.match.flies:
+    if model.known_codes is None or not flies.any():
         return []
     rolls = options.match.rolls_deg
     turned = [model.prepare(*_turn(*photo, roll)) for roll in rolls]
     codes = model.method.encode(torch.from_numpy(np.stack(turned)))
-    upright, *others = (
-        float(model.known_codes.distances(code)[flies].min())
-        for code in (predicted.code[0], *codes)
+
+    def distance(code: Tensor) -> float:
+        return float(model.known_codes.distances(code)[flies].min())
+
+    order = sorted(
+        (distance(code), roll)
+        for code, roll in zip(codes, rolls, strict=True)
+        if _chances(model, code, category)[flies].sum() > options.match.flies
     )
-    order = sorted((distance, roll) for distance, roll in zip(others, rolls, strict=True))
-    return [roll for distance, roll in order if distance < upright][: options.match.retries]
+    upright = distance(predicted.code[0])
+    return [roll for apart, roll in order if apart < upright][: options.match.retries]
 
 
 def _turn(colors: np.ndarray, mask: np.ndarray, roll_deg: float) -> tuple[np.ndarray, np.ndarray]:

@@ -119,8 +119,8 @@ class MatchOptions:
     """IoU of the best stretched template below which other cameras are tried."""
     flying: tuple[str, ...] = ("airplane",)
     """Categories that may be turned in a picture."""
-    flies: float = 0.1
-    """Least probability of one of them with which turned pictures are tried."""
+    flies: float = 0.3
+    """Probability of these categories from which a turned picture is tried."""
     rolls_deg: tuple[float, ...] = (-60.0, -45.0, -30.0, 30.0, 45.0, 60.0)
     """Angles of the picture in its plane that are tried then."""
     retries: int = 2
