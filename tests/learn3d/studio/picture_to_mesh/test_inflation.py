@@ -80,7 +80,17 @@ def test_drawings_of_black_lines_are_filled() -> None:
         assert colors[100, 100].tolist() == [255, 255, 255] and colors[lines].max() == 0
         assert fill_drawing(ink + 90, mask)[1] is mask, "a ring that is not of ink"
     half = 255 * (ring & (X < 0)).astype(np.uint8)
-    assert fill_drawing(ink, half)[1] is half, "an open line"
+    filled = fill_drawing(ink, half)[1]
+    assert (filled > 0).sum() == pytest.approx((half > 0).sum(), rel=0.02), "an open line"
+
+
+def test_gaps_of_a_silhouette_become_white_lines_and_holes_stay() -> None:
+    distance = np.hypot(X, Y)
+    whole = (distance < 60) & (distance > 20)
+    mask = 255 * (whole & (np.abs(Y) > 1)).astype(np.uint8)
+    colors, filled = fill_drawing(np.zeros((SIZE, SIZE, 3), np.uint8), mask)
+    assert np.mean((filled > 0) == whole) > 0.99
+    assert (colors[whole & (np.abs(Y) < 1)] == 255).all()
 
 
 def test_a_smooth_shape_is_made_if_it_is_asked_for() -> None:
