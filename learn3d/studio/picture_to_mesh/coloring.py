@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -135,9 +135,13 @@ def _spread(
     colors = colors.double().numpy()
     alike = _alike(colors, clear, vertices.numpy(), normals.numpy(), neighbours, options)
     laplacian = diags_array(neighbours.sum(1)) - neighbours
-    system = (diags_array(given[:, 0] + options.spreading) + 0.01 * laplacian).tocsc()
+    system = (diags_array(given[:, 0] + options.spreading) + 0.01 * laplacian).tocsr()
     right = given * colors + options.spreading * alike
-    return torch.from_numpy(np.asarray(spsolve(system, right))).float().clamp(0, 1)
+    scale = diags_array(1 / system.diagonal())
+    solved = [cg(system, channel, M=scale, rtol=1e-7) for channel in right.T]
+    if any(status for _, status in solved):
+        raise RuntimeError("the colours of a mesh did not converge")
+    return torch.from_numpy(np.stack([found for found, _ in solved], 1)).float().clamp(0, 1)
 
 
 def _alike(
