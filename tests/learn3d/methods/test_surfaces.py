@@ -10,7 +10,7 @@ from steps import INFO, make_method
 
 import nmr
 from learn3d.pictures import grid_surface
-from learn3d.studio.picture_to_mesh import refinement
+from learn3d.studio.picture_to_mesh.options import KNOWN_CAMERAS, FitOptions
 from learn3d.studio.picture_to_mesh.reconstruction import reconstruct_dataset
 from learn3d.studio.picture_to_mesh.refinement import refine
 
@@ -45,39 +45,32 @@ def make(plane: float | None):
     return make_method("plus-kato", info, **settings)
 
 
-def take_steps(monkeypatch: pytest.MonkeyPatch, code: int, vertices: int) -> None:
-    """Let `refine` take this many steps."""
-    monkeypatch.setattr(refinement, "STEPS_OF_CODES", code)
-    monkeypatch.setattr(refinement, "STEPS_OF_VERTICES", vertices)
+def steps_of(code: int, vertices: int) -> FitOptions:
+    return dataclasses.replace(KNOWN_CAMERAS, code_steps=code, vertex_steps=vertices)
 
 
 @pytest.mark.parametrize("steps", [(60, 0), (0, 30), (15, 15)])
-def test_the_silhouette_comes_closer(tiny_set, monkeypatch, steps: tuple[int, int]) -> None:
+def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
     method, batch = make(None), tiny_set.batch(torch.tensor([0, 30]))
-    take_steps(monkeypatch, *steps)
 
     def loss(vertices: torch.Tensor) -> float:
         return float(nmr.losses.soft_iou_loss(method.render(vertices, batch.poses), batch.masks))
 
     with torch.no_grad():
         before = method.decode(method.encode(batch.images)).vertices
-        after = refine(method, batch.images, batch.masks, batch.poses)
+        after = refine(method, batch.images, batch.masks, batch.poses, steps_of(*steps))
     assert loss(after.vertices) < loss(before) - 0.02
 
 
-def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(
-    tiny_set, monkeypatch
-) -> None:
-    take_steps(monkeypatch, 0, 5)
-    method = make(37.5)
+def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(tiny_set) -> None:
+    method, few = make(37.5), steps_of(0, 5)
     batches = [tiny_set.batch(torch.tensor(chosen)) for chosen in ([0, 30], [0])]
-    both, alone = (refine(method, b.images, b.masks, b.poses).vertices for b in batches)
+    both, alone = (refine(method, b.images, b.masks, b.poses, few).vertices for b in batches)
     torch.testing.assert_close(both[:1], alone, atol=5e-5, rtol=0)
     torch.testing.assert_close(method.generator.symmetrized(both), both)
 
 
-def test_shapes_of_a_data_set_are_refined(finished_run, tiny_folder, tmp_path, monkeypatch) -> None:
-    take_steps(monkeypatch, 2, 2)
+def test_shapes_of_a_data_set_are_refined(finished_run, tiny_folder, tmp_path) -> None:
     options = {"data": tiny_folder, "indices": [3], "mesh_format": "obj"}
     plain = reconstruct_dataset(finished_run, tmp_path / "plain", **options)
     fitted = reconstruct_dataset(finished_run, tmp_path / "fitted", refined=True, **options)
