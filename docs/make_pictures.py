@@ -197,6 +197,11 @@ PICTURES = {
             *(f"docs/results/{name.partition('=')[0]}.json" for name in _CURVES),
         ),
     ),
+    "results-angles.png": Picture(
+        "python docs/draw_curves.py --output {folder}/angles.png kato-generated=generated",
+        "{folder}/angles.png",
+        ("docs/draw_curves.py", "docs/results/kato-generated.json"),
+    ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
         "{folder}/tsne.png",
