@@ -47,7 +47,8 @@ def test_two_steps_of_training_store_weights(tmp_path: Path) -> None:
 
 def test_outlines_are_measured(capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
     measure_cutouts.main(images=2, seed=2, sheet=tmp_path / "sheet.png")
-    *_, line = capsys.readouterr().out.splitlines()
+    *_, line, legend = capsys.readouterr().out.splitlines()
     name, count, *shares = line.split()
     assert (name, count) == ("all", "2") and set(shares) <= {"0%", "50%", "100%"}
+    assert legend.startswith("silent: wrong without a doubt")
     assert (tmp_path / "sheet.png").exists()
