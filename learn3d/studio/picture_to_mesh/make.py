@@ -48,6 +48,7 @@ from learn3d.studio.picture_to_mesh.templates import (
     join,
 )
 from learn3d.studio.picture_to_mesh.write import Reconstruction
+from learn3d.terminal import note
 
 SMALL_MODEL = Path(__file__).with_name("small.safetensors")  # the model in the package
 
@@ -79,6 +80,9 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
     tensors = checkpoint.load(path)[0]
+    if "output_layer" in tensors and tensors["output_layer"].ndim == 1:  # it does not tell kinds
+        note(f"{path} is of an earlier version; export it again with --others to warn of these")
+        tensors = {name: x for name, x in tensors.items() if name not in KNOWN_CODES[1:]}
     stored = ((KnownCodes, KNOWN_CODES), (Templates, TEMPLATES))
     parts = [
         kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored

@@ -69,6 +69,14 @@ def test_known_codes_and_templates_of_other_shapes_are_refused(tmp_path, name, s
         load_model(tmp_path / "a.safetensors")
 
 
+def test_a_model_of_an_earlier_version_tells_other_things_by_distance(tmp_path, capsys) -> None:
+    tensors, metadata = checkpoint.load(SMALL_MODEL)
+    earlier = tensors | {"output_layer": tensors["output_layer"][-1].clone()}
+    checkpoint.save(tmp_path / "a.safetensors", earlier, metadata)
+    assert load_model(tmp_path / "a.safetensors").known_codes.hidden is None
+    assert "export it again" in capsys.readouterr().err
+
+
 def test_other_methods_are_refused(tiny_config, run_folder, tmp_path) -> None:
     train(tiny_config(run_folder, preset="multi-view-kato", encoder="conv-small", iterations=1))
     with pytest.raises(ValueError, match="proposed, vanilla, plus and many-views"):
