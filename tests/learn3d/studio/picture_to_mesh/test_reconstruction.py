@@ -68,7 +68,8 @@ def test_a_doubtful_outline_is_said_beside_the_mesh(
 
 @pytest.mark.parametrize("edge", [0, 2, 9])
 @pytest.mark.parametrize("top", [0, 14])
-def test_a_frame_around_a_picture_is_no_object(edge: int, top: int, tmp_path) -> None:
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_a_frame_around_a_picture_is_no_object(edge: int, top: int, suffix, tmp_path) -> None:
     picture = np.full((160, 200, 3), 255, np.uint8)
     picture[50:110, 60:150] = (180, 40, 30)
     y, x = np.mgrid[:160, :200]
@@ -76,10 +77,10 @@ def test_a_frame_around_a_picture_is_no_object(edge: int, top: int, tmp_path) ->
     picture[disc] = (40, 90, 160)
     wide = ((edge + top, edge), (edge, edge), (0, 0))
     framed = np.pad(picture, wide, constant_values=70)
-    Image.fromarray(framed).save(tmp_path / "framed.png")
-    mask = read_picture(tmp_path / "framed.png").mask > 127
+    Image.fromarray(framed).save(tmp_path / f"framed.{suffix}")
+    mask = read_picture(tmp_path / f"framed.{suffix}").mask > 127
     inside = np.pad((picture < 250).any(2), wide[:2])
-    assert (mask != inside).mean() < 0.002
+    assert (mask != inside).mean() < (0.002 if suffix == "png" else 0.01)
 
 
 def test_a_large_picture_and_its_box_are_reduced_together(tmp_path) -> None:
