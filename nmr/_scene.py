@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -161,20 +161,12 @@ def make_scene(
 
 
 def draw_silhouette(
-    vertices: Meshes,
-    faces: Meshes,
-    camera: Camera | None,
-    image_size: int | tuple[int, int],
-    anti_aliasing: bool,
-    fill_back: bool,
-    near: float,
-    far: float,
-    clip: bool,
-    eps: float,
-    gradient: str,
+    vertices: Meshes, faces: Meshes, camera: Camera | None, *how: Any, gradient: str
 ) -> Tensor:
-    """alpha ``[B, h, w]``: by one operator, unless faces are cut or the camera is a user's."""
-    how = image_size, anti_aliasing, fill_back, near, far, clip, eps
+    """alpha ``[B, h, w]``: by one operator, unless faces are cut or the camera is a user's.
+
+    how: as in `make_scene`, from image_size to eps.
+    """
     mesh, camera, settings, clip = _check_arguments(vertices, faces, camera, *how)
     if is_projecting(camera) and gradient != "none" and can_read():
         posed, batch = camera._arguments(mesh.vertices.dtype, mesh.batch, mesh.starts)
@@ -188,16 +180,7 @@ def draw_silhouette(
 
 
 def _check_arguments(
-    vertices: Meshes,
-    faces: Meshes,
-    camera: Camera | None,
-    image_size: int | tuple[int, int],
-    anti_aliasing: bool,
-    fill_back: bool,
-    near: float,
-    far: float,
-    clip: bool,
-    eps: float,
+    vertices: Meshes, faces: Meshes, camera: Camera | None, *how: Any
 ) -> tuple[MeshBatch, Camera | None, ops.RasterSettings, bool]:
     """The meshes in the world, the camera of this image, the settings, and whether to clip. Faces
     are not checked yet, as the number of images is not known.
@@ -208,10 +191,9 @@ def _check_arguments(
         mesh = MeshBatch(check_vertices(vertices, ", or a list of [V_b, 3]"), faces)
     if camera is not None:
         check_camera(camera, mesh.starts is not None)
-    numbers = image_size, anti_aliasing, fill_back, near, far, clip, eps
-    plain = not torch.compiler.is_compiling() and _PLAIN.issuperset(map(type, numbers))
+    plain = not torch.compiler.is_compiling() and _PLAIN.issuperset(map(type, how))
     check = _check_plain_settings if plain else _check_settings
-    settings, clip = check(mesh.vertices.dtype, has_perspective(camera), *numbers)
+    settings, clip = check(mesh.vertices.dtype, has_perspective(camera), *how)
     if isinstance(camera, ProjectingCamera):
         camera = camera.for_image(settings.height, settings.width)
     return mesh, camera, settings, clip

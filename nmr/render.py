@@ -128,7 +128,7 @@ def render(
 
     how = image_size, anti_aliasing, fill_back, near, far, clip, eps
     if outputs == ("alpha",):
-        return Images({"alpha": draw_silhouette(vertices, faces, camera, *how, gradient)})
+        return Images({"alpha": draw_silhouette(vertices, faces, camera, *how, gradient=gradient)})
     scene = make_scene(vertices, faces, camera, *how)
     how = interpolation_gradient, gradient, smooth, space
     return Images(_draw(scene, outputs, background, colors, lights, *how))
@@ -398,8 +398,8 @@ def render_silhouette(
     torch.Size([2, 64, 64])
     """
     check_choice(gradient, "gradient", GRADIENTS)
-    how = image_size, anti_aliasing, fill_back, near, far, clip, eps, gradient
-    return draw_silhouette(vertices, faces, camera, *how)
+    how = image_size, anti_aliasing, fill_back, near, far, clip, eps
+    return draw_silhouette(vertices, faces, camera, *how, gradient=gradient)
 
 
 def render_soft_silhouette(

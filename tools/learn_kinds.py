@@ -168,14 +168,14 @@ def encode(model: Model, pictures: Sequence[Picture]) -> torch.Tensor:
     return F.normalize(torch.cat([model.method.encode(part) for part in parts]), dim=1)
 
 
-def main(objects: int = 450, varied: int = 8, output: Path = SMALL_MODEL) -> None:
-    """Learn the network of `KnownCodes` for the package's model, and write the model again.
+def main(path: Path = SMALL_MODEL, objects: int = 450, varied: int = 8) -> None:
+    """Learn the network of `KnownCodes` for an exported model, and write the model again.
 
-    objects: generated ones of each kind, each in one style. varied: forms of each icon of a known
-    kind; those of other things are seen as they are and mirrored.
+    path: the model's file. objects: generated ones of each kind, each in one style. varied: forms of each
+    icon of a known kind; those of other things are seen as they are and mirrored.
     """
     torch.set_num_threads(1)
-    model = load_model(None)
+    model = load_model(path)
     names, rng = (*model.categories, "other"), np.random.default_rng(SEED)
     of_kinds = {name: [] for name in names}
     for kind, picture in icons():
@@ -194,9 +194,9 @@ def main(objects: int = 450, varied: int = 8, output: Path = SMALL_MODEL) -> Non
         known.append(torch.full((sum(map(len, found)),), kind))
         print(f"{name}: {len(of_kinds[name])} icons")
     learnt = learn_kinds(torch.cat(codes), torch.cat(known))
-    tensors, metadata = checkpoint.load(output)
+    tensors, metadata = checkpoint.load(path)
     tensors |= {name: part.half() for name, part in zip(KNOWN_CODES[1:], learnt, strict=True)}
-    checkpoint.save(output, tensors, metadata)
+    checkpoint.save(path, tensors, metadata)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Measures the likeness of meshes to pictures, each of which is the only one of its object.
+"""Measures how much meshes look like the pictures of which they are made.
 
 python tools/measure_likeness.py --pictures strangers/report --sheet likeness.png
 """

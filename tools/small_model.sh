@@ -5,7 +5,7 @@
 # knows how far away the camera of a picture was. The first 1,000 generated objects of each category become templates. A stopped
 # run continues. Icons teach it at last which kind a drawing shows (learn_kinds.py, which needs npm and resvg_py).
 # Environment: STEPS, OBJECTS, OUT, BIN.
-# Usage: bash tools/small_model.sh. It takes two hours on two cores.
+# Usage: bash tools/small_model.sh. The training takes an hour and a half on two cores.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=${BIN:-.venv/bin}

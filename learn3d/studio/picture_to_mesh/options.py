@@ -65,7 +65,7 @@ class CutOptions:
     ink: int = 16
     """Brightness up to which a pixel of a drawing is black."""
     black: float = 0.7
-    """Least share of a drawing's pixels that are black; areas between its lines are filled."""
+    """Share of black pixels from which a picture is a black drawing, see `fill_drawing`."""
     gap: float = 0.015
     """Half of the widest gap in a line that is closed, as a share of the drawing."""
     drawn: float = 0.75

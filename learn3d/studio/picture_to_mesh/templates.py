@@ -138,7 +138,7 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
 def template(category: str, number: int, whole: bool = False) -> tuple[Tensor, Tensor]:
     """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame.
 
-    whole: with what a car carries on its roof. Hardly a picture shows that, but a box on a low
+    whole: with what a car carries on its roof. Few pictures show that, and a box on a low
     roof has the outline of a high one.
     """
     shape = numbered_shape(category, SEED, number)
