@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-import trimesh
 from scipy.ndimage import (
     binary_erosion,
     distance_transform_edt,
@@ -42,7 +41,7 @@ from learn3d.studio.picture_to_mesh.fit import (
     soft_ious,
 )
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, MatchOptions
-from learn3d.studio.shapes import CATEGORIES, numbered_recipe, numbered_shape
+from learn3d.studio.shapes import CATEGORIES, numbered_shape
 
 SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates
 COUNT = 1000  # templates of each category
@@ -50,7 +49,6 @@ AXES = 24  # principal axes of the codes that are kept
 WIDTH = 64  # pixels in which distances of outlines and lines are measured
 # maps most generated shapes to themselves, in the object frame
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0]))
-_LOADED = "hatchback", "wagon", "suv", "van"  # cars, some of which have a box on the roof
 # names of the tensors in a checkpoint
 TEMPLATES = (
     "template_numbers",
@@ -111,7 +109,7 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
         if category not in found or not number.isdecimal() or len(found[category]) >= COUNT:
             continue
         batch = dataset.batch(torch.from_numpy(np.flatnonzero(dataset.object_ids == item)))
-        vertices, faces = template(category, int(number), whole=True)
+        vertices, faces = template(category, int(number), loads=True)
         if (
             nmr.metrics.voxel_iou(
                 dataset.convention.voxelize(vertices[None], faces), batch.voxels[:1]
@@ -135,18 +133,13 @@ def learn_templates(method: MeshMethod, dataset: ViewDataset) -> Templates | Non
 
 
 @functools.lru_cache(512)
-def template(category: str, number: int, whole: bool = False) -> tuple[Tensor, Tensor]:
+def template(category: str, number: int, loads: bool = False) -> tuple[Tensor, Tensor]:
     """Vertices float32 [V, 3] and faces int64 [F, 3] of a generated shape, in the object frame.
 
-    whole: with what a car carries on its roof. Few pictures show that, and a box on a low
-    roof has the outline of a high one.
+    loads: cars may have boxes on their roofs. Few pictures show them, and a box on a low roof has
+    the outline of a high one.
     """
-    shape = numbered_shape(category, SEED, number)
-    recipe = numbered_recipe(category, SEED, number)
-    if not whole and getattr(recipe, "keywords", {}).get("kind") in _LOADED:
-        parts = shape.split(only_watertight=False)
-        roof = max(parts, key=lambda part: part.area).bounds[1, 1]
-        shape = trimesh.util.concatenate([part for part in parts if part.centroid[1] < 0.9 * roof])
+    shape = numbered_shape(category, SEED, number, loads)
     vertices = np.asarray(shape.vertices) @ mesh_to_object("y", "z").T
     faces = np.asarray(shape.faces)[
         :, ::-1

@@ -22,8 +22,8 @@ _RECIPES = {
 CATEGORIES: tuple[str, ...] = tuple(_RECIPES)
 
 
-def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
-    """A random shape of the category (one of `CATEGORIES`).
+def make_shape(category: str, rng: np.random.Generator, loads: bool = True) -> trimesh.Trimesh:
+    """A random shape of the category (one of `CATEGORIES`). loads: cars may have boxes on their roofs.
 
     It depends on the state of `rng` alone, which advances.
 
@@ -35,6 +35,7 @@ def make_shape(category: str, rng: np.random.Generator) -> trimesh.Trimesh:
     True
     """
     draw = Draw(rng.bit_generator)
+    draw.loads = loads
     return assemble(_pick_recipe(category, draw)(draw))
 
 
@@ -44,13 +45,13 @@ def _pick_recipe(category: str, draw: Draw) -> Callable[[Draw], Part]:
     return draw.pick(_RECIPES[category])
 
 
-def numbered_shape(category: str, seed: int, number: int) -> trimesh.Trimesh:
+def numbered_shape(category: str, seed: int, number: int, loads: bool = True) -> trimesh.Trimesh:
     """Shape `number` of a data set of generated shapes with this seed; see `make_shape`.
 
     Exported models know shapes by their numbers (`picture_to_mesh.templates`): after a change of
     recipes, train and export the package's model again.
     """
-    return make_shape(category, _rng(seed, number))
+    return make_shape(category, _rng(seed, number), loads)
 
 
 def numbered_recipe(category: str, seed: int, number: int) -> Callable[[Draw], Part]:

@@ -73,7 +73,7 @@ def car(draw: Draw, kind: str) -> Part:
     part += (
         mirror + bar((0.85 * half, y - 0.09, z), (half + 0.04, y - 0.01, z), 0.05)
     ).both_sides()
-    if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4):
+    if kind in ("hatchback", "wagon", "suv", "van") and draw.maybe(0.4) and draw.loads:
         part += _roof_box(draw, body)
     if kind == "coupe" and draw.maybe(0.5):
         part += _spoiler(draw, body)

@@ -22,6 +22,8 @@ class Draw(np.random.Generator):
     values; a probability True or False.
     """
 
+    loads = True  # whether cars may have boxes on their roofs
+
     def __call__(self, least: float, greatest: float) -> float:
         """A random number in [least, greatest)."""
         return self.uniform(least, greatest)

@@ -101,6 +101,11 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
     assert doubted.kind == "chair" and bodies(doubted.surface) >= 3, "the mesh comes first"
 
 
+def test_templates_have_no_boxes_on_their_roofs() -> None:
+    bare, loaded = (template("car", 0, loads=loads)[0] for loads in (False, True))
+    assert len(bare) < len(loaded)
+
+
 @pytest.mark.parametrize("roll_deg", [45.0, -60.0])
 def test_an_airplane_that_is_turned_in_its_picture_is_found(model: Model, roll_deg: float) -> None:
     shown = np.dstack(picture("airplane", int(model.templates.numbers[0, 30])))

@@ -96,6 +96,18 @@ def test_left_and_right_agree(category: str) -> None:
     assert np.abs(centroids[:, 0]).max() < 0.02
 
 
+def test_cars_without_loads_are_the_same_cars_without_boxes_on_their_roofs() -> None:
+    pairs = [
+        [make_shape("car", np.random.default_rng(seed), loads=loads) for loads in (True, False)]
+        for seed in range(20)
+    ]
+    lost = [loaded.body_count - bare.body_count for loaded, bare in pairs]
+    assert set(lost) == {0, 3}, "a box and two bars"
+    for (loaded, bare), gone in zip(pairs, lost, strict=True):
+        np.testing.assert_allclose(loaded.extents[::2], bare.extents[::2])
+        assert (loaded.extents[1] - bare.extents[1] > 0.04) == (gone > 0)
+
+
 def test_unknown_category_names_the_known_ones() -> None:
     with pytest.raises(
         ValueError, match=r"category must be one of airplane, .*table; got 'teapot'"
