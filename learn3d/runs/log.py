@@ -62,7 +62,7 @@ class RunLog(contextlib.ExitStack):
             self._writer = types.SimpleNamespace(**_SILENT)
             self.say(f"warning: {config.log} does not work ({error}); metrics go to {METRICS} only")
         self.callback(self._writer.close)
-        self._started = self._last_line = time.monotonic()
+        self._after_first = self._last_line = time.monotonic()
 
     def step(self, step: int, losses: Mapping[str, float]) -> None:
         """Show the progress after a step."""
@@ -76,11 +76,14 @@ class RunLog(contextlib.ExitStack):
         now = time.monotonic()
         if now - self._last_line >= SECONDS_BETWEEN_LINES or step in (self.start + 1, self.total):
             self._last_line = now
-            seconds_per_step = (now - self._started) / (step - self.start)
-            left = datetime.timedelta(seconds=round(seconds_per_step * (self.total - step)))
-            note(
-                f"step {step}/{self.total}  {self._means()}  {1000 * seconds_per_step:.0f} ms/step, {left} left"
-            )
+            text = f"step {step}/{self.total}  {self._means()}"
+            if step == self.start + 1:
+                self._after_first = now  # a first step takes longer than others
+            else:
+                seconds = (now - self._after_first) / (step - self.start - 1)
+                left = datetime.timedelta(seconds=round(seconds * (self.total - step)))
+                text += f"  {1000 * seconds:.0f} ms/step, {left} left"
+            note(text)
 
     def _means(self) -> str:
         names = sorted(self._recent, key=lambda name: name != "total")

@@ -179,7 +179,7 @@ def test_elsewhere_it_prints_few_lines_with_means_of_losses_that_take_turns(
             log.step(step, odd if step % 2 else even)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2
-    assert lines[0].startswith("step 5/100  total 3  classification 2")
+    assert lines[0] == "step 5/100  total 3  classification 2"
     assert lines[1].startswith("step 100/100  total 2  classification 2  confusion 1 ")
     assert lines[1].endswith("0:00:00 left")
 
