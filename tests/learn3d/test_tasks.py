@@ -64,7 +64,7 @@ def test_an_interruption_lets_tasks_save_and_the_next_call_goes_on(
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()
-    assert run_tasks(steps(tmp_path, "a", "b", "c", seconds=0.5), workers) == []
+    assert run_tasks(steps(tmp_path, "a", "b", "c", seconds=1), workers) == []
     assert "saved" in (tmp_path / "a.log").read_text()
     assert not (tmp_path / "c.txt").exists(), "nothing new is started"
     assert capsys.readouterr().err.startswith("stopping:")
@@ -79,7 +79,7 @@ def test_a_task_goes_on_when_its_worker_is_killed(cluster, tmp_path, capsys) -> 
         os.kill(int(worker), signal.SIGKILL)
 
     threading.Thread(target=kill).start()
-    assert run_tasks(steps(tmp_path, "a", "b", seconds=0.3), cluster) == []
+    assert run_tasks(steps(tmp_path, "a", "b", seconds=1), cluster) == []
     assert finished(tmp_path, "a", "b")
     assert "a is started again: its worker died (KilledWorker" in capsys.readouterr().err
 
@@ -97,7 +97,7 @@ def test_a_scheduler_that_is_missing_or_ends(tmp_path, capsys) -> None:
             process.kill()
 
         threading.Thread(target=kill).start()
-        assert run_tasks(steps(tmp_path, "a", seconds=0.5), Workers(cluster=address)) == ["a"]
+        assert run_tasks(steps(tmp_path, "a", seconds=1), Workers(cluster=address)) == ["a"]
     assert (
         "the Dask scheduler ended; start it, and the same command goes on"
         in capsys.readouterr().err
