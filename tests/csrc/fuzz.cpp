@@ -39,25 +39,9 @@ struct Bytes {
 // or a special value; or raw bits.
 template <class T>
 T coordinate(Bytes& bytes, bool is_depth) {
-  using Limits = std::numeric_limits<T>;
-  static constexpr T special[] = {Limits::quiet_NaN(),
-                                  Limits::infinity(),
-                                  -Limits::infinity(),
-                                  Limits::max(),
-                                  Limits::lowest(),
-                                  Limits::denorm_min(),
-                                  Limits::min(),
-                                  -Limits::min(),
-                                  Limits::epsilon(),
-                                  1 + Limits::epsilon(),
-                                  1 - Limits::epsilon(),
-                                  T(-0.0),
-                                  T(1e10),
-                                  T(-1e20),
-                                  T(1e-20)};
   const int byte = bytes.next();
   if (byte < 232) return is_depth ? T(byte - 32) / 16 : T(byte - 116) / 64;
-  if (byte < 247) return special[byte - 232];
+  if (byte < 247) return kSpecial<T>[byte - 232];
   if (byte < 252) return T(bytes.bits<int16_t>()) / 16384;
   return bytes.bits<T>();
 }

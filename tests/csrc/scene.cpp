@@ -27,20 +27,13 @@ struct Run {
 
   // Noise for one input of the stages. Upstream gradients have names that begin with "grad".
   T* in(const char* name, int64_t size) {
-    using Limits = std::numeric_limits<T>;
-    constexpr T special[] = {Limits::quiet_NaN(),  Limits::infinity(),
-                             -Limits::infinity(),  Limits::max(),
-                             Limits::lowest(),     T(1e30),
-                             Limits::denorm_min(), T(0)};
     std::vector<T>& values = r.inputs.resize(name, size);
     const uint64_t stream = stream_of(name);
     for (int64_t n = 0; n < size; ++n) values[n] = static_cast<T>(noise(stream, n));
     const bool upstream = string_view(name).substr(0, 4) == "grad";
     for (T& x : values)
       if (upstream && s.hostile_upstream && std::abs(x) < T(1) / 16)
-        x = special[static_cast<int>((x + T(1) / 16) * 64) % 8];
-    if (s.poisoned && string_view(name) == s.poisoned)
-      std::fill_n(values.begin(), size / s.batch, special[0]);
+        x = kSpecial<T>[static_cast<int>((x + T(1) / 16) * 120) % 15];
     return values.data();
   }
   uint64_t stream_of(const char* name) const {

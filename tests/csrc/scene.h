@@ -22,6 +22,24 @@ inline double noise(uint64_t seed, uint64_t index) {
   return static_cast<double>(static_cast<int64_t>(x >> 44)) / 524288.0 - 1.0;
 }
 
+// Numbers at the limits of T.
+template <class T, class Limits = std::numeric_limits<T>>
+constexpr T kSpecial[] = {Limits::quiet_NaN(),
+                          Limits::infinity(),
+                          -Limits::infinity(),
+                          Limits::max(),
+                          Limits::lowest(),
+                          Limits::denorm_min(),
+                          Limits::min(),
+                          -Limits::min(),
+                          Limits::epsilon(),
+                          1 + Limits::epsilon(),
+                          1 - Limits::epsilon(),
+                          T(-0.0),
+                          T(1e10),
+                          T(-1e30),
+                          T(1e-20)};
+
 // What a scene holds besides numbers of its type.
 struct SceneShape {
   int64_t batch = 0, num_vertices = 0,
@@ -41,9 +59,8 @@ struct SceneShape {
   bool foreign_face_index =
       false;  // backward stages get a made-up face index map: any in range is allowed
   const int32_t* given_face_index = nullptr;  // or this one
-  bool hostile_upstream = false;   // NaN, infinities and huge numbers among the upstream gradients
-  const char* poisoned = nullptr;  // the upstream gradient that is NaN in the first image
-  uint64_t seed = 1;               // of textures, attributes, cameras and upstream gradients
+  bool hostile_upstream = false;  // NaN, infinities and huge numbers among the upstream gradients
+  uint64_t seed = 1;              // of textures, attributes, cameras and upstream gradients
 
   bool packed() const { return !starts.empty(); }
   Size raster() const { return raster_of(image, anti_aliasing); }

@@ -1,6 +1,5 @@
 // Properties of every stage: its results do not depend on threads, company, packing, the order of
-// faces or earlier calls; float agrees with double; gradients that are not finite are seen; hostile
-// inputs keep what broken_promise lists.
+// faces or earlier calls; float agrees with double; hostile inputs keep what broken_promise lists.
 #include <algorithm>
 #include <cmath>
 
@@ -40,13 +39,6 @@ std::vector<Scene<T>> scenes() {
   all[3].anti_aliasing = all[3].fill_back = all[3].perspective = false;
   all[3].channels = 1;
   return all;
-}
-
-// The share of image b of an array in which every image has the same.
-template <class Number>
-std::vector<Number> share(const std::vector<Number>& values, int64_t b, int64_t batch) {
-  const auto size = static_cast<std::ptrdiff_t>(values.size()) / batch;
-  return {values.begin() + b * size, values.begin() + (b + 1) * size};
 }
 
 template <class A, class B>
@@ -140,60 +132,6 @@ TEST(float_agrees_with_double) {
   }
 }
 
-// Gradient scalers look for gradients that are not finite: they must not vanish, nor spoil other
-// images.
-TEST_REAL(an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone) {
-  const std::pair<const char*, std::vector<const char*>> cases[] = {
-      {"grad_alpha", {"grad_silhouette", "grad_local"}},
-      {"grad_transmittance", {"grad_soft", "grad_sigma"}},
-      {"grad_distances", {"grad_soft_fragments"}},
-      {"grad_weights", {"grad_fragments"}},
-      {"grad_depth", {"grad_fragments"}},
-      {"grad_depth_image", {"grad_depth_vertices"}},
-      {"grad_colors", {"grad_textures"}},
-      {"grad_values", {"grad_attributes", "grad_value_weights"}},
-      {"grad_pyramid", {"grad_texels"}},
-      {"grad_sampled", {"grad_sampled_texels", "grad_uv", "grad_uv_weights"}},
-      {"grad_rast", {"grad_clip"}},
-      {"grad_slopes", {"grad_clip"}},
-      {"grad_blended", {"grad_blended_colors", "grad_blended_positions"}},
-      {"grad_normals", {"grad_normals_vertices"}},
-      {"grad_lit",
-       {"grad_lit_colors", "grad_lit_normals", "grad_lit_vertices", "grad_lit_weights"}},
-      {"grad_resolved", {"grad_edges", "grad_local_edges", "grad_image", "grad_background"}},
-      {"grad_points", {"grad_world", "grad_matrix", "grad_intrinsics", "grad_distortion"}},
-      {"grad_pose", {"grad_forward", "grad_up"}},
-      {"grad_loss", {"grad_loss_vertices"}},
-      {"grad_iou", {"grad_prediction", "grad_target"}},
-  };
-  Scene<T> scene = stack<T>({sphere(1, 1), sphere(1, 2), sphere(1, 3), sphere(1, 4)}, false);
-  scene.per_image_values = true;
-  scene.image = {12, 16};
-  scene.seed = 107;  // with lights of all kinds and mipmaps
-  const Results<T> healthy = run_stages(scene, 2);
-  for (const auto& [upstream, gradients] : cases) {
-    scene.poisoned = upstream;
-    const Results<T> spoiled = run_stages(scene, 2);
-    for (const auto& array : std::get<0>(healthy.lists).arrays) {
-      const bool reached = std::count_if(gradients.begin(), gradients.end(), [&](const char* name) {
-        return std::string(name) == array.name;
-      });
-      const std::vector<T>& values = spoiled.get(array.name);
-      const bool seen =
-          std::any_of(values.begin(), values.end(), [](T x) { return std::isnan(x); });
-      if (seen != reached && std::string(array.name) != "grad_lights")
-        fail(__FILE__, __LINE__, upstream, " in ", array.name, ": ", seen);
-      // The textures of images differ in size; lights are not sorted by image.
-      if (std::string(array.name) == "grad_sampled_texels" ||
-          std::string(array.name) == "grad_texels" || std::string(array.name) == "grad_lights")
-        continue;
-      for (int64_t b = 1; b < scene.batch; ++b)
-        if (share(values, b, scene.batch) != share(array.values, b, scene.batch))
-          fail(__FILE__, __LINE__, upstream, " spoils ", array.name);
-    }
-  }
-}
-
 // Uneven sizes one after the other: scratch that is kept between calls must not leak from one into
 // another.
 TEST_REAL(earlier_calls_do_not_show) {
@@ -209,11 +147,8 @@ TEST_REAL(earlier_calls_do_not_show) {
 }
 
 TEST_REAL(special_values_in_every_coordinate) {
-  using Limits = std::numeric_limits<T>;
   const Mesh fine = triangle({-0.9, -0.8, 2, 0.9, -0.7, 3, 0.1, 0.9, 4});
-  for (double special :
-       {kNaN, kInf, -kInf, double(Limits::max()), -double(Limits::max()),
-        double(Limits::denorm_min()), double(Limits::min()), 0.0, -0.0, 1e10, -1e30, 1e30})
+  for (const T special : kSpecial<T>)
     for (int n = 0; n < 9; ++n) {
       Mesh mesh = fine;
       mesh.vertices[n] = special;

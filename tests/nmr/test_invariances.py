@@ -20,7 +20,7 @@ from scenes import (
     uniform,
     value_and_gradients,
 )
-from torch.testing import assert_close
+from torch.autograd import forward_ad
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import nmr
@@ -261,28 +261,6 @@ def test_no_mesh_and_no_camera_gives_a_nan(name, coordinates, faces, eye, is_dou
 
 
 @NAMES
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_an_upstream_gradient_that_is_not_finite_stays_in_its_image(name, bad):
-    """A gradient scaler must see it, and the next step must not."""
-    mesh, faces = MESHES[1]
-    inputs = [torch.stack([mesh, 0.8 * mesh])]
-    inputs += [torch.stack([x, x]) for x in values_of(name, mesh, faces)]
-
-    def draw(vertices, *values):
-        return FUNCTIONS[name][0](vertices, faces, EYES[:2], 24, *values)[0]
-
-    def grads(factor):
-        upstream = torch.ones_like(draw(*inputs))
-        upstream[0, 8:13] *= factor
-        return value_and_gradients(draw, *inputs, upstream=upstream)[1:]
-
-    healthy, spoiled = grads(1), grads(bad)
-    assert not all(x[0].isfinite().all() for x in spoiled)
-    assert same_bits([x[1] for x in healthy], [x[1] for x in spoiled])
-    assert same_bits(grads(1), healthy)
-
-
-@NAMES
 def test_there_is_no_second_derivative(name):
     vertices, faces = MESHES[1]
     given = leaves([vertices, *values_of(name, vertices, faces)])
@@ -311,7 +289,8 @@ OUTSIDE = (
 @pytest.mark.parametrize(
     "name, eyes", [*((name, EYES) for name in OUTSIDE), ("depth", INSIDE), ("faces", INSIDE)]
 )
-def test_compile_and_vmap_give_the_same(name, eyes):
+def test_transforms_of_torch(name, eyes):
+    """Those of torch.func have the bits of backward(); there is no forward mode and no second derivative."""
     vertices, faces = MESHES[1]
     values = values_of(name, vertices, faces)
 
@@ -319,28 +298,60 @@ def test_compile_and_vmap_give_the_same(name, eyes):
         images = FUNCTIONS[name][0](vertices, faces, eyes[0], (12, 16), *values)
         return sum(x.square().mean() for x in images if x.is_floating_point())
 
+    many, one = torch.stack([0.9 * vertices, vertices]), torch.ones(())
+    grad, vmap = torch.func.grad(loss), torch.func.vmap
+    each = [value_and_gradients(loss, mesh) for mesh in many]
+    wanted = [torch.stack(x) for x in zip(*each, strict=True)]
+    assert wanted[1].flatten(1).any(1).all()
+    last = vmap(grad, in_dims=2, out_dims=2)(many.permute(1, 2, 0)).permute(2, 0, 1)
+    assert same_bits([vmap(loss)(many), vmap(grad)(many), last], [*wanted, wanted[1]])
+    value, pull = torch.func.vjp(loss, vertices)
+    with torch.no_grad():
+        without_graph = pull(one)[0]
+    # Through an inner transform, too.
+    nested = torch.func.grad(lambda x: torch.func.grad(lambda scale: scale * loss(x))(one))
+    alone = grad(vertices), nested(vertices), torch.func.jacrev(loss)(vertices), pull(one)[0]
+    for found in (*alone, without_graph):
+        assert same_bits([value, found], each[1])
+
     torch._dynamo.reset()
-    wanted = torch.func.grad(loss)(vertices)
-    close = dict(rtol=1e-4, atol=1e-5 * float(wanted.abs().max()))
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    leaf = leaf_of(vertices)
-    assert_close(torch.autograd.grad(compiled(leaf), leaf)[0], wanted, **close)
-    many = torch.stack([0.9 * vertices, vertices])
-    assert_close(torch.func.vmap(torch.func.grad(loss))(many)[1], wanted, **close)
-    assert wanted.any()
+    assert_near(value_and_gradients(compiled, vertices), each[1], 1e-5)
+
+    with pytest.raises(RuntimeError, match="has no second derivative"):
+        torch.func.grad(lambda x: grad(x).sum())(vertices)
+    for leaf in (vertices, leaf_of(vertices)):
+        with (
+            forward_ad.dual_level(),
+            pytest.raises(RuntimeError, match=r"no forward-mode derivative.*use reverse mode"),
+        ):
+            loss(forward_ad.make_dual(leaf, vertices))
+    with pytest.raises(RuntimeError, match="no forward-mode derivative"):
+        torch.func.jvp(loss, (vertices,), (vertices,))
 
 
 @NAMES
+@pytest.mark.parametrize("eyes", [EYES, INSIDE], ids=["outside", "inside"])
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_tensors_are_staged_through_the_host(name):
-    mesh = MESHES[1]
-    values = values_of(name, *mesh)
-    on_host = outcome(name, *mesh, values, EYES[0])
-    there = outcome(name, *(x.cuda() for x in mesh), [x.cuda() for x in values], EYES[0].cuda())
-    for a, b in zip((*on_host[0], *on_host[1]), (*there[0], *there[1]), strict=True):
-        assert b.is_cuda
-        error = (a - b.cpu()).abs().flatten().double()
-        assert error.quantile(0.98) <= 1e-3 * a.abs().max()  # a GPU rounds the camera otherwise
+def test_cuda_tensors_are_staged_through_the_host(name, eyes, device="cuda"):
+    """A camera may stay on the host; each gradient lies where its tensor does."""
+    vertices, faces = MESHES[1]
+    given = vertices, eyes[0], *values_of(name, vertices, faces)
+
+    def draw(vertices, *others):
+        images = FUNCTIONS[name][0](vertices, faces.to(vertices.device), others[0], 20, *others[1:])
+        assert all(x.device == vertices.device for x in images)
+        return torch.cat([x.flatten() for x in images if x.is_floating_point()])
+
+    wanted = value_and_gradients(draw, *given, upstream=torch.ones(()))
+    there = [x.to(device) for x in given]
+    one = torch.ones((), device=device)
+    for inputs in (there, [there[0], given[1], *there[2:]]):
+        found = value_and_gradients(draw, *inputs, upstream=one)
+        for a, b, x in zip(wanted, found, [one, *inputs], strict=True):
+            assert b.device == x.device
+            error = (a - b.cpu()).abs().flatten().double()
+            assert error.quantile(0.98) <= 1e-3 * a.abs().max()  # a GPU rounds the camera otherwise
 
 
 def call_everything(dtype, packed):

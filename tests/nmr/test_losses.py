@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from scenes import assert_near, double, leaf_of, uniform, value_and_gradients
+from scenes import assert_near, double, leaf_of, same_bits, uniform, value_and_gradients
 from torch.autograd import gradcheck
 from torch.testing import assert_close
 from vectors import load_vector, tensors_of, vector_names
@@ -178,7 +178,13 @@ def test_losses_have_true_derivatives(loss):
     vertices, faces = nmr.icosphere(0)
     uneven = vertices * double([[[1.0, 0.7, 0.5]], [[0.4, 1.0, 0.9]]])
     table = faces if loss in ON_FACES else nmr.edge_table(faces)
-    gradcheck(lambda x: loss(x, table), leaf_of(uneven))
+    forward = loss is not smoothness_loss
+    gradcheck(lambda x: loss(x, table), leaf_of(uneven), check_forward_ad=forward)
+    if not forward:
+        with pytest.raises(RuntimeError, match="no forward-mode derivative"):
+            torch.func.jvp(lambda x: loss(x, table), (uneven,), (uneven,))
+    grad = torch.func.grad(lambda x: loss(x, table))
+    assert same_bits(torch.func.vmap(grad)(uneven), map(grad, uneven))
 
 
 @pytest.mark.parametrize("sizes", [[0.0, 0, 0], [1.0, 0, 0]], ids=["point", "line"])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 import torch
 from children import environment
-from scenes import bumpy_sphere, leaf_of, same_bits, uniform
+from scenes import bumpy_sphere, for_threads, leaf_of, same_bits, uniform
 
 import nmr
 import nmr.neural_renderer as nr
@@ -89,7 +89,7 @@ def drawn(render, **how):
     """A function that draws: of vertices, faces and eyes."""
 
     def draw(vertices, faces, eye):
-        return tuple(render(vertices, faces, nmr.LookAt(eye), **SIZE, **how))
+        return render(vertices, faces, nmr.LookAt(eye), **SIZE, **how)
 
     return Call(draw, MESH | EYE)
 
@@ -219,16 +219,16 @@ CALLS = {
     "nmr.render_silhouette near": drawn(nmr.render_silhouette, near=2.0),
     "nmr.render_soft": drawn(nmr.render_soft, sigma=1e-3, gamma=0.02, faces_per_pixel=3),
     "nmr.render_soft sigma": Call(
-        lambda sigma, gamma: tuple(
-            nmr.render_soft(SPHERE, FACES, nmr.LookAt(EYES), sigma=sigma, gamma=gamma, **SIZE)
+        lambda sigma, gamma: nmr.render_soft(
+            SPHERE, FACES, nmr.LookAt(EYES), sigma=sigma, gamma=gamma, **SIZE
         ),
         {"sigma": torch.tensor([1e-3]), "gamma": torch.tensor([0.02])},
     ),
     "nmr.render_soft_silhouette": drawn(nmr.render_soft_silhouette, sigma=1e-3),
     "nmr.render_transparent": drawn(nmr.render_transparent, faces_per_pixel=3),
     "nmr.render_transparent opacity": Call(
-        lambda opacity: tuple(
-            nmr.render_transparent(SPHERE, FACES, nmr.LookAt(EYES), opacity=opacity, **SIZE)
+        lambda opacity: nmr.render_transparent(
+            SPHERE, FACES, nmr.LookAt(EYES), opacity=opacity, **SIZE
         ),
         {"opacity": torch.tensor([0.3] * 2)},
     ),
@@ -243,9 +243,7 @@ CALLS = {
     ),
     "nmr.VertexColors": colored(nmr.VertexColors, {"colors": noise(len(SPHERE), 3)}),
     "nmr.VertexColors soft": colored(
-        nmr.VertexColors,
-        {"colors": noise(len(SPHERE), 3)},
-        lambda *a, **k: tuple(nmr.render_soft(*a, **k)),
+        nmr.VertexColors, {"colors": noise(len(SPHERE), 3)}, nmr.render_soft
     ),
     "nmr.FaceColors": colored(nmr.FaceColors, {"colors": noise(len(FACES), 3)}),
     "nmr.TextureCubes": colored(nmr.TextureCubes, {"textures": CUBES}),
@@ -300,7 +298,7 @@ CALLS = {
     "metrics.voxel_precision_recall": Call(metrics.voxel_precision_recall, GRIDS),
     "cameras.Projection": seen(cameras.Projection, PROJECTION),
     "cameras.cat": Call(
-        lambda eye, points: cameras.cat([nmr.LookAt(eye)[1], nmr.LookAt(eye[0])]).unproject(points),
+        lambda eye, points: cameras.cat([nmr.LookAt(eye)[0], nmr.LookAt(eye[1])]).unproject(points),
         EYE | {"points": noise(4, 3)},
     ),
     "cameras.from_opencv": seen(
@@ -373,7 +371,7 @@ CALLS = {
         {"faces": CORNERS, "textures": CUBES},
     ),
     "nr.rasterize_rgbad": Call(
-        lambda faces, textures: tuple(nr.rasterize_rgbad(faces, textures, 8).values()),
+        lambda faces, textures: nr.rasterize_rgbad(faces, textures, 8).values(),
         {"faces": CORNERS, "textures": CUBES},
     ),
     "nr.rasterize_silhouettes": Call(
@@ -429,7 +427,8 @@ def test_the_table_has_every_public_function():
 
 def results_of(call, tensors):
     results = call.function(**tensors)
-    return [x for x in (results if isinstance(results, tuple) else (results,)) if x is not None]
+    results = [results] if isinstance(results, torch.Tensor) else results
+    return [x for x in results if x is not None]
 
 
 def loss_of(results):
@@ -552,6 +551,32 @@ def test_a_change_in_place_is_seen(name):
 
 
 @EACH
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone(name, bad):
+    """Of every result: a gradient scaler must see it, and the other images must not."""
+    tensors = {
+        k: leaf_of(x) if x.is_floating_point() else x for k, x in CALLS[name].tensors.items()
+    }
+    behind = [x for x in tensors.values() if x.requires_grad]
+    for result in results_of(CALLS[name], tensors):
+        if not result.requires_grad or result.ndim == 0:
+            continue
+
+        def grads(factor, result=result):
+            upstream = torch.ones_like(result)
+            upstream[0] *= factor
+            return torch.autograd.grad(
+                result, behind, upstream, True, allow_unused=True, materialize_grads=True
+            )
+
+        healthy, spoiled = grads(1), grads(bad)
+        reached = any(x.any() for x in healthy)
+        assert not reached or not all(x.isfinite().all() for x in spoiled)
+        for x, a, b in zip(behind, healthy, spoiled, strict=True):
+            assert len(same(x)) == len(x) or torch.equal(a[1], b[1])
+
+
+@EACH
 def test_torch_func_has_the_same_gradient(name):
     call = CALLS[name]
     for argument, x in call.tensors.items():
@@ -575,8 +600,10 @@ def everything():
     return found
 
 
-def test_several_python_threads_at_once():
-    wanted = everything()
+def test_any_number_of_threads_and_several_python_threads_at_once():
+    wanted, *others = for_threads((1, 2, 5), everything)
+    for name, results in wanted.items():
+        assert all(same_bits(found[name], results) for found in others), name
     with ThreadPoolExecutor(4) as pool:
         for found in [future.result() for future in [pool.submit(everything) for _ in range(4)]]:
             for name, results in found.items():

@@ -11,6 +11,7 @@ import pytest
 
 import nmr
 import nmr.neural_renderer as nr
+import nmr.nvdiffrast.torch
 
 BODY = {
     "__init__.py": "",
@@ -37,7 +38,8 @@ def no_alias(monkeypatch, tmp_path):
     """No test sees the alias of another, and none leaves one."""
 
     def belongs(key):
-        return key.partition(".")[0] in ("neural_renderer", "body", "external", "nmr_alias")
+        names = "neural_renderer", "nvdiffrast", "body", "external", "nmr_alias"
+        return key.partition(".")[0] in names
 
     for key in filter(belongs, list(sys.modules)):
         monkeypatch.delitem(sys.modules, key)
@@ -103,25 +105,12 @@ def test_other_names_and_second_calls():
             nr.install_as(name)
 
 
-def test_a_copy_inside_of_a_package(tmp_path):
-    package(
-        tmp_path,
-        "body",
-        **{"__init__.py": "", "fit.py": "from .external.neural_renderer import projection\n"},
-    )
+@pytest.mark.parametrize("parent", ["body.external", "external", "nmr_alias.external"])
+def test_a_copy_inside_of_a_package(tmp_path, parent):
+    """The package may be one of the caller's, or there is none."""
+    fit = "from .external.neural_renderer import projection\n"
+    package(tmp_path, "body", **{"__init__.py": "", "fit.py": fit})
     package(tmp_path / "body", "external", **{"__init__.py": ""})
-    nr.install_as("body.external.neural_renderer")
-    assert importlib.import_module("body.fit").projection is nr.projection
-    namespace = {}
-    exec(
-        "import body.external.neural_renderer as nr\nfrom body.external import neural_renderer as same",
-        namespace,
-    )
-    assert namespace["nr"] is namespace["same"] is nr
-
-
-@pytest.mark.parametrize("parent", ["external", "nmr_alias.external"])
-def test_a_copy_inside_of_a_package_that_does_not_exist(parent):
     nr.install_as(f"{parent}.neural_renderer")
     namespace = {}
     exec(
@@ -130,6 +119,15 @@ def test_a_copy_inside_of_a_package_that_does_not_exist(parent):
     )
     assert namespace["nr"] is namespace["same"] is nr
     assert importlib.import_module(f"{parent}.neural_renderer.look").look is nr.look
+    if parent == "body.external":
+        assert importlib.import_module("body.fit").projection is nr.projection
+
+
+def test_nvdiffrast_too(tmp_path):
+    (tmp_path / "nvdiffrast").mkdir()  # a checkout beside the script is no package
+    nmr.nvdiffrast.install_as()
+    assert importlib.import_module("nvdiffrast.torch") is nmr.nvdiffrast.torch
+    assert sys.modules["nvdiffrast"].torch is nmr.nvdiffrast.torch
 
 
 def test_an_alias_by_hand_has_its_modules():
