@@ -40,12 +40,10 @@ def face_index(
     depth = torch.full((H, W), far, dtype=vertices.dtype)
     index = torch.full((H, W), -1)
     for f, corners in enumerate(vertices[with_back_faces(faces, fill_back)]):
-        (x, y, z), flat = corners.unbind(1), corners[:, :2].double()
-        if (
-            not corners[:, :2].isfinite().all()
-            or z.isnan().any()
-            or torch.linalg.det(flat[1:] - flat[0]) == 0
-        ):
+        x, y, z = corners.unbind(1)
+        p, q, r = vertices[faces[f % len(faces)], :2].double()  # both copies have the same area
+        no_area = (q - p)[0] * (r - p)[1] == (q - p)[1] * (r - p)[0]
+        if no_area or not corners[:, :2].isfinite().all() or z.isnan().any():
             continue
         left, right = _cross(corners[2], corners[0], corners[1])
         if left < right:

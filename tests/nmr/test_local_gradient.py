@@ -17,29 +17,6 @@ def gradient_of(vertices, faces, upstream, **kwargs):
     )[1]
 
 
-RECTANGLES = [(7, 16), (15, 6), (1, 9), (9, 1)]
-
-
-@pytest.mark.parametrize(
-    "seed, size", [*((seed, (15, 15)) for seed in range(4)), *((2, size) for size in RECTANGLES)]
-)
-def test_equals_the_slow_definition(seed, size, anti_aliasing, fill_back):
-    vertices, faces = random_soup(seed)
-    upstream = normal(2, *size, seed=seed)
-    eps = (1e-4, 2.0)[seed % 2]  # 2: many ties
-    how = dict(anti_aliasing=anti_aliasing, fill_back=fill_back, eps=eps)
-    grad = gradient_of(vertices, faces, upstream, **how)
-    raster = tuple(n * (1 + anti_aliasing) for n in size)
-    for b in range(2):
-        index = reference.face_index(vertices[b], faces, raster, fill_back)
-        assert fill_back == bool((index >= len(faces)).any())  # reversed copies own pixels, too
-        expected = reference.local_gradient(
-            vertices[b], faces, index, upstream[b], anti_aliasing, eps
-        )
-        assert_close(grad[b], expected, rtol=1e-9, atol=1e-9)
-    assert grad[..., :2].any() and not grad[..., 2].any()
-
-
 # It covers columns 1..4 and rows 1..4 of 8 x 8 pixels (2 / R = 1/4): its right end lies between columns 4 and 5.
 BLOCK = (-0.75, -0.25, 0.25, 0.75)
 

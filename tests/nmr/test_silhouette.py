@@ -14,22 +14,31 @@ import nmr
 RECTANGLES = [(7, 16), (15, 6), (1, 9), (9, 1)]
 
 
+@pytest.mark.parametrize("gradient", ["nmr", "local"])
 @pytest.mark.parametrize(
-    "seed, size", [(seed, (15, 15)) for seed in range(6)] + [(5, size) for size in RECTANGLES]
+    "seed, size", [(seed, (15, 15)) for seed in range(6)] + [(2, size) for size in RECTANGLES]
 )
-def test_equals_the_slow_definition(seed, size, anti_aliasing, fill_back):
+def test_equals_the_slow_definition(seed, size, gradient, anti_aliasing, fill_back):
     vertices, faces = random_soup(seed)
     upstream, raster = normal(2, *size, seed=seed), tuple(n * (1 + anti_aliasing) for n in size)
-    how = dict(image_size=size, anti_aliasing=anti_aliasing, fill_back=fill_back)
+    eps = (1e-4, 2.0)[seed % 2]  # 2: many ties of local gradients
+    how = dict(anti_aliasing=anti_aliasing, eps=eps)
     alpha, grad = value_and_gradients(
-        lambda x: nmr.render_silhouette(x, faces, **how), vertices, upstream=upstream
+        lambda x: nmr.render_silhouette(
+            x, faces, image_size=size, fill_back=fill_back, gradient=gradient, **how
+        ),
+        vertices,
+        upstream=upstream,
     )
     for b, mesh in enumerate(vertices):
         index = reference.face_index(mesh, faces, raster, fill_back)
+        assert fill_back == bool((index >= len(faces)).any())  # reversed copies own pixels, too
         assert torch.equal(alpha[b], reference.silhouette(index, anti_aliasing, torch.float64))
-        slow = reference.silhouette_gradient(
-            mesh, faces, index, upstream[b], anti_aliasing, fill_back
-        )
+        given = mesh, faces, index, upstream[b]
+        if gradient == "nmr":
+            slow = reference.silhouette_gradient(*given, fill_back=fill_back, **how)
+        else:
+            slow = reference.local_gradient(*given, **how)
         assert_near(grad[b], slow, 1e-9)
     assert grad[..., :2].any() and not grad[..., 2].any()
 
@@ -52,7 +61,14 @@ def almost_equally_near(vertices, seed):
     return torch.stack([x, y, z], dim=-1)
 
 
-@pytest.mark.parametrize("place", [None, on_pixel_centres, almost_equally_near])
+def almost_on_a_line(vertices, seed):
+    """Faces so thin that rounding puts pixels beyond their ends inside of their edges."""
+    a, b, c = on_pixel_centres(vertices, seed).unflatten(1, (-1, 3)).unbind(2)
+    c[..., :2] = torch.lerp(a, b, 0.3)[..., :2]
+    return torch.stack([a, b, c], dim=2).flatten(1, 2)
+
+
+@pytest.mark.parametrize("place", [None, on_pixel_centres, almost_equally_near, almost_on_a_line])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_face_index_map_is_the_definition(place, seed, dtype, perspective):
     """Of several sizes; every third soup is cut by near and far."""
@@ -60,7 +76,8 @@ def test_the_face_index_map_is_the_definition(place, seed, dtype, perspective):
     vertices = vertices.to(dtype)
     vertices = vertices if place is None else place(vertices, seed)
     near, far = (1.3, 1.7) if seed % 3 == 1 and place is None else (0.1, 100.0)
-    sizes = [(16, 16)] if place is on_pixel_centres else [(24, 24), (6, 45)]
+    on_centres = place in (on_pixel_centres, almost_on_a_line)
+    sizes = [(16, 16)] if on_centres else [(24, 24), (6, 45)]
     for size in sizes:
         how = seed % 2 == 0, near, far, perspective
         drawn = nmr.ops.rasterize(vertices, faces, None, *size, *how)
@@ -85,6 +102,22 @@ def test_row_zero_is_the_top_and_winding_matters_without_fill_back():
     assert alpha[0, :5, 5:].any() and not alpha[0, 5:].any() and not alpha[0, :, :5].any()
     assert not draw([0, 2, 1], fill_back=False).any()
     assert torch.equal(draw([0, 2, 1]), alpha)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_one_number_that_is_not_finite_reaches_every_visible_face_of_its_image(bad):
+    vertices, faces = random_soup(0)
+    upstream = normal(2, 12, 12)
+    upstream[0, 5, 5] = bad
+    _, grad = value_and_gradients(
+        lambda x: nmr.render_silhouette(x, faces, image_size=12, anti_aliasing=False),
+        vertices,
+        upstream=upstream,
+    )
+    seen = nmr.render_face_index(vertices, faces, image_size=12)[0].unique()[1:].long()
+    wanted = torch.zeros_like(grad, dtype=torch.bool)
+    wanted[0, faces[seen], :2] = True
+    assert 3 < len(seen) < len(faces) and torch.equal(grad.isnan(), wanted)
 
 
 def test_one_openmp_runtime():
