@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
-from scenes import any_number, double, leaf_of, normal, same_bits, uniform, value_and_gradients
+from scenes import any_number, double, leaf_of, same_bits, uniform, value_and_gradients
 from torch.autograd import gradcheck
 from torch.testing import assert_close
 from vectors import load_vector, tensors_of
@@ -18,12 +18,6 @@ from vectors import load_vector, tensors_of
 import nmr
 import nmr.neural_renderer as nr
 from nmr.cameras import Projection, points_from_angles
-
-
-def test_the_origin_is_at_the_centre_at_the_eye_distance():
-    camera = nmr.LookAt.from_angles(2.5, [0.0, 30.0, -40.0], [0.0, 77.0, 200.0])
-    out = camera.transform(torch.zeros(1, 1, 3))
-    assert_close(out, torch.tensor([[[0.0, 0.0, 2.5]]] * 3), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("fov", [30.0, torch.tensor(30.0), torch.tensor([30.0]), [30.0]])
@@ -44,9 +38,6 @@ def test_orthographic_keeps_sizes():
     points = torch.tensor([[0.4, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 2.0, 7.0]])
     expected = torch.tensor([[[0.2, 0.0, 2.0], [0.0, 1.0, 2.0], [0.0, 1.0, 9.0]]])
     assert_close(camera.transform(points), expected, atol=1e-6, rtol=0)
-
-
-# (crossed along the batch) and no vertex on the optical axis (NaN). Those two are tested further down.
 
 
 def identity_intrinsics(camera, dtype=torch.float32):
@@ -154,50 +145,6 @@ def test_gradcheck_in_all_parameters(name):
     )
 
 
-def test_a_batch_of_three_is_three_cameras():
-    """Upstream crosses along the batch axis when it is 3 (defect 5, fixed)."""
-    eye = torch.tensor([[0.3, 1.0, -3.0], [2.0, 0.5, 1.0], [-1.0, 2.0, 0.5]])
-    points = torch.rand(3, 4, 3)
-    one_by_one = [nmr.LookAt(e).transform(p[None]) for e, p in zip(eye, points, strict=True)]
-    assert torch.equal(nmr.LookAt(eye).transform(points), torch.cat(one_by_one))
-
-
-CAMERAS = {
-    "LookAt": nmr.LookAt,
-    "Look": lambda e: nmr.Look(e, -e.detach(), half_fov_deg=torch.full(e.shape[:-1], 40.0)),
-    "Orthographic": nmr.Orthographic,
-    "Pinhole": lambda e: nmr.Pinhole(
-        CALIBRATION[0], torch.eye(3), e + 4.0, [0.1, 0, 0, 0.1, 0.2], orig_size=256
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-@pytest.mark.parametrize("one_camera", [False, True])
-def test_packed_is_one_by_one(name, one_camera):
-    """Bit for bit, images and gradients; one of the meshes is empty."""
-    sizes = [5, 600, 0, 33]
-    vertices, upstream = uniform(638, 3).float() - 0.5, normal(638, 3).float()
-    eye = torch.tensor([[0.0, 0.0, -2.0]]) + 0.1 * normal(1 if one_camera else 4, 3).float()
-    first = torch.tensor([0, *np.cumsum(sizes)])
-    starts = torch.stack([first, torch.tensor([0, 3, 9, 9, 20])], dim=1)
-
-    def draw(vertices, eye, *starts):
-        return CAMERAS[name](eye).transform(vertices, *starts)
-
-    packed, grad, eye_grad = value_and_gradients(
-        lambda *given: draw(*given, starts), vertices, eye, upstream=upstream
-    )
-    eye_sum = torch.zeros_like(eye)
-    for b, (mesh, up) in enumerate(zip(vertices.split(sizes), upstream.split(sizes), strict=True)):
-        own = 0 if one_camera else b
-        out, alone, own_eye = value_and_gradients(draw, mesh, eye[own], upstream=up[None])
-        assert torch.equal(out[0], packed.split(sizes)[b])
-        assert torch.equal(alone, grad.split(sizes)[b])
-        eye_sum[own] += own_eye
-    assert_close(eye_grad, eye_sum, rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.parametrize("make, name", [(nmr.LookAt, "half_fov_deg"), (nmr.Orthographic, "scale")])
 def test_fields_of_view_and_scales_under_vmap(make, name):
     points, values = torch.rand(1, 5, 3), torch.tensor([20.0, 30.0])
@@ -207,11 +154,6 @@ def test_fields_of_view_and_scales_under_vmap(make, name):
 
     many = torch.func.vmap(transform)(values)
     assert torch.equal(many, torch.stack([transform(x) for x in values]))
-
-
-def test_an_eye_at_the_place_that_it_looks_at_warns():
-    with pytest.warns(UserWarning, match="or at its own place"):
-        nmr.LookAt([[0.0, 1.0, 2.0], [0.0, 0.0, 0.0]])
 
 
 @pytest.mark.parametrize(
@@ -241,17 +183,6 @@ def test_a_right_handed_camera_shows_the_picture_flipped(make):
     if not isinstance(right, nmr.Orthographic):
         rotation = nmr.cameras.to_opencv(right, height=32, width=32)[1]
         assert_close(torch.linalg.det(rotation), torch.ones(len(rotation)).to(rotation))
-
-
-def test_warnings_name_the_line_that_made_the_camera():
-    for make in (
-        lambda: nmr.LookAt([0.0, 3.0, 0.0]),
-        lambda: nmr.LookAt.from_angles(3.0, 90.0, 0.0),
-        lambda: nr.look_at(torch.rand(1, 4, 3), [0.0, 3.0, 0.0]),
-    ):
-        with pytest.warns(UserWarning, match="up vector") as warned:
-            make()
-        assert warned[0].filename == __file__
 
 
 def test_looking_straight_down_warns():

@@ -176,14 +176,21 @@ def test_a_corner_in_the_plane_of_the_eye():
 
 
 def test_near_zero():
-    def alpha(mesh, near):
-        return nmr.render_silhouette(*mesh, CAMERA, image_size=SIZE, near=near)
+    """It is the limit of small ones, and what it draws of a face does not depend on the others."""
+    small = 5e-4 * torch.tensor([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 1.0, 1.0]])
+    face, (vertices, faces) = torch.tensor([[0, 1, 2]]), floor(1)
 
-    zero = alpha(floor(1), 0.0)
-    assert torch.equal(zero, alpha(floor(150), 0.0))
-    tiny = [alpha(floor(1), near) for near in (1e-6, 1e-7, 1e-12)]
+    def alpha(vertices, faces, near=0.0):
+        return nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near)
+
+    zero = alpha(vertices, faces)
+    assert torch.equal(zero, alpha(*floor(150)))
+    tiny = [alpha(vertices, faces, near) for near in (1e-6, 1e-7, 1e-12)]
     assert torch.equal(tiny[0], tiny[1]) and torch.equal(tiny[0], tiny[2])
     assert (tiny[0] >= zero).all()
+    assert not alpha(small, face).any() and alpha(small, face, near=1e-6).any()
+    joint = torch.cat([vertices, small]), torch.cat([faces, face + len(vertices)])
+    assert torch.equal(alpha(*joint), zero)
 
 
 @pytest.mark.parametrize(
@@ -222,15 +229,3 @@ def test_what_is_nearer_than_near_is_never_drawn(camera):
         )
         assert both.face_index.unique().tolist() == [-1, 8] and not both.covered[1].any()
         assert both.weights.min() >= 0 and both.weights.max() <= 1
-
-
-def test_near_zero_draws_the_same_whatever_other_faces_do():
-    small = 5e-4 * torch.tensor([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 1.0, 1.0]])
-    face, (vertices, faces) = torch.tensor([[0, 1, 2]]), floor(1)
-
-    def alpha(vertices, faces, near=0.0):
-        return nmr.render_silhouette(vertices, faces, CAMERA, image_size=SIZE, near=near)
-
-    assert not alpha(small, face).any() and alpha(small, face, near=1e-6).any()
-    joint = torch.cat([vertices, small]), torch.cat([faces, face + len(vertices)])
-    assert torch.equal(alpha(*joint), alpha(vertices, faces))

