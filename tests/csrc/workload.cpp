@@ -1,8 +1,8 @@
-// Every stage on deformed spheres of 1280 faces, 64x64 anti-aliased (workload W1 of
-// tools/bench/bench.py): a program whose instructions can be counted and whose results can be
+// Every stage on deformed spheres of 1280 faces, 64x64 anti-aliased, as in workload W1 of
+// tools/bench/bench.py: a program whose instructions can be counted and whose results can be
 // compared between builds.
-//   workload IMAGES         prints hashes of the results, in float and double, also those of small
-//   meshes workload IMAGES RUNS    runs every stage so many times in float
+//   workload IMAGES         prints hashes of the results in float and double, small meshes too
+//   workload IMAGES RUNS    runs every stage so many times in float
 #include <cinttypes>
 #include <cstdio>
 #include <cstdlib>
@@ -12,35 +12,10 @@
 namespace nmr::test {
 namespace {
 
-// Icospheres with axes scaled by 0.4..1.2 and noise of deviation 0.03, times 0.5, in world space.
-// The camera is 2.732 away at an elevation of 30 degrees, half field of view 15; the azimuth comes
-// as (cos, sin) of a multiple of 3-4-5 angles: no sine of any C library has a part in it.
 template <class T>
 Scene<T> spheres(int64_t batch) {
-  const Mesh ball = icosphere(3);
-  std::vector<Mesh> meshes(batch, ball);
-  double c = 1, s = 0;
-  for (int64_t b = 0; b < batch; ++b) {
-    const double c_next = 0.8 * c - 0.6 * s;
-    s = 0.6 * c + 0.8 * s;
-    c = c_next;
-    const double sin_e = 0.5, cos_e = std::sqrt(0.75), tan_half = 2 - std::sqrt(3.0),
-                 distance = 2.732;
-    for (size_t n = 0; n < ball.vertices.size(); n += 3) {
-      double v[3];
-      for (int k = 0; k < 3; ++k) {
-        double normal = 0;  // a sum of four uniform numbers, of deviation 1
-        for (int j = 0; j < 4; ++j) normal += noise(b + 1, 100 + 4 * (n + k) + j) * std::sqrt(0.75);
-        v[k] = 0.5 * ((0.8 + 0.4 * noise(b + 1, k)) * ball.vertices[n + k] + 0.03 * normal);
-      }
-      const double x = c * v[0] + s * v[2],
-                   z = -s * v[0] + c * v[2];  // turned about y, then tilted
-      const double depth = distance + cos_e * z - sin_e * v[1], up = sin_e * z + cos_e * v[1];
-      meshes[b].vertices[n] = x / depth / tan_half;
-      meshes[b].vertices[n + 1] = up / depth / tan_half;
-      meshes[b].vertices[n + 2] = depth;
-    }
-  }
+  std::vector<Mesh> meshes;
+  for (int64_t b = 0; b < batch; ++b) meshes.push_back(sphere(3, b + 1));
   Scene<T> scene = stack<T>(meshes, true);
   scene.image = {64, 64};
   scene.seed = 107;  // lights of all kinds, mipmaps
