@@ -122,15 +122,15 @@ struct FaceSums {
   }
 };
 
-// Calls body(block) for every block of every image. face_count(b) is the number of faces of image
-// b: its blocks do not depend on other images.
-template <class FaceCount, class Body>
-void for_blocks(int64_t batch, Size raster, int num_threads, const FaceCount& face_count,
-                const Body& body) {
+// Calls body(block) for every block of every image. faces: those of the images. The blocks of an
+// image do not depend on other images.
+template <class Body>
+void for_blocks(int64_t batch, Size raster, int num_threads, const Rows& faces, const Body& body) {
   int64_t most = 1;
-  for (int64_t b = 0; b < batch; ++b) most = std::max(most, RowBlocks(raster, face_count(b)).count);
+  for (int64_t b = 0; b < batch; ++b)
+    most = std::max(most, RowBlocks(raster, faces.count(b)).count);
   parallel_for(batch * most, num_threads, [&](int64_t task) {
-    const RowBlock block{RowBlocks(raster, face_count(task / most)), task / most, task % most};
+    const RowBlock block{RowBlocks(raster, faces.count(task / most)), task / most, task % most};
     if (block.number < block.blocks.count) body(block);
   });
 }
@@ -138,15 +138,15 @@ void for_blocks(int64_t batch, Size raster, int num_threads, const FaceCount& fa
 // Calls produce(block, result) for every block of every image, on several threads, and then
 // consume(b, result) for each block. Blocks that add to the same output are consumed one after the
 // other, in ascending order of image and block. Each image has its own output, unless the images
-// share one. face_count: as in for_blocks.
-template <class Result, class FaceCount, class Produce, class Consume>
-void sum_blocks(int64_t batch, Size raster, bool shared, int num_threads,
-                const FaceCount& face_count, const Produce& produce, const Consume& consume) {
+// share one. faces: as in for_blocks.
+template <class Result, class Produce, class Consume>
+void sum_blocks(int64_t batch, Size raster, bool shared, int num_threads, const Rows& faces,
+                const Produce& produce, const Consume& consume) {
   const ScratchUse use;
   if (!shared && batch >= num_threads) {
     parallel_for(batch, num_threads, [&](int64_t b) {
       Result& result = thread_scratch<Result>();
-      const RowBlocks blocks(raster, face_count(b));
+      const RowBlocks blocks(raster, faces.count(b));
       for (int64_t n = 0; n < blocks.count; ++n) {
         produce(RowBlock{blocks, b, n}, result);
         consume(b, result);
@@ -167,7 +167,7 @@ void sum_blocks(int64_t batch, Size raster, bool shared, int num_threads,
   };
   const size_t wave = num_threads <= 1 ? 1 : 4 * static_cast<size_t>(num_threads);
   for (int64_t b = 0; b < batch; ++b) {
-    const RowBlocks blocks(raster, face_count(b));
+    const RowBlocks blocks(raster, faces.count(b));
     for (int64_t n = 0; n < blocks.count; ++n) {
       tasks.push_back({blocks, b, n});
       if (tasks.size() == wave) flush();

@@ -6,82 +6,7 @@
 #include <limits>
 #include <vector>
 
-#include "distortion.h"
-#include "parallel.h"
-#include "stages.h"
-
-namespace nmr {
-namespace {
-
-// Vertices per task. Sums are taken per chunk, in kGroup partial sums, then over chunks: the same
-// on every processor.
-constexpr int64_t kVertexChunk = 512;
-
-// The gradient of one camera, summed over vertices. Numbers are double, or kGroup partial sums.
-template <class Number>
-struct LensGradient {
-  Number matrix[12], intrinsics[6], distortion[kMostCoefficients];
-};
-struct CameraGradient : LensGradient<double> {
-  double origin[3], extent;  // these follow from the sums
-};
-
-// Derivatives, and gradients multiplied by them, count as infinite beyond this limit. It is small
-// enough that sums cannot overflow.
-template <class T>
-constexpr T kLimit = T(1e200);
-template <>
-constexpr float kLimit<float> = 1e30f;
-
-// The camera of one image.
-template <class T>
-struct Lens {
-  T a[12], k[6], d[kMostCoefficients], o[3], extent, inverse_extent;
-  T reach2;  // largest r^2 at which the distortion is that of a lens
-  T largest_a, largest_k,
-      largest_d;  // largest |a|, |k / extent|, |d|; the first and the last at least 1
-  bool usable;    // all of it is finite, and extent is not 0
-
-  Lens(const Project<T>& args, int64_t b)
-      : d{},
-        o{},
-        extent(1),
-        reach2(std::numeric_limits<T>::infinity()),
-        largest_a(1),
-        largest_k(0),
-        largest_d(1),
-        usable(true) {
-    const T* camera = args.camera + (args.cameras == args.batch ? kCamera * b : 0);
-    std::copy_n(camera, 12, a);
-    std::copy_n(camera + kIntrinsics, 6, k);
-    std::copy_n(camera + kOrigin, 3, o);
-    extent = camera[kExtent];
-    if (args.distortion.values)
-      std::copy_n(args.distortion.of(b, args.coefficients), args.coefficients, d);
-    inverse_extent = 1 / extent;
-    for (T value : a) largest_a = std::max(largest_a, std::abs(value));
-    for (T value : k) largest_k = std::max(largest_k, std::abs(value * inverse_extent));
-    for (T value : d) largest_d = std::max(largest_d, std::abs(value));
-    for (T value : a) usable = usable && std::isfinite(value);
-    for (T value : k) usable = usable && std::isfinite(value * inverse_extent);
-    for (T value : d) usable = usable && std::abs(value) < kLimit<T>;
-    for (T value : o) usable = usable && std::isfinite(value);
-    usable = usable && std::isfinite(extent) && std::isfinite(inverse_extent);
-    if (!args.distortion.values || !args.perspective || !usable) return;
-    const int64_t n = args.coefficients;
-    reach2 = static_cast<T>(n == 4   ? square_reach<4>(d)
-                            : n == 5 ? square_reach<5>(d)
-                                     : square_reach<8>(d));
-  }
-};
-
-// Consecutive vertices of one image: their first row in the vertices and in the points.
-struct Run {
-  int64_t image, vertices, points, count;
-};
-
-}  // namespace
-}  // namespace nmr
+#include "lens.h"
 
 #define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "project_lanes.h"
@@ -89,6 +14,10 @@ struct Run {
 
 namespace nmr {
 namespace {
+
+// Vertices per task. Sums are taken per chunk, in kGroup partial sums, then over chunks: the same
+// on every processor.
+constexpr int64_t kVertexChunk = 512;
 
 struct ProjectScratch {
   std::vector<Run> runs;
@@ -99,12 +28,12 @@ struct ProjectScratch {
 template <class T>
 const std::vector<Run>& runs_of(const Project<T>& args, ProjectScratch& scratch) {
   scratch.runs.clear();
+  const Rows &vertices = args.vertex_rows, points{vertices.size, true, vertices.starts};
   for (int64_t b = 0; b < args.batch; ++b) {
-    const int64_t points = args.starts ? args.starts[2 * b] : b * args.num_vertices;
-    const int64_t vertices = args.starts || args.vertex_batch != 1 ? points : 0;
-    const int64_t count = args.starts ? args.starts[2 * b + 2] - points : args.num_vertices;
+    const int64_t count = vertices.count(b);
     for (int64_t n = 0; n < count; n += kVertexChunk)
-      scratch.runs.push_back({b, vertices + n, points + n, std::min(kVertexChunk, count - n)});
+      scratch.runs.push_back(
+          {b, vertices.first(b) + n, points.first(b) + n, std::min(kVertexChunk, count - n)});
   }
   return scratch.runs;
 }
@@ -200,11 +129,11 @@ void project_backward(const Project<T>& args) {
   CameraGradient* gradients = of_camera ? reserve(scratch.gradients, num_runs) : nullptr;
 
   if (args.batch == 0 && args.grad_vertices)
-    std::fill_n(args.grad_vertices, 3 * args.vertex_batch * args.num_vertices, T(0));
+    std::fill_n(args.grad_vertices, 3 * args.vertex_rows.total(0), T(0));
 
   // If all images share the vertices, each chunk of vertices belongs to one task, which visits the
   // images in order.
-  const bool shared = !args.starts && args.vertex_batch == 1 && args.batch > 1;
+  const bool shared = !args.vertex_rows.each && args.batch > 1;
   const int64_t images = shared ? args.batch : 1, tasks = num_runs / images;
   parallel_for(tasks, args.num_threads, [&](int64_t task) {
     T discarded[3 * kVertexChunk];

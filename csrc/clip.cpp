@@ -45,7 +45,7 @@ NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face, T near) {
 template <class T>
 bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
   const T* vertices = mesh.image_vertices(b);
-  for (int64_t f = 0; f < mesh.face_count(b); ++f) {
+  for (int64_t f = 0; f < mesh.face_rows.count(b); ++f) {
     const int64_t* face = mesh.image_faces(b) + 3 * f;
     if (sides_of(vertices, face, near).count != 3) continue;
     const T z0 = vertices[3 * face[0] + 2], z1 = vertices[3 * face[1] + 2],
@@ -58,7 +58,7 @@ bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
 // Whether the mesh does not stay as it is.
 template <class T>
 bool changes(const MeshBatch<T>& mesh, int64_t b, T near) {
-  for (int64_t f = 0; f < mesh.face_count(b); ++f)
+  for (int64_t f = 0; f < mesh.face_rows.count(b); ++f)
     if (sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, near).cut()) return true;
   return any_around_eye(mesh, b, near);
 }
@@ -69,7 +69,7 @@ template <class T>
 void clip_count(const ClipCount<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    const int64_t num_faces = mesh.face_count(b);
+    const int64_t num_faces = mesh.face_rows.count(b);
     int64_t cut = 0, drawn = 0;
     for (int64_t f = 0; f < num_faces; ++f) {
       const Sides sides = sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, args.near);
@@ -86,7 +86,8 @@ template <class T>
 void clip_faces(const ClipFaces<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    const int64_t vertex_start = mesh.vertex_start(b), num_vertices = mesh.vertex_count(b);
+    const int64_t vertex_start = mesh.vertex_rows.first(b),
+                  num_vertices = mesh.vertex_rows.count(b);
     const int64_t first_vertex = args.starts[2 * b], last_vertex = args.starts[2 * b + 2];
     const int64_t first_face = args.starts[2 * b + 1], last_face = args.starts[2 * b + 3];
     int64_t p = first_vertex, n = first_face;
@@ -112,7 +113,7 @@ void clip_faces(const ClipFaces<T>& args) {
       args.source[n++] = static_cast<int32_t>(f);
     };
     const bool stays = !changes(mesh, b, args.near);
-    for (int64_t f = 0; f < mesh.face_count(b); ++f) {
+    for (int64_t f = 0; f < mesh.face_rows.count(b); ++f) {
       const int64_t* face = mesh.image_faces(b) + 3 * f;
       const Sides sides = sides_of(mesh.image_vertices(b), face, args.near);
       if (stays || sides.count == 0) {

@@ -29,9 +29,8 @@ struct ClipImage {
   const int32_t* face_index;
 
   ClipImage(const ClipMesh<T>& mesh, int64_t b)
-      : positions(mesh.positions + (mesh.position_batch == 1 ? 0 : 4 * b * mesh.num_vertices)),
-        attributes{mesh.position_batch == 1 ? 0 : b * mesh.num_vertices, mesh.faces,
-                   mesh.num_faces},
+      : positions(mesh.positions + 4 * mesh.rows.first(b)),
+        attributes{mesh.rows.first(b), mesh.faces, mesh.num_faces},
         raster(mesh.raster),
         face_index(mesh.face_index + b * mesh.raster.pixels()) {}
 
@@ -93,10 +92,10 @@ NMR_INLINE void add_corner(const Corner& grad, double X, double Y, T* position) 
 
 template <class T, class Body>
 void sum_positions(const ClipMesh<T>& mesh, T* grad_positions, const Body& body) {
-  std::fill_n(grad_positions, 4 * mesh.num_vertices * mesh.position_batch, T(0));
+  std::fill_n(grad_positions, 4 * mesh.rows.total(mesh.batch), T(0));
   sum_blocks<FaceSums<T>>(
-      mesh.batch, mesh.raster, mesh.position_batch == 1, mesh.num_threads,
-      [&](int64_t) { return mesh.num_faces; },
+      mesh.batch, mesh.raster, !mesh.rows.each, mesh.num_threads,
+      Rows{mesh.num_faces, false, nullptr},
       [&](const RowBlock& block, FaceSums<T>& sums) {
         const int64_t W = mesh.raster.width;
         body(block.b, block.first() * W, block.last() * W, sums);

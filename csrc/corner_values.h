@@ -22,6 +22,19 @@ void for_rows(int64_t batch, int64_t height, int num_threads, const Body& body) 
   });
 }
 
+// Calls body(set, first, last) for ranges of the texels of every set, of which a set has
+// count(set): every texel is summed on one thread, over images and pixels in ascending order. If
+// there are fewer sets than threads, several threads share a set: each reads all pixels, and uses
+// those of its own range.
+template <class Count, class Body>
+void for_texels(int64_t sets, int num_threads, const Count& count, const Body& body) {
+  const int64_t parts = sets >= num_threads ? 1 : 2 * static_cast<int64_t>(num_threads);
+  parallel_for(sets * parts, num_threads, [&](int64_t task) {
+    const int64_t set = task / parts, part = task % parts, texels = count(set);
+    body(set, part * texels / parts, (part + 1) * texels / parts);
+  });
+}
+
 // Whether loops over 1, 3 and 4 channels are compiled for these numbers. Not for double, which
 // gains nothing from it.
 template <class T>
@@ -59,12 +72,7 @@ struct ImageAttributes {
 
 template <class T>
 ImageAttributes<T> image_attributes(const Interpolate<T>& args, int64_t b) {
-  if (args.starts) {
-    const int64_t* s = args.starts + 2 * b;
-    return {s[0], args.corners + 3 * s[1], s[3] - s[1]};
-  }
-  return {args.attribute_batch == 1 ? 0 : b * args.num_attributes,
-          args.corners + (args.corners_per_image ? 3 * b * args.num_faces : 0), args.num_faces};
+  return {args.rows.first(b), args.corners + 3 * args.face_rows.first(b), args.face_rows.count(b)};
 }
 
 // Adds sums [count, 3, C] of the corners of faces to the rows of attributes at these corners.

@@ -1,5 +1,9 @@
-// The inner loops of NMR's gradient; included by levels.h for every instruction set. See
-// edge_gradient.cpp.
+// The inner loops of NMR's gradient (edge_gradient.cpp).
+#include "edge_lines.h"
+#include "level_lanes.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // Whether all values are finite: only then is the sum of their products with 0 a number.
 template <class T>
@@ -505,3 +509,6 @@ void pull_group(const EdgeImage<T>& image, const LineGroup<T>& group, const Pixe
     first = last;
   }
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

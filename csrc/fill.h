@@ -1,5 +1,9 @@
-// The inner loops of the rasterizer; included by levels.h for every instruction set. See
-// rasterize.cpp.
+// The inner loops of the rasterizer (rasterize.cpp).
+#include "face_table.h"
+#include "level_lanes.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // --- set-up
 
@@ -500,3 +504,6 @@ void cover_band(const Band<T>& band, const int32_t* face_index, bool anti_aliasi
   for (int64_t y = (band.raster.height - 1 - band.row_last) / scale; y < last; ++y)
     cover_row(face_index + y * scale * band.raster.width, w, anti_aliasing, alpha + y * w);
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

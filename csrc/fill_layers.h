@@ -1,6 +1,9 @@
-// The loops of the K nearest faces; included by levels.h for every instruction set.
-
+// The loops of the K nearest faces.
+#include "layer_band.h"
 #include "soft_pixels.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // Inserts a face into the lists of those pixels of a box (rows from the bottom) for which
 // row(j)(i, depth) holds, which also computes its depth there.
@@ -106,3 +109,6 @@ void fill_soft(const SoftImage<T>& image, const LayerBand<T>& band) {
                 face.row_first, face.row_last, row);
   }
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

@@ -1,5 +1,9 @@
-// The inner loops of fragments and depth images; included by levels.h for every instruction set.
-// See fragments.cpp.
+// The inner loops of fragments and depth images (fragments.cpp).
+#include "fragment_table.h"
+#include "level_lanes.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // --- the faces of a block
 
@@ -343,3 +347,6 @@ void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
         }
       });
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

@@ -10,33 +10,7 @@
 #include <limits>
 #include <vector>
 
-#include "blocks.h"
-#include "soft_faces.h"
-#include "soft_weights.h"
-
-namespace nmr {
-namespace {
-
-// The lists of the rows first, ..., last - 1 (from the bottom) of one image.
-template <class T>
-struct LayerBand {
-  RasterSettings<T> settings;
-  int64_t layers, first, last;
-  T* depth;             // [rows, W, K], sorted; `far` without a face
-  int32_t* face_index;  // [H, W, K] of the image, row 0 = top
-};
-
-// One image whose faces cover pixels.
-template <class T>
-struct HardImage {
-  const T* vertices;
-  const int64_t* faces;
-  int64_t num_faces;
-  const T* columns;  // pixel centres, padded to whole groups
-};
-
-}  // namespace
-}  // namespace nmr
+#include "layer_band.h"
 
 #define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "fill_layers.h"
@@ -67,7 +41,7 @@ void rasterize_layers(const RasterizeLayers<T>& args) {
   for (int64_t i = 0; i < W + kGroup; ++i) columns[i] = pixel_centre<T>(i, W);
   fill_bands(args, args.settings, [&](int64_t b, const LayerBand<T>& band) {
     const HardImage<T> image{args.mesh.image_vertices(b), args.mesh.image_faces(b),
-                             args.mesh.face_count(b), columns.data()};
+                             args.mesh.face_rows.count(b), columns.data()};
     NMR_AT_BEST_LEVEL(fill_hard, image, band);
   });
 }

@@ -1,6 +1,23 @@
-// kLanes values that are processed together (lanes), for one level: levels.h includes this file in
-// the namespace of each. A vector that does not fit into a register of the level is two halves.
-// Every operation treats each lane separately, so results do not depend on the level.
+// kLanes values that are processed together (lanes), for one level (levels.h). A vector that does
+// not fit into a register of the level is two halves. Every operation treats each lane separately,
+// so results do not depend on the level.
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+#include <utility>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+#include "parallel.h"
+
+#ifndef NMR_LEVEL
+#define NMR_LEVEL base
+#endif
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // Two vectors of half the lanes.
 template <class V>
@@ -466,3 +483,6 @@ NMR_INLINE void add_lane_sums(Lanes<T> p, Lanes<T> q, T* sums) {
   sums[0] += sum(a.lane);
   sums[1] += sum(b.lane);
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

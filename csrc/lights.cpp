@@ -7,26 +7,12 @@
 #include <limits>
 #include <vector>
 
-#include <Eigen/Core>
-
 #include "corner_values.h"
 #include "powers.h"
+#include "vectors.h"
 
 namespace nmr {
 namespace {
-
-template <class T>
-using Vec3 = Eigen::Matrix<T, 3, 1>;
-
-template <class T>
-NMR_INLINE Vec3<T> load3(const T* p) {
-  return Vec3<T>(p[0], p[1], p[2]);
-}
-
-template <class T>
-NMR_INLINE void add3(T* p, const Vec3<T>& v) {
-  for (int k = 0; k < 3; ++k) p[k] += v[k];
-}
 
 // v / |v| and |v|; 0 if it has no length. The backward pass is that of the unit vector alone.
 template <class T>
@@ -37,10 +23,7 @@ struct Unit {
   explicit Unit(const Vec3<T>& v) : unit(Vec3<T>::Zero()), length(v.norm()) {
     if (length > 0 && length <= std::numeric_limits<T>::max()) unit = v / length;
   }
-  Vec3<T> backward(const Vec3<T>& grad) const {
-    if (!(length > 0)) return Vec3<T>::Zero();
-    return (grad - unit * unit.dot(grad)) / length;
-  }
+  Vec3<T> backward(const Vec3<T>& grad) const { return unit_backward<T>(unit, length, 0, grad); }
 };
 
 // One light of an image, directional or a point, and the gradients of the same.
@@ -266,10 +249,8 @@ struct View {
 
   View(const LitColors<T>& args, int64_t b)
       : image(image_attributes(args.at, b)), viewer(args.viewer + 5 * b), side(viewer[4]) {
-    const int64_t* s = args.at.starts ? args.at.starts + 2 * b : nullptr;
     vertices = args.at.attributes + 3 * image.first_row;
-    const int64_t rows = args.smooth ? args.at.num_attributes : args.at.num_faces;
-    first_normal = s ? s[args.smooth ? 0 : 1] : args.normal_batch == 1 ? 0 : b * rows;
+    first_normal = args.normal_rows.first(b);
     normals = args.normals + 3 * first_normal;
   }
 };
@@ -336,12 +317,8 @@ NMR_INLINE void pixel_backward(const LitColors<T>& args, const View<T>& view,
   else
     grad_surface.normal = grad.diffuse;
   Vec3<T> grad_mean = p.sign * grad_surface.normal;
-  if (args.smooth && p.length > T(kShortestNormal)) {
-    const Vec3<T> unit = p.mean / p.length;
-    grad_mean = (grad_mean - unit * unit.dot(grad_mean)) / p.length;
-  } else if (args.smooth) {
-    grad_mean /= p.length;
-  }
+  if (args.smooth)
+    grad_mean = unit_backward<T>(p.mean / p.length, p.length, T(kShortestNormal), grad_mean);
   if (position) grad_surface.point -= view.viewer[3] * p.to_eye.backward(grad_surface.eye);
   if (!args.smooth) add3(sums, grad_mean);
   for (int k = 0; weights && k < 3; ++k) {
@@ -518,8 +495,7 @@ void with_colors(const LitColors<T>& args, const Body& body) {
 
 template <class T>
 void lit_forward(const LitColors<T>& args) {
-  const auto face_count = [&](int64_t b) { return image_attributes(args.at, b).num_faces; };
-  for_blocks(args.at.batch, args.at.raster, args.at.num_threads, face_count,
+  for_blocks(args.at.batch, args.at.raster, args.at.num_threads, args.at.face_rows,
              [&](const RowBlock& block) {
                with_colors(args, [&](auto known) {
                  lit_block_forward<known()>(args, block, thread_scratch<LitSums<T>>());
@@ -530,15 +506,13 @@ void lit_forward(const LitColors<T>& args) {
 // Parameters, normals and vertices are summed in the order of images and blocks.
 template <class T>
 void lit_backward(const LitColors<T>& args) {
-  const int64_t images = args.at.starts ? 1 : args.normal_batch;
-  const int64_t normals = images * (args.smooth ? args.at.num_attributes : args.at.num_faces);
-  const int64_t vertices = args.at.num_attributes * (args.at.starts ? 1 : args.at.attribute_batch);
+  const int64_t normals = args.normal_rows.total(args.at.batch),
+                vertices = args.at.rows.total(args.at.batch);
   if (args.grad_normals) std::fill_n(args.grad_normals, 3 * normals, T(0));
   if (args.at.grad_attributes) std::fill_n(args.at.grad_attributes, 3 * vertices, T(0));
   if (args.grad_parameters) std::fill_n(args.grad_parameters, args.num_parameters, T(0));
   sum_blocks<LitSums<T>>(
-      args.at.batch, args.at.raster, true, args.at.num_threads,
-      [&](int64_t b) { return image_attributes(args.at, b).num_faces; },
+      args.at.batch, args.at.raster, true, args.at.num_threads, args.at.face_rows,
       [&](const RowBlock& block, LitSums<T>& sums) {
         with_colors(args, [&](auto known) { lit_block_backward<known()>(args, block, sums); });
       },

@@ -215,9 +215,9 @@ void add_pulls(const LocalRaster<T>& image, const Pulls<T>& pulls, T* grad_verti
 template <class T, class ImageOf>
 void local_pulls(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int num_threads,
                  const ImageOf& image_of) {
-  std::fill_n(grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
+  std::fill_n(grad_vertices, 3 * mesh.vertex_rows.total(mesh.batch), T(0));
   sum_blocks<Pulls<T>>(
-      mesh.batch, raster, false, num_threads, [](int64_t) { return 0; },
+      mesh.batch, raster, false, num_threads, Rows{},
       [&](const RowBlock& block, Pulls<T>& pulls) {
         const auto image = image_of(block.b);
         reserve(pulls.list, block.blocks.rows * raster.width);
@@ -227,7 +227,7 @@ void local_pulls(const MeshBatch<T>& mesh, Size raster, T* grad_vertices, int nu
             find_pull(image, row, column, pulls);
       },
       [&](int64_t b, const Pulls<T>& pulls) {
-        add_pulls<T>(image_of(b), pulls, grad_vertices + 3 * mesh.vertex_start(b));
+        add_pulls<T>(image_of(b), pulls, grad_vertices + 3 * mesh.vertex_rows.first(b));
       });
 }
 
@@ -237,7 +237,7 @@ LocalRaster<T> raster_of_image(const MeshBatch<T>& mesh, Size size, bool anti_al
   const Size raster = raster_of(size, anti_aliasing);
   return {mesh.image_vertices(b),
           mesh.image_faces(b),
-          mesh.face_count(b),
+          mesh.face_rows.count(b),
           raster,
           size,
           anti_aliasing,

@@ -4,15 +4,12 @@
 #include <cmath>
 #include <limits>
 
-#include <Eigen/Core>
-
 #include "stages.h"
+#include "vectors.h"
 
 namespace nmr {
 namespace {
 
-template <class T>
-using Vec3 = Eigen::Matrix<T, 3, 1>;
 template <class T>
 using Matrix34 = Eigen::Matrix<T, 3, 4, Eigen::RowMajor>;
 using Vec3d = Vec3<double>;
@@ -42,11 +39,9 @@ Vec3<T> normalized(const Vec3<T>& v) {
   return v / std::max(length(v), T(kShortestAxis));
 }
 
-Vec3<double> normalized_backward(const Vec3<double>& v, const Vec3<double>& grad) {
-  const double size = v.norm();
-  if (!(size > kShortestAxis)) return grad / kShortestAxis;
-  const Vec3<double> n = v / size;
-  return (grad - n * n.dot(grad)) / size;
+Vec3d normalized_backward(const Vec3d& v, const Vec3d& grad) {
+  const double size = std::max(v.norm(), kShortestAxis);
+  return unit_backward<double>(v / size, size, kShortestAxis, grad);
 }
 
 Vec3d vector_of(const Parameter<double>& parameter, int64_t b) {

@@ -5,16 +5,14 @@
 #include <limits>
 #include <vector>
 
-#include <Eigen/Core>
-#include <Eigen/Geometry>
-
 #include "parallel.h"
 #include "stages.h"
+#include "vectors.h"
 
 namespace nmr {
 namespace {
 
-using Vec3 = Eigen::Vector3d;
+using Vec3d = Vec3<double>;
 
 // Coordinates beyond this do not count: their products could overflow.
 constexpr double kLargestCoordinate = 1e100;
@@ -26,22 +24,21 @@ template <>
 constexpr double kLeastArea<float> = std::numeric_limits<float>::min();
 
 struct Direction {
-  Vec3 unit;
+  Vec3d unit;
   double length;  // 0 without a direction
 };
 
 template <class T>
-NMR_INLINE Direction direction_of(const Vec3& v) {
+NMR_INLINE Direction direction_of(const Vec3d& v) {
   const double scale = v.cwiseAbs().maxCoeff();
-  if (!(scale >= kLeastArea<T>)) return {Vec3::Zero(), 0};
+  if (!(scale >= kLeastArea<T>)) return {Vec3d::Zero(), 0};
   const double length = (v / scale).norm() * scale;
   return {v / length, length};
 }
 
 // dL/dv from dL/d(v / |v|).
-NMR_INLINE Vec3 direction_backward(const Direction& d, const Vec3& grad) {
-  if (d.length == 0) return Vec3::Zero();
-  return (grad - d.unit * d.unit.dot(grad)) / d.length;
+NMR_INLINE Vec3d direction_backward(const Direction& d, const Vec3d& grad) {
+  return unit_backward(d.unit, d.length, 0.0, grad);
 }
 
 // Whether a vertex is used: finite, with coordinates below kLargestCoordinate. Others count as the
@@ -53,27 +50,27 @@ NMR_INLINE bool counts(const T* vertex) {
 }
 
 template <class T>
-NMR_INLINE Vec3 vertex_of(const T* vertex) {
-  return counts(vertex) ? Vec3(vertex[0], vertex[1], vertex[2]) : Vec3(Vec3::Zero());
+NMR_INLINE Vec3d vertex_of(const T* vertex) {
+  return counts(vertex) ? Vec3d(vertex[0], vertex[1], vertex[2]) : Vec3d(Vec3d::Zero());
 }
 
 // Sides v0 - v1 and v2 - v1 of a face, and their product.
 struct Sides {
-  Vec3 a, b, across;
+  Vec3d a, b, across;
 };
 
 template <class T>
 NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face) {
-  const Vec3 v1 = vertex_of(vertices + 3 * face[1]);
+  const Vec3d v1 = vertex_of(vertices + 3 * face[1]);
   Sides s{vertex_of(vertices + 3 * face[0]) - v1, vertex_of(vertices + 3 * face[2]) - v1, {}};
   s.across = s.a.cross(s.b);
   return s;
 }
 
 // Adds the gradient of the product to the corners.
-NMR_INLINE void sides_backward(const Sides& s, const int64_t* face, const Vec3& grad_across,
-                               Vec3* grad_vertices) {
-  const Vec3 grad_a = s.b.cross(grad_across), grad_b = grad_across.cross(s.a);
+NMR_INLINE void sides_backward(const Sides& s, const int64_t* face, const Vec3d& grad_across,
+                               Vec3d* grad_vertices) {
+  const Vec3d grad_a = s.b.cross(grad_across), grad_b = grad_across.cross(s.a);
   grad_vertices[face[0]] += grad_a;
   grad_vertices[face[2]] += grad_b;
   grad_vertices[face[1]] -= grad_a + grad_b;
@@ -81,31 +78,26 @@ NMR_INLINE void sides_backward(const Sides& s, const int64_t* face, const Vec3& 
 
 // Sums of the products around each vertex of mesh b.
 template <class T>
-std::vector<Vec3> vertex_sums(const MeshBatch<T>& mesh, int64_t b) {
-  std::vector<Vec3> sums(mesh.vertex_count(b), Vec3::Zero());
+std::vector<Vec3d> vertex_sums(const MeshBatch<T>& mesh, int64_t b) {
+  std::vector<Vec3d> sums(mesh.vertex_rows.count(b), Vec3d::Zero());
   const int64_t* face = mesh.image_faces(b);
-  for (int64_t f = 0; f < mesh.face_count(b); ++f, face += 3) {
-    const Vec3 across = sides_of(mesh.image_vertices(b), face).across;
+  for (int64_t f = 0; f < mesh.face_rows.count(b); ++f, face += 3) {
+    const Vec3d across = sides_of(mesh.image_vertices(b), face).across;
     for (int k = 0; k < 3; ++k) sums[face[k]] += across;
   }
   return sums;
 }
 
 template <class T>
-NMR_INLINE void store(T* to, const Vec3& v) {
+NMR_INLINE void store(T* to, const Vec3d& v) {
   for (int k = 0; k < 3; ++k) to[k] = static_cast<T>(v[k]);
 }
 
-template <class T>
-NMR_INLINE Vec3 load(const T* from) {
-  return Vec3(from[0], from[1], from[2]);
-}
-
-// First row of the normals of mesh b.
+// First row of the normals of mesh b, which has its own also if it shares its faces.
 template <class T>
 int64_t first_normal(const Normals<T>& args, int64_t b) {
-  const MeshBatch<T>& mesh = args.mesh;
-  return args.smooth ? mesh.vertex_start(b) : mesh.starts ? mesh.face_start(b) : b * mesh.num_faces;
+  const Rows& faces = args.mesh.face_rows;
+  return (args.smooth ? args.mesh.vertex_rows : Rows{faces.size, true, faces.starts}).first(b);
 }
 
 }  // namespace
@@ -116,12 +108,12 @@ void normals_forward(const Normals<T>& args) {
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
     T* normals = args.normals + 3 * first_normal(args, b);
     if (args.smooth) {
-      const std::vector<Vec3> sums = vertex_sums(mesh, b);
+      const std::vector<Vec3d> sums = vertex_sums(mesh, b);
       for (size_t v = 0; v < sums.size(); ++v)
         store(normals + 3 * v, direction_of<T>(sums[v]).unit);
       return;
     }
-    for (int64_t f = 0; f < mesh.face_count(b); ++f)
+    for (int64_t f = 0; f < mesh.face_rows.count(b); ++f)
       store(normals + 3 * f,
             direction_of<T>(sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f).across)
                 .unit);
@@ -135,23 +127,23 @@ void normals_backward(const Normals<T>& args) {
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
     const T *vertices = mesh.image_vertices(b),
             *grad_normals = args.grad_normals + 3 * first_normal(args, b);
-    const int64_t V = mesh.vertex_count(b), *face = mesh.image_faces(b);
-    std::vector<Vec3> grads(V, Vec3::Zero()), grad_sums;
+    const int64_t V = mesh.vertex_rows.count(b), *face = mesh.image_faces(b);
+    std::vector<Vec3d> grads(V, Vec3d::Zero()), grad_sums;
     if (args.smooth) {
       grad_sums = vertex_sums(mesh, b);
       for (int64_t v = 0; v < V; ++v)
-        grad_sums[v] =
-            direction_backward(direction_of<T>(grad_sums[v]), load(grad_normals + 3 * v));
+        grad_sums[v] = direction_backward(direction_of<T>(grad_sums[v]),
+                                          load3(grad_normals + 3 * v).template cast<double>());
     }
-    for (int64_t f = 0; f < mesh.face_count(b); ++f, face += 3) {
+    for (int64_t f = 0; f < mesh.face_rows.count(b); ++f, face += 3) {
       const Sides sides = sides_of(vertices, face);
-      const Vec3 grad_across =
-          args.smooth
-              ? Vec3(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
-              : direction_backward(direction_of<T>(sides.across), load(grad_normals + 3 * f));
+      const Vec3d grad_across =
+          args.smooth ? Vec3d(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
+                      : direction_backward(direction_of<T>(sides.across),
+                                           load3(grad_normals + 3 * f).template cast<double>());
       sides_backward(sides, face, grad_across, grads.data());
     }
-    T* grad_vertices = args.grad_vertices + 3 * mesh.vertex_start(b);
+    T* grad_vertices = args.grad_vertices + 3 * mesh.vertex_rows.first(b);
     for (int64_t v = 0; v < V; ++v)
       for (int k = 0; k < 3; ++k)
         grad_vertices[3 * v + k] = counts(vertices + 3 * v)

@@ -1,4 +1,9 @@
-// The loops of project over vertices; included by levels.h for every instruction set.
+// The loops of project over vertices.
+#include "lens.h"
+#include "level_lanes.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 template <class T>
 NMR_INLINE T larger(T a, T b) {
@@ -318,3 +323,6 @@ void backward_run(const Project<T>& args, const Run& run, T* grad_vertices, Came
     });
   if (total) *total = {};
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

@@ -61,17 +61,6 @@ NMR_INLINE void blend(const Texels<T>& texels, const T* texture, int64_t channel
   }
 }
 
-// Number of faces of image b, and the first of its cubes.
-template <class T>
-int64_t face_count(const TextureCubes<T>& args, int64_t b) {
-  return args.starts ? args.starts[2 * b + 3] - args.starts[2 * b + 1] : args.num_faces;
-}
-
-template <class T>
-int64_t first_cube(const TextureCubes<T>& args, int64_t b) {
-  return args.starts ? args.starts[2 * b + 1] : args.texture_batch == 1 ? 0 : b * args.num_faces;
-}
-
 }  // namespace
 
 template <class T>
@@ -81,8 +70,8 @@ void texture_cubes_forward(const TextureCubes<T>& args) {
     const int64_t W = args.raster.width, C = kChannels ? kChannels : args.channels,
                   ts = args.texture_size, cube = ts * ts * ts * C;
     for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
-      const int64_t start = (b * args.raster.height + row) * W, F = face_count(args, b);
-      const T* textures = args.textures + first_cube(args, b) * cube;
+      const int64_t start = (b * args.raster.height + row) * W, F = args.cubes.count(b);
+      const T* textures = args.textures + args.cubes.first(b) * cube;
       T* color = args.colors + start * C;
       for (int64_t n = start; n < start + W; ++n, color += C) {
         const int64_t id = args.face_index[n];
@@ -105,8 +94,8 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
                            int64_t last_face) {
   const int64_t C = kChannels ? kChannels : args.channels, ts = args.texture_size,
                 cube = ts * ts * ts * C;
-  const int64_t F = face_count(args, b), pixels = args.raster.pixels();
-  T* grad_textures = args.grad_textures + first_cube(args, b) * cube;
+  const int64_t F = args.cubes.count(b), pixels = args.raster.pixels();
+  T* grad_textures = args.grad_textures + args.cubes.first(b) * cube;
   for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
     const int64_t f = face_of(args.face_index[n], F);
     if (f < first_face || f >= last_face) continue;  // background as well
@@ -121,27 +110,22 @@ void add_texture_gradients(const TextureCubes<T>& args, int64_t b, int64_t first
 
 }  // namespace
 
-// Every texel is summed on one thread, over images and pixels in ascending order. If images share
-// their textures, or if there are fewer images than threads, each thread reads all pixels and uses
-// those of its own range of faces.
+// The ranges are those of faces.
 template <class T>
 void texture_cubes_backward(const TextureCubes<T>& args) {
   const int64_t ts = args.texture_size, cube = ts * ts * ts * args.channels;
-  const bool shared = !args.starts && args.texture_batch == 1;
-  const int64_t sets = shared ? 1 : args.batch,
-                images = shared ? args.batch : 1;  // sets of textures; images of each set
-  const int64_t parts = sets >= args.num_threads ? 1 : 2 * static_cast<int64_t>(args.num_threads);
-  parallel_for(sets * parts, args.num_threads, [&](int64_t task) {
-    const int64_t set = task / parts, part = task % parts;
-    const int64_t F = shared ? args.num_faces : face_count(args, set);
-    const int64_t first = part * F / parts, last = (part + 1) * F / parts;
-    std::fill_n(args.grad_textures + (first_cube(args, set) + first) * cube, (last - first) * cube,
-                T(0));
-    with_channels<T>(args.channels, [&](auto known) {
-      for (int64_t b = set; b < set + images; ++b)
-        add_texture_gradients<known()>(args, b, first, last);
-    });
-  });
+  const int64_t sets = args.cubes.each ? args.batch : 1,
+                images = args.cubes.each ? 1 : args.batch;  // of each set
+  for_texels(
+      sets, args.num_threads, [&](int64_t set) { return args.cubes.count(set); },
+      [&](int64_t set, int64_t first, int64_t last) {
+        std::fill_n(args.grad_textures + (args.cubes.first(set) + first) * cube,
+                    (last - first) * cube, T(0));
+        with_channels<T>(args.channels, [&](auto known) {
+          for (int64_t b = set; b < set + images; ++b)
+            add_texture_gradients<known()>(args, b, first, last);
+        });
+      });
 }
 
 namespace {
@@ -204,11 +188,10 @@ void interpolate_forward(const Interpolate<T>& args) {
 
 template <class T>
 void interpolate_backward(const Interpolate<T>& args) {
-  const int64_t rows = args.num_attributes * (args.starts ? 1 : args.attribute_batch);
-  if (args.grad_attributes) std::fill_n(args.grad_attributes, rows * args.channels, T(0));
+  if (args.grad_attributes)
+    std::fill_n(args.grad_attributes, args.rows.total(args.batch) * args.channels, T(0));
   sum_blocks<FaceSums<T>>(
-      args.batch, args.raster, !args.starts && args.attribute_batch == 1, args.num_threads,
-      [&](int64_t b) { return image_attributes(args, b).num_faces; },
+      args.batch, args.raster, !args.rows.each, args.num_threads, args.face_rows,
       [&](const RowBlock& block, FaceSums<T>& sums) {
         with_channels<T>(args.channels, [&](auto known) {
           interpolate_block_backward<known()>(args, block, sums);

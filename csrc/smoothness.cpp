@@ -13,27 +13,17 @@
 #include "parallel.h"
 #include "stages.h"
 
-namespace nmr {
-namespace {
-
-constexpr double kGuard = 1e-6;  // added to every squared length and denominator
-constexpr int kCoordinates =
-    12;  // x, y, z of an edge's first and second vertex and of the two opposite ones
-
-template <class T>
-struct SmoothnessScratch {
-  std::vector<T> vertices, grad;  // [V, 3, kGroup]
-};
-
-}  // namespace
-}  // namespace nmr
-
 #define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "smoothness_lanes.h"
 #include "levels.h"
 
 namespace nmr {
 namespace {
+
+template <class T>
+struct SmoothnessScratch {
+  std::vector<T> vertices, grad;  // [V, 3, kGroup]
+};
 
 // Calls meshes(b) for groups of kGroup images from b on, and mesh(b) for each remaining image.
 template <class Meshes, class Mesh>

@@ -1,4 +1,16 @@
-// The loops of the smoothness loss over edges; included by levels.h for every instruction set.
+// The loops of the smoothness loss over edges.
+#include <algorithm>
+#include <cmath>
+
+#include "level_lanes.h"
+#include "stages.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
+
+constexpr double kGuard = 1e-6;  // added to every squared length and denominator
+constexpr int kCoordinates =
+    12;  // x, y, z of an edge's first and second vertex and of the two opposite ones
 
 // Not a vector of Eigen: GCC does not inline its constructors into code for another level, and the
 // loops over lanes are then not vectorized (six times the instructions).
@@ -237,3 +249,6 @@ void mesh_backward(const Smoothness<T>& args, int64_t b) {
     }
   }
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

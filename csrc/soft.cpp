@@ -19,20 +19,13 @@
 #include "blocks.h"
 #include "soft_faces.h"
 
-namespace nmr {
-namespace {
-
-constexpr int64_t kFaceChunk = 64;  // faces per task, backward
-constexpr int64_t kSoftSums = 7;    // gradients of x and y of three corners, and of sigma
-
-}  // namespace
-}  // namespace nmr
-
 #define NMR_LEVEL_V4
 #define NMR_LEVEL_FILE "soft_lanes.h"
 #include "levels.h"
 
 namespace nmr {
+
+constexpr int64_t kFaceChunk = 64;  // faces per task, backward
 
 template <class T>
 void soft_forward(const SoftForward<T>& args) {
@@ -53,13 +46,13 @@ void soft_backward(const SoftBackward<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   const Size raster = args.settings.raster.raster;
   const std::vector<T> columns = scaled_columns<T>(raster);
-  std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
+  std::fill_n(args.grad_vertices, 3 * mesh.vertex_rows.total(mesh.batch), T(0));
   std::vector<T> pull(mesh.batch * raster.pixels());
   std::vector<int64_t> chunks{0};  // number of chunks of faces before each image
   std::vector<int64_t> first_face{0};
   for (int64_t b = 0; b < mesh.batch; ++b) {
-    chunks.push_back(chunks[b] + (mesh.face_count(b) + kFaceChunk - 1) / kFaceChunk);
-    first_face.push_back(first_face[b] + mesh.face_count(b));
+    chunks.push_back(chunks[b] + (mesh.face_rows.count(b) + kFaceChunk - 1) / kFaceChunk);
+    first_face.push_back(first_face[b] + mesh.face_rows.count(b));
   }
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
     for (int64_t n = b * raster.pixels(); n < (b + 1) * raster.pixels(); ++n)
@@ -86,8 +79,8 @@ void soft_backward(const SoftBackward<T>& args) {
     }
   });
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    T *grad_vertices = args.grad_vertices + 3 * mesh.vertex_start(b), grad_sigma = 0;
-    for (int64_t f = 0; f < mesh.face_count(b); ++f) {
+    T *grad_vertices = args.grad_vertices + 3 * mesh.vertex_rows.first(b), grad_sigma = 0;
+    for (int64_t f = 0; f < mesh.face_rows.count(b); ++f) {
       if (!drawn[first_face[b] + f]) continue;
       for (int k = 0; k < 3; ++k) {
         T* grad = grad_vertices + 3 * mesh.image_faces(b)[3 * f + k];

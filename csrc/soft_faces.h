@@ -15,6 +15,8 @@
 
 namespace nmr {
 
+constexpr int64_t kSoftSums = 7;  // gradients of x and y of three corners, and of sigma
+
 // A face ready to be evaluated: corners counter-clockwise, and the pixels that it can reach.
 template <class T>
 struct SoftFace {
@@ -100,7 +102,7 @@ SoftImage<T> soft_image(const MeshBatch<T>& mesh, const SoftSettings<T>& soft, i
   const T shorter = static_cast<T>(std::min(raster.height, raster.width));
   return {mesh.image_vertices(b),
           mesh.image_faces(b),
-          mesh.face_count(b),
+          mesh.face_rows.count(b),
           soft.raster,
           soft.sigma,
           soft.reach,

@@ -26,7 +26,7 @@ struct SoftFragment {
     const T shorter = static_cast<T>(std::min(raster.height, raster.width));
     scale_x = static_cast<T>(raster.width) / shorter,
     scale_y = static_cast<T>(raster.height) / shorter;
-    face = args.mesh.image_faces(b) + 3 * face_of(id, args.mesh.face_count(b));
+    face = args.mesh.image_faces(b) + 3 * face_of(id, args.mesh.face_rows.count(b));
     for (int k = 0; k < 3; ++k) {
       const T* v = args.mesh.image_vertices(b) + 3 * face[k];
       x[k] = v[0] * scale_x, y[k] = v[1] * scale_y, z[k] = v[2];
@@ -132,9 +132,9 @@ template <class T>
 void soft_fragments_backward(const SoftFragments<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   const int64_t H = args.raster.height, wide = args.raster.width * args.layers;
-  std::fill_n(args.grad_vertices, 3 * mesh.num_vertices * (mesh.starts ? 1 : mesh.batch), T(0));
+  std::fill_n(args.grad_vertices, 3 * mesh.vertex_rows.total(mesh.batch), T(0));
   sum_blocks<FaceSums<T>>(
-      mesh.batch, {H, wide}, false, args.num_threads, [&](int64_t b) { return mesh.face_count(b); },
+      mesh.batch, {H, wide}, false, args.num_threads, mesh.face_rows,
       [&](const RowBlock& block, FaceSums<T>& sums) {
         const int64_t first = block.begin(), last = block.end();
         sums.start(args.face_index + first, last - first, block.blocks.num_faces, 9);
@@ -148,8 +148,8 @@ void soft_fragments_backward(const SoftFragments<T>& args) {
         }
       },
       [&](int64_t b, const FaceSums<T>& sums) {
-        const ImageAttributes<T> image{mesh.vertex_start(b), mesh.image_faces(b),
-                                       mesh.face_count(b)};
+        const ImageAttributes<T> image{mesh.vertex_rows.first(b), mesh.image_faces(b),
+                                       mesh.face_rows.count(b)};
         scatter_corner_sums<3>(sums, image, 3, args.grad_vertices);
       });
 }

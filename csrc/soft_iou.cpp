@@ -3,30 +3,15 @@
 #include <algorithm>
 #include <vector>
 
-#include "blocks.h"
-#include "parallel.h"
-#include "stages.h"
-
-namespace nmr {
-namespace {
-
-constexpr int64_t kValueChunk = 4096;              // a multiple of 16
-constexpr int64_t kTaskValues = 16 * kValueChunk;  // of a pair of images, that one task reads
-
-// The sums over a chunk, lane by lane, and its smallest and largest target (at most 0, at least 1).
-template <class T>
-struct ChunkSums {
-  T product[2 * kLanes], sum[2 * kLanes];  // of p t, and of p + t
-  T low[kLanes], high[kLanes];
-};
-
-}  // namespace
-}  // namespace nmr
+#include "chunk_sums.h"
 
 #define NMR_LEVEL_FILE "soft_iou_lanes.h"
 #include "levels.h"
 
 namespace nmr {
+
+constexpr int64_t kValueChunk = 4096;              // a multiple of 16
+constexpr int64_t kTaskValues = 16 * kValueChunk;  // of a pair of images, that one task reads
 
 // The partial sums are added in the order of the chunks and lanes, in double precision.
 template <class T>

@@ -1,4 +1,9 @@
-// The loops of the soft intersection over union; included by levels.h for every instruction set.
+// The loops of the soft intersection over union.
+#include "chunk_sums.h"
+#include "level_lanes.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // Two vectors of partial sums run side by side. Their order depends on the number of values alone.
 template <class T>
@@ -36,3 +41,6 @@ template <class T>
 void gradient_of(const T* __restrict other, T factor, T offset, T* __restrict grad, int64_t count) {
   for (int64_t n = 0; n < count; ++n) grad[n] = factor * other[n] - offset;
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

@@ -1,6 +1,8 @@
-// The loops of the soft silhouette over pixels; included by levels.h for every instruction set.
-
+// The loops of the soft silhouette over pixels.
 #include "soft_pixels.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // Multiplies the rows first, ..., last - 1 (from the bottom) of `transmittance [H, W]`, row 0 =
 // top, by 1 - D of every face.
@@ -57,3 +59,6 @@ void soft_backward_face(const SoftImage<T>& image, const SoftFace<T>& face, cons
     grad[k] = sum * (k == 6 ? 1 / (2 * image.sigma) : k % 2 ? image.scale_y : image.scale_x);
   }
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

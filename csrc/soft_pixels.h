@@ -1,4 +1,9 @@
-// What a face means for a pixel of the soft silhouette; included by loops of every instruction set.
+// What a face means for a pixel of the soft silhouette.
+#include "level_lanes.h"
+#include "soft_faces.h"
+
+namespace nmr::NMR_LEVEL {
+namespace {
 
 // exp(-x) for x >= 0: 2^-n times the Taylor series of exp on [-ln 2 / 2, ln 2 / 2]. Written out
 // because the library's function is not the same on all processors, and the compiler does not
@@ -71,3 +76,6 @@ NMR_INLINE SoftPixel<T> evaluate(const SoftFace<T>& face, T px, T py, T sigma, T
   p.reaches = inside | (least < reach);
   return p;
 }
+
+}  // namespace
+}  // namespace nmr::NMR_LEVEL

@@ -23,32 +23,30 @@ inline Size raster_of(Size image, bool anti_aliasing) {
   return anti_aliasing ? Size{2 * image.height, 2 * image.width} : image;
 }
 
+// The rows of an array that belong to the images: [B, N, ...], [N, ...] for all images, or packed.
+struct Rows {
+  int64_t size;  // N; packed: rows of all images
+  bool each;     // every image has its own
+  const int64_t*
+      starts;  // packed: first row of each image at every second place, then N; or nullptr
+
+  int64_t first(int64_t b) const { return starts ? starts[2 * b] : each ? b * size : 0; }
+  int64_t count(int64_t b) const { return starts ? starts[2 * b + 2] - starts[2 * b] : size; }
+  int64_t total(int64_t batch) const { return each && !starts ? batch * size : size; }
+};
+
 // A batch of meshes. In renderer space x, y lie in [-1, 1] across the screen (y up) and z is the
 // depth.
 template <class T>
 struct MeshBatch {
-  const T* vertices;      // [B, V, 3], or packed [N, 3]
-  const int64_t* faces;   // [F, 3] shared, [B, F, 3], or packed [M, 3]; vertex numbers count from
-                          // the mesh's own first vertex
-  int64_t batch;          // B
-  int64_t num_vertices;   // V (packed: N)
-  int64_t num_faces;      // F (packed: M)
-  bool faces_per_image;   // faces are [B, F, 3]
-  const int64_t* starts;  // packed: [B + 1, 2], first vertex and first face of each mesh, then N
-                          // and M; else nullptr
+  const T* vertices;     // [B, V, 3], or packed [N, 3]
+  const int64_t* faces;  // [F, 3] shared, [B, F, 3], or packed [M, 3]; vertex numbers count from
+                         // the mesh's own first vertex
+  int64_t batch;         // B
+  Rows vertex_rows, face_rows;
 
-  int64_t vertex_start(int64_t b) const { return starts ? starts[2 * b] : b * num_vertices; }
-  int64_t face_start(int64_t b) const {
-    return starts ? starts[2 * b + 1] : faces_per_image ? b * num_faces : 0;
-  }
-  int64_t vertex_count(int64_t b) const {
-    return starts ? starts[2 * b + 2] - starts[2 * b] : num_vertices;
-  }
-  int64_t face_count(int64_t b) const {
-    return starts ? starts[2 * b + 3] - starts[2 * b + 1] : num_faces;
-  }
-  const T* image_vertices(int64_t b) const { return vertices + 3 * vertex_start(b); }
-  const int64_t* image_faces(int64_t b) const { return faces + 3 * face_start(b); }
+  const T* image_vertices(int64_t b) const { return vertices + 3 * vertex_rows.first(b); }
+  const int64_t* image_faces(int64_t b) const { return faces + 3 * face_rows.first(b); }
 };
 
 // A parameter of cameras: one for all, or one for each.
@@ -85,12 +83,10 @@ constexpr int64_t kCamera = 12 + 6 + 3 + 1, kIntrinsics = 12, kOrigin = 18, kExt
 // out = (inf, inf, any finite number), so that its faces are not drawn, and gradient 0.
 template <class T>
 struct Project {
-  const T* vertices;      // [B or 1, V, 3], or packed [N, 3]
-  const int64_t* starts;  // packed: [B + 1, 2] as in MeshBatch; else nullptr
-  int64_t batch;          // B, of the output
-  int64_t vertex_batch;   // 1 or B when not packed
-  int64_t num_vertices;   // V
-  int64_t cameras;        // n: B or 1
+  const T* vertices;  // [B or 1, V, 3], or packed [N, 3]
+  Rows vertex_rows;
+  int64_t batch;    // B, of the output
+  int64_t cameras;  // n: B or 1
   bool perspective;
 
   Parameter<double> eye, at, up;  // of poses [3]; else not given
@@ -111,8 +107,8 @@ struct Project {
   T* nearest;            // forward out []: the least depth of all points, which are never NaN
   const T* grad_camera;  // backward in, or nullptr
   const T* grad_points;  // backward in, or nullptr
-  T* grad_vertices;  // backward out, like vertices (summed over images when vertex_batch is 1), or
-                     // nullptr
+  T* grad_vertices;      // backward out, like vertices (summed over images that share them), or
+                         // nullptr
   int num_threads;
 };
 
@@ -274,17 +270,15 @@ struct TextureCubes {
   const int32_t* face_index;  // [B, H, W]
   const T* weights;           // [B, H, W, 3] of Fragments
   int64_t batch;
-  Size raster;            // H x W
-  const T* textures;      // [B or 1, F, ts, ts, ts, C], or packed [M, ts, ts, ts, C]
-  int64_t texture_batch;  // 1 or B when not packed
-  int64_t num_faces;      // F (packed: M)
-  const int64_t* starts;  // packed: as in MeshBatch; else nullptr
-  int64_t texture_size;   // ts; a cube of one texel is constant
-  int64_t channels;       // C
-  T eps;                  // coordinates are clamped to [0, ts - 1 - eps]
-  T* colors;              // forward out [B, H, W, C]; 0 on background
-  const T* grad_colors;   // backward in
-  T* grad_textures;       // backward out, like textures
+  Size raster;           // H x W
+  const T* textures;     // [B or 1, F, ts, ts, ts, C], or packed [M, ts, ts, ts, C]
+  Rows cubes;            // a cube for each face
+  int64_t texture_size;  // ts; a cube of one texel is constant
+  int64_t channels;      // C
+  T eps;                 // coordinates are clamped to [0, ts - 1 - eps]
+  T* colors;             // forward out [B, H, W, C]; 0 on background
+  const T* grad_colors;  // backward in
+  T* grad_textures;      // backward out, like textures
   int num_threads;
 };
 
@@ -294,21 +288,17 @@ struct Interpolate {
   const int32_t* face_index;  // [B, H, W]
   const T* weights;           // [B, H, W, 3] of Fragments
   int64_t batch;
-  Size raster;              // H x W
-  const T* attributes;      // [B or 1, N, C], or packed [N, C]
-  int64_t attribute_batch;  // 1 or B when not packed
-  int64_t num_attributes;   // N
-  int64_t channels;         // C
-  const int64_t* corners;   // [F, 3] shared, [B, F, 3], or packed [M, 3]: rows of attributes,
-                            // counted from the mesh's first
-  int64_t num_faces;        // F (packed: M)
-  bool corners_per_image;
-  const int64_t*
-      starts;  // packed: [B + 1, 2], first attribute row and first face of each mesh; else nullptr
-  T* values;   // forward out [B, H, W, C]; 0 on background
-  const T* grad_values;  // backward in
-  T* grad_attributes;    // backward out, like attributes, or nullptr
-  T* grad_weights;       // backward out [B, H, W, 3], or nullptr
+  Size raster;             // H x W
+  const T* attributes;     // [B or 1, N, C], or packed [N, C]
+  Rows rows;               // of attributes
+  int64_t channels;        // C
+  const int64_t* corners;  // [F, 3] shared, [B, F, 3], or packed [M, 3]: rows of attributes,
+                           // counted from the mesh's first
+  Rows face_rows;          // of corners
+  T* values;               // forward out [B, H, W, C]; 0 on background
+  const T* grad_values;    // backward in
+  T* grad_attributes;      // backward out, like attributes, or nullptr
+  T* grad_weights;         // backward out [B, H, W, 3], or nullptr
   int num_threads;
 };
 
@@ -365,8 +355,7 @@ struct UVLevels {
 template <class T>
 struct ClipMesh {
   const T* positions;         // [B or 1, V, 4]: x, y, z, w
-  int64_t position_batch;     // 1 or B
-  int64_t num_vertices;       // V
+  Rows rows;                  // of positions
   const int64_t* faces;       // [F, 3]
   int64_t num_faces;          // F
   const int32_t* face_index;  // [B, H, W]
@@ -448,10 +437,10 @@ enum class LightParameter : int {
 // 1, and c = point point_color / (1 + falloff |position - x|^2).
 template <class T>
 struct LitColors {
-  Interpolate<T> at;     // attributes: vertices in world space, 3 channels, corners: the faces;
-                         // grad_attributes, grad_weights
-  const T* normals;      // [B or 1, F, 3], packed [M, 3]; smooth: like the vertices
-  int64_t normal_batch;  // 1 or B when not packed
+  Interpolate<T> at;  // attributes: vertices in world space, 3 channels, corners: the faces;
+                      // grad_attributes, grad_weights
+  const T* normals;   // [B or 1, F, 3], packed [M, 3]; smooth: like the vertices
+  Rows normal_rows;
   bool smooth;  // normals of vertices, interpolated: sum of b_k n_k, divided by its length or 1e-5
   const T* viewer;  // [B, 5]: place of the eye, 1; or direction towards the viewer, 0; then -1 if
                     // the camera sees a right-handed world (Pinhole), else 1

@@ -442,23 +442,19 @@ void sample_uv_forward(const SampleUV<T>& args) {
   });
 }
 
-// Every texel is summed on one thread, over images and pixels in ascending order: on one thread, or
-// if each image has its own texels and its own uv, directly; otherwise each thread takes ranges of
-// texels, and reads the pixels that touch them.
+// On one thread, or if each image has its own texels and its own uv, the gradients of texels are
+// summed together with those of uv; otherwise by for_texels.
 template <class T>
 void sample_uv_backward(const SampleUV<T>& args) {
   const Interpolate<T>& at = args.uv;
-  const int64_t uv_rows = at.num_attributes * (at.starts ? 1 : at.attribute_batch);
-  const bool shared_uv = !at.starts && at.attribute_batch == 1;
-  const bool alone =
-      at.num_threads <= 1 || (!shared_uv && args.images == at.batch && at.batch >= at.num_threads);
+  const bool alone = at.num_threads <= 1 ||
+                     (at.rows.each && args.images == at.batch && at.batch >= at.num_threads);
   const bool direct = args.grad_texels && alone, scatter = args.grad_texels && !alone;
-  if (at.grad_attributes) std::fill_n(at.grad_attributes, 2 * uv_rows, T(0));
+  if (at.grad_attributes) std::fill_n(at.grad_attributes, 2 * at.rows.total(at.batch), T(0));
   if (args.grad_texels) std::fill_n(args.grad_texels, args.num_texels * args.channels, T(0));
   std::vector<int32_t> rows(scatter ? at.batch * at.raster.pixels() * (args.level ? 4 : 2) : 0);
   sum_blocks<FaceSums<T>>(
-      at.batch, at.raster, shared_uv, at.num_threads,
-      [&](int64_t b) { return image_attributes(at, b).num_faces; },
+      at.batch, at.raster, !at.rows.each, at.num_threads, at.face_rows,
       [&](const RowBlock& block, FaceSums<T>& sums) {
         with_channels<T>(args.channels, [&](auto known) {
           sample_uv_block_backward<known()>(args, block, direct, scatter ? rows.data() : nullptr,
@@ -470,13 +466,13 @@ void sample_uv_backward(const SampleUV<T>& args) {
           scatter_corner_sums<2>(sums, image_attributes(at, b), 2, at.grad_attributes);
       });
   if (!scatter) return;
-  const int64_t parts = 2 * static_cast<int64_t>(at.num_threads);
-  parallel_for(parts, at.num_threads, [&](int64_t part) {
-    const int64_t first = part * args.num_texels / parts,
-                  last = (part + 1) * args.num_texels / parts;
-    with_channels<T>(args.channels,
-                     [&](auto known) { scatter_texels<known()>(args, rows.data(), first, last); });
-  });
+  for_texels(
+      1, at.num_threads, [&](int64_t) { return args.num_texels; },
+      [&](int64_t, int64_t first, int64_t last) {
+        with_channels<T>(args.channels, [&](auto known) {
+          scatter_texels<known()>(args, rows.data(), first, last);
+        });
+      });
 }
 
 NMR_FLOAT_AND_DOUBLE(mipmaps_forward, Mipmaps)

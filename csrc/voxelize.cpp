@@ -147,7 +147,7 @@ void voxelize(const Voxelize& args) {
     grid.clear();
     const float* vertices = args.mesh.image_vertices(b);
     const int64_t* faces = args.mesh.image_faces(b);
-    for (int64_t f = 0; f < args.mesh.face_count(b); ++f) {
+    for (int64_t f = 0; f < args.mesh.face_rows.count(b); ++f) {
       Vec3f corners[3];
       for (int k = 0; k < 3; ++k)
         corners[k] =

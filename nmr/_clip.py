@@ -145,9 +145,7 @@ def _new_vertices(
             z = F.embedding(rows, mesh.vertices.reshape(-1, 3))[..., 2:]
     usable = _moderate(ends) & _moderate(z)
     ends, z = (torch.where(usable.unsqueeze(-1), x, torch.zeros_like(x)) for x in (ends, z))
-    height = z[:, 1] - z[:, 0]
-    share = (plane - z[:, 0]) / torch.where(height == 0, torch.ones_like(height), height)
-    points = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+    share, points = cut_edges(ends, z, plane)
     if camera is None:
         points = torch.cat([points[:, :2] / plane, torch.full_like(points[:, 2:], plane)], dim=-1)
     elif mesh.starts is not None or isinstance(camera, ProjectingCamera):
@@ -155,6 +153,15 @@ def _new_vertices(
     else:
         points = _transform_padded(points, world, mesh.batch, camera, starts)
     return share, torch.where(usable, points, float("inf"))
+
+
+def cut_edges(ends: Tensor, depth: Tensor, plane: float) -> tuple[Tensor, Tensor]:
+    """The points at depth ``plane`` of edges between ``ends [P, 2, C]`` at ``depth [P, 2, 1]``: how
+    far from the first end ``[P, 1]``, and the points ``[P, C]``.
+    """
+    height = depth[:, 1] - depth[:, 0]
+    share = (plane - depth[:, 0]) / torch.where(height == 0, torch.ones_like(height), height)
+    return share, ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
 
 
 def _moderate(ends: Tensor) -> Tensor:

@@ -153,6 +153,11 @@ def is_list(value: object) -> bool:
     return isinstance(value, (list, tuple))
 
 
+def as_tuple(values: Tensor | Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Values of each mesh of a list, or one tensor of all."""
+    return tuple(values) if is_list(values) else (values,)
+
+
 def pack_meshes(vertices: object, faces: object) -> MeshBatch:
     """Meshes given as lists, checked and laid end to end; a list of one becomes the batch
     ``[1, V, 3]``.

@@ -75,17 +75,7 @@ def soft_iou_loss(prediction: Tensor, target: Tensor) -> Tensor:
     forward_mode = not torch.compiler.is_compiling() and ops.in_forward_mode(prediction, target)
     if prediction.is_cpu and target.is_cpu and not forward_mode:
         return ops.soft_iou_loss(prediction, target)[0]
-    return 1 - _soft_iou(prediction.flatten(1), target.flatten(1)).mean()
-
-
-def _soft_iou(prediction: Tensor, target: Tensor) -> Tensor:
-    """Soft IoU ``[B]`` of pairs ``[B, N]``, by torch: on the device of the images, and in forward
-    mode.
-    """
-    intersection = (prediction * target).sum(1)
-    union = (prediction + target).sum(1) - intersection
-    empty = union == 0
-    return torch.where(empty, 1.0, intersection / torch.where(empty, 1.0, union))
+    return ops.soft_iou_in_torch(prediction, target)
 
 
 def smoothness_loss(vertices: Tensor, edges: Tensor) -> Tensor:

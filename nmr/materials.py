@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ._images import read_image
-from ._packing import is_list
+from ._packing import as_tuple, is_list
 from ._validate import check_indices, check_values, describe
 from .textures import UVTexture
 
@@ -78,7 +78,7 @@ class Materials:
         if not is_list(self.images) or len(self.images) != len(colors):
             got = len(self.images) if is_list(self.images) else describe(self.images)
             raise ValueError(f"images must be a list of {len(colors)}, one per colour, got {got}")
-        for faces in _each(self.face_material):
+        for faces in as_tuple(self.face_material):
             if not isinstance(faces, Tensor) or faces.ndim != 1 or faces.is_floating_point():
                 raise TypeError(
                     f"face_material must be an integer tensor [F], got {describe(faces)}"
@@ -135,12 +135,12 @@ class Materials:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
         # the image of each face, -1 if it has none; then the colour, 0 if it has an image
         chosen, plain = [], []
-        for k, faces in enumerate(_each(self.face_material)):
+        for k, faces in enumerate(as_tuple(self.face_material)):
             faces = faces.to(self.colors.device, torch.int64)
             has_image = [image is not None for image in self.images]
             shown = faces.new_tensor([*has_image, False], dtype=torch.bool)[faces]
             if self.uv_faces is not None:
-                shown = shown & (_each(self.uv_faces)[k] >= 0).all(1).to(shown.device)
+                shown = shown & (as_tuple(self.uv_faces)[k] >= 0).all(1).to(shown.device)
             chosen.append(torch.where(shown, faces, -1).to(self.colors).unsqueeze(-1))
             grey = self.colors.new_full((1, self.colors.shape[1]), GREY)
             colors = torch.cat([self.colors, grey])[faces]
@@ -159,11 +159,7 @@ class Materials:
     def _texture(self, image: Tensor) -> UVTexture:
         """One image on all faces; those without texture coordinates have any."""
         lists = is_list(self.uv)
-        uv = [x if len(x) else x.new_zeros(1, 2) for x in _each(self.uv)]
-        rows = [x.clamp(min=0) for x in _each(self.uv_faces)]
+        uv = [x if len(x) else x.new_zeros(1, 2) for x in as_tuple(self.uv)]
+        rows = [x.clamp(min=0) for x in as_tuple(self.uv_faces)]
         parts = (uv, rows) if lists else (uv[0], rows[0])
         return UVTexture(image, *parts, self.wrap, self.filter)
-
-
-def _each(values: object) -> list:
-    return list(values) if is_list(values) else [values]

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from . import ops
-from ._packing import is_list
+from ._packing import as_tuple, is_list
 from ._validate import (
     callers_level,
     check_choice,
@@ -148,16 +148,16 @@ class TextureCubes:
     textures: Tensor | list[Tensor]
 
     def __post_init__(self) -> None:
-        for cubes in _each(check_values(self.textures, "textures", "F, ts, ts, ts, C")):
+        for cubes in as_tuple(check_values(self.textures, "textures", "F, ts, ts, ts, C")):
             sides = cubes.shape[-4:-1]
             if (
                 len(set(sides)) != 1
                 or sides[0] < 2
-                or sides != _each(self.textures)[0].shape[-4:-1]
+                or sides != as_tuple(self.textures)[0].shape[-4:-1]
             ):
                 raise ValueError(
                     "textures must be cubes [ts, ts, ts, C] of one size ts >= 2, "
-                    f"got {', '.join(describe(part) for part in _each(self.textures))}"
+                    f"got {', '.join(describe(part) for part in as_tuple(self.textures))}"
                 )
 
     def sample(self, fragments: Fragments) -> Tensor:
@@ -225,7 +225,7 @@ class UVTexture:
     filter: Literal["bilinear", "mipmap"] = "bilinear"
 
     def __post_init__(self) -> None:
-        for image in _each(check_values(self.image, "image", "H, W, C")):
+        for image in as_tuple(check_values(self.image, "image", "H, W, C")):
             if 0 in image.shape[-3:]:
                 raise ValueError(f"image must have texels, got {describe(image)}")
             if image.shape[-3] <= 4 < min(image.shape[-2:]):
@@ -234,15 +234,15 @@ class UVTexture:
                     "[C, H, W], give image.permute(1, 2, 0)",
                     stacklevel=callers_level(),
                 )
-        for uv in _each(check_values(self.uv, "uv", "T, 2")):
+        for uv in as_tuple(check_values(self.uv, "uv", "T, 2")):
             if uv.shape[-1] != 2:
                 raise ValueError(f"uv must have shape [T, 2] or [B, T, 2], got {describe(uv)}")
         if self.uv_faces is not None:
-            for faces in _each(self.uv_faces):
+            for faces in as_tuple(self.uv_faces):
                 batch = len(faces) if isinstance(faces, Tensor) and faces.ndim else 0
                 check_faces(faces, batch, torch.device("cpu"), "uv_faces")
-            if len(_each(self.uv)) == len(_each(self.uv_faces)):  # else refused when drawn
-                for faces, uv in zip(_each(self.uv_faces), _each(self.uv), strict=True):
+            if len(as_tuple(self.uv)) == len(as_tuple(self.uv_faces)):  # else refused when drawn
+                for faces, uv in zip(as_tuple(self.uv_faces), as_tuple(self.uv), strict=True):
                     if not holds_for_all(faces != -1):
                         raise ValueError(
                             "uv_faces is -1 at faces without texture coordinates; nmr.Materials draws them in a colour"
@@ -422,7 +422,7 @@ class NormalMap(UVTexture):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for image in _each(self.image):
+        for image in as_tuple(self.image):
             if image.shape[-1] != 3:
                 raise ValueError(
                     f"the image of normals must have 3 channels, got {describe(image)}"
@@ -454,7 +454,3 @@ class NormalMap(UVTexture):
         x, y, z = texel.split(1, dim=-1)
         mapped = unit(x * t + y * turned * torch.linalg.cross(n, t) + z * n)
         return mapped
-
-
-def _each(values: Tensor | tuple[Tensor, ...] | list[Tensor]) -> tuple[Tensor, ...]:
-    return tuple(values) if is_list(values) else (values,)

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Checks the kernels (csrc/) without Python, in separate builds under build/native. Usage: bash tools/check_native.sh CHECK [ARGUMENTS]
-#   tests             C++ tests; every instruction set must give the same bits
+#   tests             C++ tests; every instruction set must give the same bits; every header compiles alone
 #   asan, tsan        the same under AddressSanitizer and UndefinedBehaviorSanitizer; under ThreadSanitizer
 #   fuzz SECONDS      libFuzzer looks for inputs that reach new code; keep stores them in corpus.hex
 #   count             instructions of every kernel under callgrind, at most 5 % above instructions.json; --store stores
@@ -39,6 +39,7 @@ build_and_run() { # name, compiler, flags, further cmake arguments
 }
 
 check_tests() { # with the flags of the package
+    build plain "${CXX:-c++}" -O3 headers -DNMR_MULTIVERSION=ON
     build_and_run plain "${CXX:-c++}" -O3 -DNMR_MULTIVERSION=ON
     for level in best v3 base; do
         NMR_CPU_LEVEL=$level build/native/plain/workload 2 >"build/native/plain/$level.txt"

@@ -21,10 +21,11 @@ template <class T>
 Project<T> read_project(Call& call, bool drawn) {
   Project<T> args{};
   const bool packed = call.has("starts");
-  call.read("starts? [B + 1, 2]", args.starts);
-  args.vertex_batch =
-      call.read(packed ? "vertices [V, 3]" : "vertices [1|B, V, 3]", args.vertices).shape[0];
-  args.num_vertices = call["V"];
+  const int64_t* starts = nullptr;
+  call.read("starts? [B + 1, 2]", starts);
+  const auto& shape =
+      call.read(packed ? "vertices [V, 3]" : "vertices [1|B, V, 3]", args.vertices).shape;
+  args.vertex_rows = {call["V"], packed || shape[0] != 1, starts};
   args.cameras = call.read("camera [1|B, 22]", args.camera).shape[0];
   const Argument& distortion = call.read("distortion? [1|B, 4|5|8]", args.distortion.values);
   const char* points = packed ? "points [V, 3]" : "points [B, V, 3]";
@@ -35,8 +36,7 @@ Project<T> read_project(Call& call, bool drawn) {
     call.result(points, args.points, args.grad_points);
   }
   args.batch = call["B"];
-  if (packed)
-    require_starts(args.starts, args.batch, args.num_vertices, args.starts[2 * args.batch + 1]);
+  if (packed) require_starts(starts, args.batch, args.vertex_rows.size, starts[2 * args.batch + 1]);
   call.gradient("vertices", args.grad_vertices);
   call.let("n", args.cameras);
   args.perspective = call.flag("perspective");

@@ -10,13 +10,13 @@ ClipMesh<T> read_clip_mesh(Call& call) {
   call.read("faces [F, 3]", mesh.faces);
   mesh.num_faces = call["F"];
   mesh.num_threads = num_threads(call);
-  const auto face_count = [&](int64_t) { return mesh.num_faces; };
-  read_face_index(call, "face_index [B, H, W]", mesh.face_index, face_count, mesh.num_threads);
-  mesh.position_batch = call.read("positions [1|B, V, 4]", mesh.positions).shape[0];
-  mesh.num_vertices = call["V"];
+  read_face_index(call, "face_index [B, H, W]", mesh.face_index,
+                  Rows{mesh.num_faces, false, nullptr}, mesh.num_threads);
+  const bool each = call.read("positions [1|B, V, 4]", mesh.positions).shape[0] != 1;
+  mesh.rows = {call["V"], each, nullptr};
   mesh.batch = call["B"];
   mesh.raster = raster_size(call);
-  require_indices(mesh.faces, 3 * mesh.num_faces, mesh.num_vertices, "faces", "vertex", "vertices");
+  require_indices(mesh.faces, 3 * mesh.num_faces, mesh.rows.size, "faces", "vertex", "vertices");
   return mesh;
 }
 

@@ -36,7 +36,8 @@ void pull_edges(Call& call, const Resolve<T>& mean) {
   EdgesBackward<T> args{};
   args.mesh = read_mesh<T>(call);
   args.num_threads = mean.num_threads;
-  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh, args.num_threads);
+  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh.face_rows,
+                  args.num_threads);
   args.image = mean.image;
   args.anti_aliasing = mean.anti_aliasing;
   args.eps = static_cast<T>(call.number("eps"));

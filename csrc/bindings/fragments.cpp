@@ -10,7 +10,8 @@ Fragments<T> read(Call& call, const char* depth, bool anti_aliasing) {
   Fragments<T> args{};
   args.mesh = read_mesh<T>(call);
   args.num_threads = num_threads(call);
-  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh, args.num_threads);
+  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh.face_rows,
+                  args.num_threads);
   args.anti_aliasing = anti_aliasing;
   args.image = image_size(call, anti_aliasing);
   args.far = static_cast<T>(call.number("far"));

@@ -10,7 +10,7 @@ Normals<T> read_normals(Call& call) {
   args.mesh = read_mesh<T>(call);
   args.smooth = call.flag("smooth");
   args.num_threads = num_threads(call);
-  const bool packed = args.mesh.starts;
+  const bool packed = args.mesh.face_rows.starts;
   const char* of_vertices = packed ? "normals [N, 3]" : "normals [B, V, 3]";
   const char* of_faces = packed ? "normals [M, 3]" : "normals [B, F, 3]";
   call.result(args.smooth ? of_vertices : of_faces, args.normals, args.grad_normals);
@@ -57,11 +57,13 @@ template <class T>
 LitColors<T> read_lit(Call& call) {
   LitColors<T> args{};
   args.at = read_interpolate<T>(call, "vertices", "faces", "3");
-  const bool packed = args.at.starts;
+  const bool packed = args.at.rows.starts;
   args.smooth = call.flag("smooth");
   const char* of_vertices = packed ? "normals [A, 3]" : "normals [1|B, A, 3]";
   const char* of_faces = packed ? "normals [M, 3]" : "normals [1|B, F, 3]";
-  args.normal_batch = call.read(args.smooth ? of_vertices : of_faces, args.normals).shape[0];
+  const auto& shape = call.read(args.smooth ? of_vertices : of_faces, args.normals).shape;
+  args.normal_rows = args.smooth ? args.at.rows : args.at.face_rows;
+  args.normal_rows.each = packed || shape[0] != 1;
   call.read("viewer [B, 5]", args.viewer);
   call.read("layout [lights, 3]", args.layout);
   call.read("parameters? [P]", args.parameters);

@@ -34,7 +34,7 @@ ClipFaces<T> read_clip(Call& call) {
     require(args.starts[n + 2] - args.starts[n] >= counts[n],
             "new_starts leave too little room for the clipped meshes");
   for (int64_t b = 0; b < batch; ++b)
-    require(args.mesh.vertex_count(b) > 0 || args.starts[2 * b + 3] == args.starts[2 * b + 1],
+    require(args.mesh.vertex_rows.count(b) > 0 || args.starts[2 * b + 3] == args.starts[2 * b + 1],
             "a mesh without vertices has no faces");
   return args;
 }
@@ -113,16 +113,17 @@ void pull_silhouette(Call& call) {
   args.num_threads = num_threads(call);
   args.anti_aliasing = call.flag("anti_aliasing");
   args.eps = static_cast<T>(call.number("eps"));
-  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh, args.num_threads);
+  read_face_index(call, "face_index [B, H, W]", args.face_index, args.mesh.face_rows,
+                  args.num_threads);
   args.image = image_size(call, args.anti_aliasing);
   call.read("grad_alpha [B, h, w]", args.grad_alpha);
   const bool* cut;
   call.read("cut []", cut);
   const ScratchUse use;
   if (has_camera(call)) {
-    const int64_t rows = args.mesh.starts ? 1 : args.mesh.batch;
-    args.grad_vertices = reserve(thread_scratch<PointsScratch<T>>().grad,
-                                 static_cast<size_t>(3 * rows * args.mesh.num_vertices));
+    args.grad_vertices =
+        reserve(thread_scratch<PointsScratch<T>>().grad,
+                static_cast<size_t>(3 * args.mesh.vertex_rows.total(args.mesh.batch)));
     camera.grad_points = args.grad_vertices;
   } else {
     call.only_gradient("vertices", args.grad_vertices);

@@ -33,51 +33,50 @@ inline void require_starts(const int64_t* starts, int64_t batch, int64_t rows, i
                      std::to_string(faces) + ")");
 }
 
+// The rows of [F, 3], [B, F, 3], or packed [M, 3].
+inline Rows rows_of_faces(Call& call, const Argument& faces, const int64_t* starts) {
+  if (starts) return {call["M"], true, starts + 1};
+  return {call["F"], faces.shape.size() == 3, nullptr};
+}
+
 // A batch of meshes, with every index checked. The names are those of its starts and its vertices.
 template <class T>
-MeshBatch<T> read_mesh(Call& call, const std::string& starts = "starts",
+MeshBatch<T> read_mesh(Call& call, const std::string& name_of_starts = "starts",
                        const std::string& vertices = "vertices") {
   MeshBatch<T> mesh{};
-  const bool packed = call.has(starts);
+  const bool packed = call.has(name_of_starts);
   call.read(vertices + (packed ? " [N, 3]" : " [B, V, 3]"), mesh.vertices);
-  mesh.faces_per_image =
-      call.read(packed ? "faces [M, 3]" : "faces [F, 3] or [B, F, 3]", mesh.faces).shape.size() ==
-      3;
-  if (packed) call.read(starts + " [B + 1, 2]", mesh.starts);
+  const Argument& faces =
+      call.read(packed ? "faces [M, 3]" : "faces [F, 3] or [B, F, 3]", mesh.faces);
+  const int64_t* starts = nullptr;
+  if (packed) call.read(name_of_starts + " [B + 1, 2]", starts);
   mesh.batch = call["B"];
-  mesh.num_vertices = call[packed ? "N" : "V"];
-  mesh.num_faces = call[packed ? "M" : "F"];
-  require(mesh.num_faces < (int64_t(1) << 30), "at most 2^30 faces per mesh");
-  if (packed) require_starts(mesh.starts, mesh.batch, mesh.num_vertices, mesh.num_faces);
+  mesh.vertex_rows = {call[packed ? "N" : "V"], true, starts};
+  mesh.face_rows = rows_of_faces(call, faces, starts);
+  require(mesh.face_rows.size < (int64_t(1) << 30), "at most 2^30 faces per mesh");
+  if (packed) require_starts(starts, mesh.batch, mesh.vertex_rows.size, mesh.face_rows.size);
   for (int64_t b = 0; b < mesh.batch; ++b) {
-    require(mesh.vertex_count(b) < (int64_t(1) << 29), "at most 2^29 vertices per mesh");
-    if (b == 0 || packed || mesh.faces_per_image)
-      require_indices(mesh.image_faces(b), 3 * mesh.face_count(b), mesh.vertex_count(b), "faces",
-                      "vertex", "vertices");
+    require(mesh.vertex_rows.count(b) < (int64_t(1) << 29), "at most 2^29 vertices per mesh");
+    if (b == 0 || mesh.face_rows.each)
+      require_indices(mesh.image_faces(b), 3 * mesh.face_rows.count(b), mesh.vertex_rows.count(b),
+                      "faces", "vertex", "vertices");
   }
   return mesh;
 }
 
 // The face index map, or with "[B, H, W, K]" a table of faces; each entry must be -1 or name a face
 // of its image, or a reversed copy of one.
-template <class FaceCount>
-void read_face_index(Call& call, const char* text, const int32_t*& field,
-                     const FaceCount& face_count, int num_threads) {
+inline void read_face_index(Call& call, const char* text, const int32_t*& field, const Rows& faces,
+                            int num_threads) {
   const Argument& map = call.read(text, field);
   const int64_t batch = call["B"], entries = batch ? map.count() / batch : 0;
   const int64_t parts = entries / (int64_t(1) << 18) + 1;  // of each image
   parallel_for(batch * parts, num_threads, [&](int64_t n) {
     const int64_t b = n / parts, k = n % parts, first = k * entries / parts,
                   last = (k + 1) * entries / parts;
-    require(are_face_indices(field + b * entries + first, last - first, face_count(b)),
+    require(are_face_indices(field + b * entries + first, last - first, faces.count(b)),
             "the face index map does not belong to these faces");
   });
-}
-
-template <class T>
-void read_face_index(Call& call, const char* text, const int32_t*& field, const MeshBatch<T>& mesh,
-                     int num_threads) {
-  read_face_index(call, text, field, [&](int64_t b) { return mesh.face_count(b); }, num_threads);
 }
 
 inline Size raster_size(Call& call) { return {call["H"], call["W"]}; }
@@ -116,15 +115,11 @@ RasterSettings<T> raster_settings(Call& call, Size raster, bool perspective) {
           static_cast<T>(call.number("far")), perspective};
 }
 
-// Face index map and weights of the pixels of F faces, or of M packed ones.
+// Face index map and weights of the pixels of these faces.
 template <class Args>
-void read_pixels(Call& call, Args& args, int64_t num_faces) {
-  const int64_t* starts = args.starts;
-  const auto face_count = [&](int64_t b) {
-    return starts ? starts[2 * b + 3] - starts[2 * b + 1] : num_faces;
-  };
+void read_pixels(Call& call, Args& args, const Rows& faces) {
   args.num_threads = num_threads(call);
-  read_face_index(call, "face_index [B, H, W]", args.face_index, face_count, args.num_threads);
+  read_face_index(call, "face_index [B, H, W]", args.face_index, faces, args.num_threads);
   call.read("weights [B, H, W, 3]", args.weights);
   args.batch = call["B"];
   args.raster = raster_size(call);
@@ -137,28 +132,23 @@ Interpolate<T> read_interpolate(Call& call, const std::string& values, const std
                                 const std::string& channels) {
   Interpolate<T> args{};
   const bool packed = call.has("starts");
-  call.read("starts? [B + 1, 2]", args.starts);
-  args.corners_per_image =
-      call.read(corners + (packed ? " [M, 3]" : " [F, 3] or [B, F, 3]"), args.corners)
-          .shape.size() == 3;
-  args.num_faces = call[packed ? "M" : "F"];
-  read_pixels(call, args, args.num_faces);
+  const int64_t* starts = nullptr;
+  call.read("starts? [B + 1, 2]", starts);
+  args.face_rows = rows_of_faces(
+      call, call.read(corners + (packed ? " [M, 3]" : " [F, 3] or [B, F, 3]"), args.corners),
+      starts);
+  read_pixels(call, args, args.face_rows);
   const auto& shape =
       call.read(values + (packed ? " [A, " : " [1|B, A, ") + channels + "]", args.attributes).shape;
-  args.attribute_batch = packed ? 1 : shape[0];
-  args.num_attributes = call["A"];
+  args.rows = {call["A"], packed || shape[0] != 1, starts};
   args.channels = shape.back();
   require(args.channels >= 1,
           values + " must have at least one channel, got " + call(values).shape_text());
-  if (packed) require_starts(args.starts, args.batch, args.num_attributes, args.num_faces);
-  for (int64_t b = 0; packed && b < args.batch; ++b) {
-    const int64_t* s = args.starts + 2 * b;
-    require_indices(args.corners + 3 * s[1], 3 * (s[3] - s[1]), s[2] - s[0], corners.c_str(),
-                    "attribute", "attributes");
-  }
-  if (!packed)
-    require_indices(args.corners, call(corners).count(), args.num_attributes, corners.c_str(),
-                    "attribute", "attributes");
+  if (packed) require_starts(starts, args.batch, args.rows.size, args.face_rows.size);
+  const bool once = !args.face_rows.each;  // also without an image
+  for (int64_t b = 0; b < (once ? 1 : args.batch); ++b)
+    require_indices(args.corners + 3 * args.face_rows.first(b), 3 * args.face_rows.count(b),
+                    args.rows.count(b), corners.c_str(), "attribute", "attributes");
   call.gradient(values, args.grad_attributes);
   call.gradient("weights", args.grad_weights);
   return args;

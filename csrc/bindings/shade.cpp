@@ -9,17 +9,18 @@ template <class T>
 TextureCubes<T> read_texture_cubes(Call& call) {
   TextureCubes<T> args{};
   const bool packed = call.has("starts");
-  call.read("starts? [B + 1, 2]", args.starts);
+  const int64_t* starts = nullptr;
+  call.read("starts? [B + 1, 2]", starts);
   const char* text = packed ? "textures [M, ts, ts, ts, C]" : "textures [1|I, F, ts, ts, ts, C]";
-  args.texture_batch = call.read(text, args.textures).shape[0];
-  args.num_faces = call[packed ? "M" : "F"];
+  const int64_t sets = call.read(text, args.textures).shape[0];
+  args.cubes = {call[packed ? "M" : "F"], packed || sets != 1, packed ? starts + 1 : nullptr};
   args.texture_size = call["ts"];
   args.channels = call["C"];
   require(args.texture_size >= 1 && args.channels >= 1,
           "textures must have texels and channels, got " + call("textures").shape_text());
-  if (packed) require_starts(args.starts, call["B"], args.starts[2 * call["B"]], args.num_faces);
-  read_pixels(call, args, args.num_faces);
-  require(packed || args.texture_batch == 1 || args.texture_batch == args.batch,
+  if (packed) require_starts(starts, call["B"], starts[2 * call["B"]], args.cubes.size);
+  read_pixels(call, args, args.cubes);
+  require(packed || sets == 1 || sets == args.batch,
           "textures must have the batch size " + std::to_string(args.batch) + " or 1, got " +
               call("textures").shape_text());
   args.eps = static_cast<T>(call.number("eps"));

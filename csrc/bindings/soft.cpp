@@ -65,7 +65,8 @@ SoftFragments<T> read_soft_fragments(Call& call) {
   SoftFragments<T> args{};
   args.mesh = read_mesh<T>(call);
   args.num_threads = num_threads(call);
-  read_face_index(call, "face_index [B, H, W, K]", args.face_index, args.mesh, args.num_threads);
+  read_face_index(call, "face_index [B, H, W, K]", args.face_index, args.mesh.face_rows,
+                  args.num_threads);
   args.raster = drawn_size(call, "face_index");
   args.layers = num_layers(call);
   args.perspective = call.flag("perspective");

@@ -67,7 +67,8 @@ UVLevels<T> read_levels(Call& call) {
   args.mesh = read_mesh<T>(call, "mesh_starts");
   args.uv = read_interpolate<T>(call, "uv", "corners", "2");
   const int32_t* face_index = nullptr;
-  read_face_index(call, "face_index [B, H, W]", face_index, args.mesh, args.uv.num_threads);
+  read_face_index(call, "face_index [B, H, W]", face_index, args.mesh.face_rows,
+                  args.uv.num_threads);
   read_grids(call, args, kMostTexels - 1);
   call.read("level [B, H, W]", args.level);
   return args;

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nmr import ops
+from nmr._clip import cut_edges
 from nmr._validate import (
     cast_under_autocast,
     check_choice,
@@ -245,8 +246,8 @@ def _in_front(pos: Tensor, tri: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, T
     faces, source, _, ends = ops.clip_faces(
         depths, tri, None, plane, new_starts, num_new, num_drawn
     )
-    a, b = (pos.double().view(-1, 4)[ends[:, k]] for k in (0, 1))
-    new = a + (plane - a[:, 3:]) / (b[:, 3:] - a[:, 3:]) * (b - a)
+    both = pos.double().view(-1, 4)[ends[:, :2]]
+    new = cut_edges(both, both[..., 3:], plane)[1]
     parts = zip(pos.double(), new.split(counts[:, 0].tolist()), strict=True)
     starts = new_starts + torch.arange(batch + 1).unsqueeze(1) * torch.tensor([vertices, 0])
     return torch.cat([x for pair in parts for x in pair]), faces, (source, starts)

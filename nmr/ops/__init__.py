@@ -20,7 +20,7 @@ from .camera import count_cameras, project
 from .clip_space import antialias, clip_weights
 from .edges import resolve
 from .fragments import depth_image, fragments
-from .losses import soft_iou_loss
+from .losses import soft_iou_in_torch, soft_iou_loss
 from .mesh import smoothness, voxels
 from .raster import (
     RasterSettings,
@@ -59,6 +59,7 @@ __all__ = [
     "silhouette",
     "smoothness",
     "soft_fragments",
+    "soft_iou_in_torch",
     "soft_iou_loss",
     "soft_layers",
     "soft_silhouette",

@@ -57,10 +57,9 @@ struct Run {
   // `channels` values at the vertices of the faces, and their gradients.
   Interpolate<T> interpolate(const T* attributes, int64_t attribute_batch, int64_t channels,
                              T* grad, T* grad_weights) {
-    return {face_index,        weights,        s.batch,  raster,         attributes,
-            attribute_batch,   s.num_vertices, channels, s.faces.data(), s.num_faces,
-            s.faces_per_image, mesh.starts,    nullptr,  nullptr,        grad,
-            grad_weights,      threads};
+    const Rows rows{s.num_vertices, s.packed() || attribute_batch != 1, mesh.vertex_rows.starts};
+    return {face_index,     weights,        s.batch, raster,  attributes, rows,         channels,
+            s.faces.data(), mesh.face_rows, nullptr, nullptr, grad,       grad_weights, threads};
   }
 
   void all() {
@@ -103,7 +102,7 @@ struct Run {
     for (int64_t n = 0; n < pixels && s.foreign_face_index; ++n) {
       const double u = (noise(stream_of("face_index"), n) + 1) / 2;
       index[n] = static_cast<int32_t>(
-                     u * static_cast<double>(2 * mesh.face_count(n / raster.pixels()) + 1)) -
+                     u * static_cast<double>(2 * mesh.face_rows.count(n / raster.pixels()) + 1)) -
                  1;
     }
     if (s.given_face_index) std::copy_n(s.given_face_index, pixels, index);
@@ -194,9 +193,7 @@ struct Run {
                                 s.batch,
                                 raster,
                                 in("textures", size),
-                                groups,
-                                s.num_faces,
-                                mesh.starts,
+                                {s.num_faces, s.packed() || groups != 1, mesh.face_rows.starts},
                                 s.texture_size,
                                 C,
                                 s.eps,
@@ -288,15 +285,15 @@ struct Run {
     }
     for (int64_t b = 0; b < s.batch; ++b) {
       const int64_t first = b * raster.pixels(), vertex = mesh.vertex_start(b),
-                    edges = 3 * mesh.face_count(b);
+                    edges = 3 * mesh.face_rows.count(b);
       std::vector<int64_t>& twins =
           r.tables.resize("twins", edges);  // of other edges, too: any in range is allowed
       for (int64_t n = 0; n < edges; ++n) twins[n] = n % 3 ? n : (5 * n + seed) % edges;
       const ClipMesh<T> clip{positions.data() + 4 * vertex,
                              1,
-                             mesh.vertex_count(b),
+                             mesh.vertex_rows.count(b),
                              mesh.image_faces(b),
-                             mesh.face_count(b),
+                             mesh.face_rows.count(b),
                              face_index + first,
                              1,
                              raster,
@@ -363,7 +360,7 @@ struct Run {
     args.at = interpolate(s.vertices.data(), s.batch, 3, out("grad_lit_vertices", 3 * rows),
                           out("grad_lit_weights", 3 * pixels));
     args.normals = unit;
-    args.normal_batch = s.packed() ? 0 : s.batch;
+    args.normal_rows = smooth ? args.at.rows : Rows{s.num_faces, true, mesh.face_rows.starts};
     args.smooth = smooth;
     args.viewer = viewer;
     args.parameters = lit ? parameters : nullptr;
@@ -434,9 +431,8 @@ struct Run {
     for (int64_t n = 0; n < D * B; ++n) distortion[n] /= 16;
     Project<T> args{};
     args.vertices = s.vertices.data();
-    args.starts = mesh.starts;
-    args.batch = args.cameras = args.vertex_batch = B;
-    args.num_vertices = s.num_vertices;
+    args.vertex_rows = mesh.vertex_rows;
+    args.batch = args.cameras = B;
     args.perspective = s.perspective;
     args.matrix = {matrix, true, out("grad_matrix", 12 * B)};
     args.intrinsics = {intrinsics, true, out("grad_intrinsics", 6 * B)};
@@ -470,7 +466,6 @@ struct Run {
     T nearest = 0;
     Project<T> args{};
     args.batch = args.cameras = count;
-    args.vertex_batch = 1;
     args.perspective = s.perspective;
     args.eye = {eye, false, nullptr};
     args.at = {points.data(), true, grads.data()};
@@ -491,7 +486,7 @@ struct Run {
   // The edges are made up: corners of consecutive faces of the first mesh but the last, so that
   // groups of edges are not full. Packed vertices count as one mesh.
   void smoothness() {
-    const int64_t num_faces = s.batch > 0 ? mesh.face_count(0) : 0,
+    const int64_t num_faces = s.batch > 0 ? mesh.face_rows.count(0) : 0,
                   num_edges = std::max<int64_t>(num_faces - 1, 0), batch = s.packed() ? 1 : s.batch;
     int64_t* edges = r.tables.resize("edges", 4 * num_edges).data();
     for (int64_t f = 0; f < num_edges; ++f) {
@@ -536,8 +531,8 @@ struct Run {
     std::vector<float>& vertices =
         memory.resize("vertices", static_cast<int64_t>(s.vertices.size()));
     std::copy(s.vertices.begin(), s.vertices.end(), vertices.begin());
-    const MeshBatch<float> batch{vertices.data(), s.faces.data(),    s.batch,    s.num_vertices,
-                                 s.num_faces,     s.faces_per_image, mesh.starts};
+    const MeshBatch<float> batch{vertices.data(), s.faces.data(), s.batch, mesh.vertex_rows,
+                                 mesh.face_rows};
     for (const bool touched : {false, true}) {
       const int64_t cells = s.grid_size * s.grid_size * s.grid_size;
       unsigned char* filled = out<unsigned char>(touched ? "touched" : "voxels", s.batch * cells);
@@ -633,8 +628,8 @@ Scene<T> first_image(const Scene<T>& scene) {
   Scene<T> result = scene;
   const MeshBatch<T> mesh = scene.mesh();
   result.batch = 1;
-  result.num_vertices = mesh.vertex_count(0);
-  result.num_faces = mesh.face_count(0);
+  result.num_vertices = mesh.vertex_rows.count(0);
+  result.num_faces = mesh.face_rows.count(0);
   result.vertices.resize(3 * result.num_vertices);
   result.faces.resize(3 * result.num_faces);
   if (scene.packed()) result.starts = {0, 0, result.num_vertices, result.num_faces};
@@ -688,7 +683,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   for (size_t n = 0; n < face_index.size(); ++n) {
     const int64_t b = static_cast<int64_t>(n) / raster.pixels(), x = static_cast<int64_t>(n) % W,
                   y = static_cast<int64_t>(n) / W % H;
-    const int64_t F = mesh.face_count(b), id = face_index[n];
+    const int64_t F = mesh.face_rows.count(b), id = face_index[n];
     check(id >= -1 && id < (scene.fill_back || foreign ? 2 * F : F),
           "face_index names a face of its image, or -1");
     if (id < 0 || foreign || *broken) continue;
@@ -710,7 +705,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
     const size_t count = face_index.empty() ? 0 : layers.size() / face_index.size();
     for (size_t n = 0; n < layers.size(); ++n) {
       const int64_t id = layers[n],
-                    F = mesh.face_count(static_cast<int64_t>(n / count) / raster.pixels());
+                    F = mesh.face_rows.count(static_cast<int64_t>(n / count) / raster.pixels());
       check(id >= -1 && id < (scene.fill_back ? 2 * F : F),
             "a layer names a face of its image, or -1");
       if (n % count > 0)
@@ -727,8 +722,8 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
         &ends = r.template get<int64_t>("clip_ends");
   const std::vector<int32_t>& sources = r.template get<int32_t>("clip_source");
   for (int64_t b = 0; b < scene.batch; ++b) {
-    const int64_t V = mesh.vertex_count(b), F = mesh.face_count(b), first = mesh.vertex_start(b),
-                  P = starts[2 * b + 2] - starts[2 * b];
+    const int64_t V = mesh.vertex_rows.count(b), F = mesh.face_rows.count(b),
+                  first = mesh.vertex_start(b), P = starts[2 * b + 2] - starts[2 * b];
     for (int64_t f = starts[2 * b + 1]; f < starts[2 * b + 3]; ++f) {
       const int64_t source = sources[f];
       check(source >= 0 && source < std::max<int64_t>(F, 1), "a drawn face is part of a face");

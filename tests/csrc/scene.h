@@ -65,6 +65,10 @@ struct SceneShape {
   bool packed() const { return !starts.empty(); }
   Size raster() const { return raster_of(image, anti_aliasing); }
   int64_t pixels() const { return batch * raster().pixels(); }
+  Rows face_rows() const {
+    if (packed()) return {num_faces, true, starts.data() + 1};
+    return {num_faces, faces_per_image, nullptr};
+  }
   int64_t rows() const { return packed() ? num_vertices : batch * num_vertices; }  // of vertices
   void add_start() {  // of the next packed mesh, or the end
     starts.push_back(num_vertices);
@@ -79,7 +83,7 @@ struct Scene : SceneShape {
 
   MeshBatch<T> mesh() const {
     const int64_t* first = packed() ? starts.data() : nullptr;
-    return {vertices.data(), faces.data(), batch, num_vertices, num_faces, faces_per_image, first};
+    return {vertices.data(), faces.data(), batch, {num_vertices, true, first}, face_rows()};
   }
 };
 
