@@ -176,33 +176,4 @@ void sum_blocks(int64_t batch, Size raster, bool shared, int num_threads, const 
   flush();
 }
 
-// Gradients per visible face of a block, in drawing order.
-template <class T>
-struct FaceGradients {
-  std::vector<int32_t> ids;  // [count] face indices
-  std::vector<T> values;     // [count, 3, 3] of the three corners' x, y, z
-  int64_t count;
-
-  // Names the faces; there is memory for them.
-  NMR_INLINE void list(const int32_t* faces, int64_t number) {
-    count = number;
-    std::copy_n(faces, number, ids.data());
-  }
-};
-
-// Adds these gradients to the vertices of one image (faces [F, 3]).
-template <class T>
-void scatter_face_gradients(const FaceGradients<T>& gradients, const int64_t* faces,
-                            int64_t num_faces, T* grad_vertices) {
-  const T* value = gradients.values.data();
-  for (int64_t n = 0; n < gradients.count; ++n) {
-    const bool reversed = gradients.ids[n] >= num_faces;
-    const int64_t* face = faces + 3 * face_of(gradients.ids[n], num_faces);
-    for (int k = 0; k < 3; ++k, value += 3) {
-      T* grad = grad_vertices + 3 * face[reversed ? 2 - k : k];
-      for (int c = 0; c < 3; ++c) grad[c] += value[c];
-    }
-  }
-}
-
 }  // namespace nmr

@@ -24,7 +24,7 @@ struct Corner {
 template <class T>
 struct ClipImage {
   const T* positions;
-  ImageAttributes<T> attributes;
+  ImageAttributes attributes;
   Size raster;
   const int32_t* face_index;
 

@@ -58,7 +58,6 @@ void with_channels(int64_t channels, const Body& body) {
 }
 
 // The attribute rows and corners of image b.
-template <class T>
 struct ImageAttributes {
   int64_t first_row;       // first row of attributes
   const int64_t* corners;  // [F, 3]
@@ -71,14 +70,19 @@ struct ImageAttributes {
 };
 
 template <class T>
-ImageAttributes<T> image_attributes(const Interpolate<T>& args, int64_t b) {
+ImageAttributes image_attributes(const Interpolate<T>& args, int64_t b) {
   return {args.rows.first(b), args.corners + 3 * args.face_rows.first(b), args.face_rows.count(b)};
+}
+
+template <class T>
+ImageAttributes image_attributes(const MeshBatch<T>& mesh, int64_t b) {
+  return {mesh.vertex_rows.first(b), mesh.image_faces(b), mesh.face_rows.count(b)};
 }
 
 // Adds sums [count, 3, C] of the corners of faces to the rows of attributes at these corners.
 // kChannels: C, or 0 if it is known only at run time.
 template <int64_t kChannels, class T>
-void scatter_corner_sums(const FaceSums<T>& sums, const ImageAttributes<T>& image, int64_t channels,
+void scatter_corner_sums(const FaceSums<T>& sums, const ImageAttributes& image, int64_t channels,
                          T* grad_attributes) {
   const int64_t C = kChannels ? kChannels : channels;
   const T* value = sums.values.data() + 3 * C;  // skips the background's

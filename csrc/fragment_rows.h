@@ -12,9 +12,9 @@ namespace {
 template <class T>
 NMR_INLINE void set_up_faces(const FragmentBlock<T>& block, FragmentScratch<T>& scratch) {
   const int64_t W = block.raster.width, F = block.num_faces;
-  scratch.visible.find(block.face_index + block.first * W, (block.last - block.first) * W, F);
-  const int32_t* ids = scratch.visible.ids.data() + 1;
-  const int64_t count = scratch.visible.count - 1;
+  scratch.visible->find(block.face_index + block.first * W, (block.last - block.first) * W, F);
+  const int32_t* ids = scratch.visible->ids.data() + 1;
+  const int64_t count = scratch.visible->count - 1;
   T* table = scratch.table.data();
   for (int64_t n = 0; n < kFaceEntry; ++n) table[n] = n == 8 || n >= 12 ? T(1) : T(0);
   const Lanes<T> width = splat(static_cast<T>(W)),
@@ -72,7 +72,7 @@ template <class T>
 NMR_INLINE FragmentPixels<T> evaluate(const FragmentScratch<T>& scratch, Lanes32 ids, int64_t i,
                                       Lanes<T> y) {
   FragmentPixels<T> p;
-  const LaneArray<int32_t, Lanes32> slots(gather_values(scratch.visible.slots.data() + 1, ids));
+  const LaneArray<int32_t, Lanes32> slots(gather_values(scratch.visible->slots.data() + 1, ids));
   const T* entry[kLanes];
   for (int64_t n = 0; n < kLanes; ++n) {
     p.slot[n] = slots.lane[n];
@@ -197,16 +197,20 @@ NMR_INLINE void load_face_quads(const T* values, int64_t slot, int64_t stride,
   load_quads<T>(row, column);
 }
 
-// Writes the gradients of the faces [slot, slot + 8): grad[3 k + c] of coordinate c of corner k.
+// Writes the gradients of the faces [slot, slot + 8): grad[3 k + c] of coordinate c of corner k in
+// drawing order.
 template <class T>
-NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot,
-                                     FaceGradients<T>& result) {
+NMR_INLINE void store_face_gradients(const Lanes<T> (&grad)[9], int64_t slot, int64_t num_faces,
+                                     FaceSums<T>& sums) {
   T value[9][kLanes];
   for (int c = 0; c < 9; ++c) store_lanes(value[c], grad[c]);
-  T* out = result.values.data() + 9 * (slot - 1);
-  const int64_t count = std::min(kLanes, result.count - (slot - 1));
-  for (int64_t n = 0; n < count; ++n, out += 9)
-    for (int c = 0; c < 9; ++c) out[c] = value[c][n];
+  const int64_t count = std::min(kLanes, sums.visible.count - slot);
+  for (int64_t n = 0; n < count; ++n) {
+    const bool reversed = sums.visible.ids[slot + n] >= num_faces;
+    for (int k = 0; k < 3; ++k)
+      for (int c = 0; c < 3; ++c)
+        sums.values[9 * (slot + n) + 3 * (reversed ? 2 - k : k) + c] = value[3 * k + c][n];
+  }
 }
 
 // The values of eight faces in the table: M_k0 and M_k1, and the depths of the corners.
@@ -220,12 +224,11 @@ struct FaceLanes {
 // then computes the gradients of eight faces: out[3 k + c] is that of coordinate c of corner k.
 template <int64_t kNumbers, class T, class StartRow, class Add, class Gradients>
 NMR_INLINE void backward_block(const FragmentBlock<T>& block, FragmentScratch<T>& scratch,
-                               FaceGradients<T>& result, const StartRow& start_row, const Add& add,
+                               FaceSums<T>& result, const StartRow& start_row, const Add& add,
                                const Gradients& gradients) {
   set_up_faces(block, scratch);
-  result.list(scratch.visible.ids.data() + 1, scratch.visible.count - 1);
   T* sums = scratch.sums.data();
-  std::fill_n(sums, kNumbers * (scratch.visible.count + kLanes), T(0));
+  std::fill_n(sums, kNumbers * (scratch.visible->count + kLanes), T(0));
   for (int64_t j = block.first; j < block.last; ++j) {
     start_row(j);
     for_covered(
@@ -236,14 +239,14 @@ NMR_INLINE void backward_block(const FragmentBlock<T>& block, FragmentScratch<T>
         [](int64_t) {});
   }
   const T* table = scratch.table.data();
-  for (int64_t slot = 1; slot < scratch.visible.count; slot += kLanes) {
+  for (int64_t slot = 1; slot < scratch.visible->count; slot += kLanes) {
     FaceLanes<T> faces;
     load_face_quads<T>(table, slot, kFaceEntry, faces.mx);
     load_face_quads<T>(table + 4, slot, kFaceEntry, faces.my);
     load_face_quads<T>(table + 12, slot, kFaceEntry, faces.z);
     Lanes<T> out[9];
     gradients(sums, slot, faces, out);
-    store_face_gradients<T>(out, slot, result);
+    store_face_gradients<T>(out, slot, block.num_faces, result);
   }
 }
 
@@ -256,7 +259,7 @@ NMR_INLINE void backward_block(const FragmentBlock<T>& block, FragmentScratch<T>
 // of c w_k:  H_mk = -C_k, or z_m C_k.
 template <class T>
 void backward_rows(const Fragments<T>& args, const FragmentBlock<T>& block,
-                   FragmentScratch<T>& scratch, FaceGradients<T>& result) {
+                   FragmentScratch<T>& scratch, FaceSums<T>& result) {
   const int64_t W = block.raster.width, w = args.image.width;
   const bool perspective = scratch.perspective;
   const Lanes<T> zero = splat(T(0)), one = splat(T(1));

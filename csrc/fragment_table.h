@@ -9,7 +9,7 @@
 #include <vector>
 
 #include "average.h"
-#include "blocks.h"
+#include "corner_values.h"
 #include "geometry.h"
 #include "parallel.h"
 #include "stages.h"
@@ -22,16 +22,17 @@ constexpr int64_t kFaceEntry = 16;
 // Memory for one block.
 template <class T>
 struct FragmentScratch {
-  VisibleFaces visible;
+  VisibleFaces* visible;
   std::vector<T> table;  // [visible + 1 + 8, kFaceEntry]
   std::vector<T> rows;   // [2, W + 8] a row of depths or gradients each
   std::vector<T> sums;   // [visible + 1 + 8, 4 or 12] gradients per face
   bool perspective;
 
-  void reserve_for(const RowBlocks& blocks, bool has_perspective) {
+  void reserve_for(const RowBlocks& blocks, bool has_perspective, VisibleFaces& faces) {
     const int64_t most = blocks.most_visible();
     perspective = has_perspective;
-    visible.reserve_for(blocks.num_faces, most);
+    visible = &faces;
+    faces.reserve_for(blocks.num_faces, most);
     reserve(table, (most + 1 + kLanes) * kFaceEntry);
     reserve(rows, 2 * (blocks.raster.width + kLanes));
   }

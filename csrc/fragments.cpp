@@ -24,7 +24,7 @@ void fragments_forward(const Fragments<T>& args) {
   for_blocks(args.mesh.batch, raster_of(args.image, args.anti_aliasing), args.num_threads,
              args.mesh.face_rows, [&](const RowBlock& block) {
                FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
-               scratch.reserve_for(block.blocks, args.perspective);
+               scratch.reserve_for(block.blocks, args.perspective, thread_scratch<VisibleFaces>());
                NMR_AT_BEST_LEVEL(forward_block, args, FragmentBlock<T>(args, block), scratch);
              });
 }
@@ -33,21 +33,19 @@ template <class T>
 void fragments_backward(const Fragments<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   std::fill_n(args.grad_vertices, 3 * mesh.vertex_rows.total(mesh.batch), T(0));
-  sum_blocks<FaceGradients<T>>(
+  sum_blocks<FaceSums<T>>(
       mesh.batch, raster_of(args.image, args.anti_aliasing), false, args.num_threads,
       mesh.face_rows,
-      [&](const RowBlock& block, FaceGradients<T>& result) {
+      [&](const RowBlock& block, FaceSums<T>& sums) {
         const int64_t most = block.blocks.most_visible();
         FragmentScratch<T>& scratch = thread_scratch<FragmentScratch<T>>();
-        scratch.reserve_for(block.blocks, args.perspective);
+        scratch.reserve_for(block.blocks, args.perspective, sums.visible);
         reserve(scratch.sums, (most + 1 + kLanes) * 12);
-        reserve(result.ids, most);
-        reserve(result.values, 9 * most);
-        NMR_AT_BEST_LEVEL(backward_rows, args, FragmentBlock<T>(args, block), scratch, result);
+        reserve(sums.values, 9 * (most + 1));
+        NMR_AT_BEST_LEVEL(backward_rows, args, FragmentBlock<T>(args, block), scratch, sums);
       },
-      [&](int64_t b, const FaceGradients<T>& result) {
-        scatter_face_gradients(result, mesh.image_faces(b), mesh.face_rows.count(b),
-                               args.grad_vertices + 3 * mesh.vertex_rows.first(b));
+      [&](int64_t b, const FaceSums<T>& sums) {
+        scatter_corner_sums<3>(sums, image_attributes(mesh, b), 3, args.grad_vertices);
       });
 }
 

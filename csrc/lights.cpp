@@ -242,7 +242,7 @@ constexpr double kShortestNormal =
 // Pointers to the values of image b, and the sign of its front normals.
 template <class T>
 struct View {
-  ImageAttributes<T> image;
+  ImageAttributes image;
   const T *vertices, *normals, *viewer;
   int64_t first_normal;  // row of normals
   T side;                // factor of normals of faces that are seen from their front

@@ -134,7 +134,7 @@ namespace {
 template <int64_t kChannels, class T>
 void interpolate_block_backward(const Interpolate<T>& args, const RowBlock& block,
                                 FaceSums<T>& sums) {
-  const ImageAttributes<T> image = image_attributes(args, block.b);
+  const ImageAttributes image = image_attributes(args, block.b);
   const int64_t C = kChannels ? kChannels : args.channels, begin = block.begin(), end = block.end();
   if (args.grad_attributes)
     sums.start(args.face_index + begin, end - begin, image.num_faces, 3 * C);
@@ -166,7 +166,7 @@ void interpolate_forward(const Interpolate<T>& args) {
   with_channels<T>(args.channels, [&](auto known) {
     const int64_t W = args.raster.width, C = known ? known() : args.channels;
     for_rows(args.batch, args.raster.height, args.num_threads, [&](int64_t b, int64_t row) {
-      const ImageAttributes<T> image = image_attributes(args, b);
+      const ImageAttributes image = image_attributes(args, b);
       const T* attributes = args.attributes + image.first_row * C;
       const int64_t start = (b * args.raster.height + row) * W;
       T* value = args.values + start * C;

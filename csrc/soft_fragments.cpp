@@ -148,9 +148,7 @@ void soft_fragments_backward(const SoftFragments<T>& args) {
         }
       },
       [&](int64_t b, const FaceSums<T>& sums) {
-        const ImageAttributes<T> image{mesh.vertex_rows.first(b), mesh.image_faces(b),
-                                       mesh.face_rows.count(b)};
-        scatter_corner_sums<3>(sums, image, 3, args.grad_vertices);
+        scatter_corner_sums<3>(sums, image_attributes(mesh, b), 3, args.grad_vertices);
       });
 }
 

@@ -203,7 +203,7 @@ template <class T>
 void uv_levels(const UVLevels<T>& args) {
   const Size raster = args.uv.raster;
   parallel_for(args.uv.batch, args.uv.num_threads, [&](int64_t b) {
-    const ImageAttributes<T> image = image_attributes(args.uv, b);
+    const ImageAttributes image = image_attributes(args.uv, b);
     const int64_t F = image.num_faces, begin = b * raster.pixels();
     const T* uv = args.uv.attributes + 2 * image.first_row;
     LevelScratch<T>& scratch = thread_scratch<LevelScratch<T>>();
@@ -342,7 +342,7 @@ template <int64_t kChannels, class T>
 void sample_uv_block_backward(const SampleUV<T>& args, const RowBlock& block, bool direct,
                               int32_t* rows, FaceSums<T>& sums) {
   const Interpolate<T>& at = args.uv;
-  const ImageAttributes<T> image = image_attributes(at, block.b);
+  const ImageAttributes image = image_attributes(at, block.b);
   const int64_t C = kChannels ? kChannels : args.channels, begin = block.begin(), end = block.end();
   const int64_t per_pixel = args.level ? 4 : 2;
   const T* uv = at.attributes + 2 * image.first_row;
@@ -395,7 +395,7 @@ void scatter_texels(const SampleUV<T>& args, const int32_t* rows, int64_t first,
   const int64_t C = kChannels ? kChannels : args.channels, per_pixel = args.level ? 4 : 2,
                 pixels = at.raster.pixels();
   for (int64_t b = 0; b < at.batch; ++b) {
-    const ImageAttributes<T> image = image_attributes(at, b);
+    const ImageAttributes image = image_attributes(at, b);
     for (int64_t n = b * pixels; n < (b + 1) * pixels; ++n) {
       bool inside = false;
       for (int64_t k = 0; k < per_pixel; ++k)
@@ -420,7 +420,7 @@ void sample_uv_forward(const SampleUV<T>& args) {
     constexpr int64_t kChannels = known();
     const int64_t W = at.raster.width, C = kChannels ? kChannels : args.channels;
     for_rows(at.batch, at.raster.height, at.num_threads, [&](int64_t b, int64_t row) {
-      const ImageAttributes<T> image = image_attributes(at, b);
+      const ImageAttributes image = image_attributes(at, b);
       const T* uv = at.attributes + 2 * image.first_row;
       const int64_t start = (b * at.raster.height + row) * W;
       T* color = args.colors + start * C;

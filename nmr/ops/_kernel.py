@@ -71,7 +71,8 @@ def kernel(
     used_by : str
         The public function, for the error that it has no second derivative.
     twice : function, optional
-        The backward pass in torch, for second derivatives, if there are any.
+        The first result in torch, the only one with a gradient: for second derivatives, if there
+        are any.
 
     Returns
     -------
@@ -89,7 +90,7 @@ def kernel(
             kept = {"keep": keep.split(), "constant": constant.split()}
             call.backward = _add_gradient(call, hints, results.split(), gradients.split(), **kept)
             _refuse_gradient(call.backward, used_by) if twice is None else _add_second(
-                call.backward, twice
+                call.backward, twice, len(hints), call.differentiable
             )
         return call
 
@@ -294,8 +295,10 @@ def _refuse_gradient(backward: Callable, used_by: str) -> None:
     _register_autograd(backward, refuse, lambda ctx, inputs, output: None)
 
 
-def _add_second(backward: Callable, twice: Callable) -> None:
-    """``twice`` takes the arguments of ``backward`` but ``wanted``, and returns all gradients."""
+def _add_second(backward: Callable, twice: Callable, count: int, of: list[int]) -> None:
+    """``twice`` takes the first ``count`` arguments of ``backward``, which returns the gradients of
+    those in ``of``.
+    """
 
     def set_up(ctx, inputs, output):
         *arguments, ctx.wanted = inputs
@@ -310,10 +313,16 @@ def _add_second(backward: Callable, twice: Callable) -> None:
             arguments[k] = x
         floats = [k for k in ctx.tensors if arguments[k].is_floating_point()]
 
+        def result(*values):
+            of_values = dict(zip(of, values, strict=True))
+            return twice(*(of_values.get(k, x) for k, x in enumerate(arguments[:count])))
+
         def gradients(*values):
             for k, value in zip(floats, values, strict=True):
                 arguments[k] = value
-            return tuple(x for x, want in zip(twice(*arguments), ctx.wanted, strict=True) if want)
+            *_, upstream = arguments
+            pulled = torch.func.vjp(result, *(arguments[k] for k in of))[1](upstream)
+            return tuple(x for x, want in zip(pulled, ctx.wanted, strict=True) if want)
 
         pulled = torch.func.vjp(gradients, *(arguments[k] for k in floats))[1]
         upstream = tuple(x for x, want in zip(grads, ctx.wanted, strict=True) if want)

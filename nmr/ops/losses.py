@@ -17,19 +17,12 @@ def soft_iou_in_torch(prediction: Tensor, target: Tensor) -> Tensor:
     return 1 - torch.where(empty, 1.0, intersection / torch.where(empty, 1.0, union)).mean()
 
 
-def _gradients(
-    prediction: Tensor, target: Tensor, areas: Tensor, grad_loss: Tensor
-) -> tuple[Tensor, ...]:
-    """The backward pass of :func:`soft_iou_loss` in torch, for second derivatives."""
-    return torch.func.vjp(soft_iou_in_torch, prediction, target)[1](grad_loss)
-
-
 @kernel(
     "loss areas",
     gradients="prediction target",
     constant="areas",
     used_by="soft_iou_loss",
-    twice=_gradients,
+    twice=soft_iou_in_torch,
 )
 def soft_iou_loss(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """``1 - mean_b I / U`` ``[]`` of pairs ``[B, ...]`` with ``I = sum p t`` and

@@ -44,28 +44,24 @@ def interpolate(
     return attributes.new_empty((*face_index.shape, attributes.shape[-1]))
 
 
-def _normals_backward(
-    vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool, grad_normals: Tensor
-) -> tuple[Tensor]:
-    """The backward pass of :func:`normals` in torch, for second derivatives."""
+def _normals_in_torch(
+    vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool
+) -> Tensor:
+    """:func:`normals` by torch, for second derivatives."""
     if starts is not None:  # packed: one large mesh
         first = starts[:-1, :1].repeat_interleave(starts[:, 1].diff(), 0)
-        faces, grad_normals = faces + first.to(faces.device), grad_normals.unsqueeze(0)
-
-    def forward(vertices):
-        batched = vertices if starts is None else vertices.unsqueeze(0)
-        corner_of = faces.flip(-1).flatten(-2)
-        cross = face_cross(gather_rows(batched, corner_of).unflatten(1, (-1, 3)))
-        if smooth:
-            index = corner_of.expand(len(cross), -1).unsqueeze(-1).expand(-1, -1, 3)
-            sums = torch.zeros_like(batched)
-            cross = sums.scatter_add(1, index, cross.repeat_interleave(3, dim=1))
-        return unit(cross)
-
-    return torch.func.vjp(forward, vertices)[1](grad_normals)
+        faces = faces + first.to(faces.device)
+        return _normals_in_torch(vertices.unsqueeze(0), faces, None, smooth)[0]
+    corner_of = faces.flip(-1).flatten(-2)
+    cross = face_cross(gather_rows(vertices, corner_of).unflatten(1, (-1, 3)))
+    if smooth:
+        index = corner_of.expand(len(cross), -1).unsqueeze(-1).expand(-1, -1, 3)
+        sums = torch.zeros_like(vertices)
+        cross = sums.scatter_add(1, index, cross.repeat_interleave(3, dim=1))
+    return unit(cross)
 
 
-@kernel("normals", gradients="vertices", used_by="render_normals", twice=_normals_backward)
+@kernel("normals", gradients="vertices", used_by="render_normals", twice=_normals_in_torch)
 def normals(vertices: Tensor, faces: Tensor, starts: Tensor | None, smooth: bool) -> Tensor:
     """Unit normals ``n((v0 - v1) x (v2 - v1))`` of faces, ``[B or 1, F, 3]`` or packed
     ``[M, 3]``.

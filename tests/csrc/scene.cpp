@@ -284,14 +284,13 @@ struct Run {
       std::copy_n(position, 4, positions.data() + 4 * n);
     }
     for (int64_t b = 0; b < s.batch; ++b) {
-      const int64_t first = b * raster.pixels(), vertex = mesh.vertex_start(b),
+      const int64_t first = b * raster.pixels(), vertex = mesh.vertex_rows.first(b),
                     edges = 3 * mesh.face_rows.count(b);
       std::vector<int64_t>& twins =
           r.tables.resize("twins", edges);  // of other edges, too: any in range is allowed
       for (int64_t n = 0; n < edges; ++n) twins[n] = n % 3 ? n : (5 * n + seed) % edges;
       const ClipMesh<T> clip{positions.data() + 4 * vertex,
-                             1,
-                             mesh.vertex_rows.count(b),
+                             {mesh.vertex_rows.count(b), false, nullptr},
                              mesh.image_faces(b),
                              mesh.face_rows.count(b),
                              face_index + first,
@@ -723,7 +722,7 @@ const char* broken_promise(const Scene<T>& scene, const Results<T>& r) {
   const std::vector<int32_t>& sources = r.template get<int32_t>("clip_source");
   for (int64_t b = 0; b < scene.batch; ++b) {
     const int64_t V = mesh.vertex_rows.count(b), F = mesh.face_rows.count(b),
-                  first = mesh.vertex_start(b), P = starts[2 * b + 2] - starts[2 * b];
+                  first = mesh.vertex_rows.first(b), P = starts[2 * b + 2] - starts[2 * b];
     for (int64_t f = starts[2 * b + 1]; f < starts[2 * b + 3]; ++f) {
       const int64_t source = sources[f];
       check(source >= 0 && source < std::max<int64_t>(F, 1), "a drawn face is part of a face");

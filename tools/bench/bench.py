@@ -76,6 +76,7 @@ class Work:
     anti_aliasing: bool = True
     colors: str = "white"
     values: Tensor | None = None  # colours of vertices [B, V, 3] or texture images [B, 128, 128, 3]
+    uv: Tensor | None = None  # [V, 2] of texture images
     target: Tensor | None = None  # images that the loss compares with
 
     def __str__(self) -> str:
@@ -89,7 +90,7 @@ class Work:
         if self.colors == "vertex":
             options["colors"] = nmr.VertexColors(values)
         elif self.colors != "white":
-            options["colors"] = nmr.UVTexture(values, sphere_uv(nmr.icosphere(3)[0]))
+            options["colors"] = nmr.UVTexture(values, self.uv)
             options["lights"] = nmr.Lights() if self.colors == "uv-lights" else None
         options |= {
             "outputs": (self.output,),
@@ -133,7 +134,8 @@ def spheres(
         shape = (len(sphere),) if colors == "vertex" else (TEXELS, TEXELS)
         values = torch.rand(batch, *shape, 3, generator=torch.Generator().manual_seed(1))
     others = vertices.roll(1, 0) if batch > 1 else vertices * torch.tensor([1.1, 0.7, 0.9])
-    work = Work(vertices, faces, camera, size, colors=colors, values=values, **more)
+    uv = sphere_uv(sphere)
+    work = Work(vertices, faces, camera, size, colors=colors, values=values, uv=uv, **more)
     return replace(work, target=work.draw(others))
 
 
