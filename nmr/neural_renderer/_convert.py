@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nmr._scene import LARGEST_IMAGE
-from nmr._validate import as_floats, check_image_size, check_vertices, describe
+from nmr._validate import as_floats, check_faces, check_image_size, check_vertices, describe
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -47,29 +47,23 @@ def height_and_width(image_size: object) -> tuple[int, int]:
     return check_image_size(image_size, LARGEST_IMAGE)
 
 
-def integer_faces(faces: object, batch: int) -> Tensor:
-    """``faces`` as int64 ``[B, F, 3]``, or as ``[F, 3]`` if all meshes share them.
+def integer_faces(faces: object, vertices: Tensor) -> Tensor:
+    """``faces`` as int64 ``[B, F, 3]``, or as ``[F, 3]`` if all meshes share them, on the device of
+    ``vertices [B, V, 3]``.
 
-    Whole numbers in a float tensor or in an array are accepted, too.
+    Whole numbers in a float tensor or in an array are accepted, too, and several faces of one mesh.
     """
     if isinstance(faces, np.ndarray):
         faces = torch.from_numpy(faces)
-    if not isinstance(faces, Tensor):
-        raise TypeError(
-            f"faces must be an integer tensor [B, F, 3], got {describe(faces)}; use torch.as_tensor()"
-        )
-    if faces.ndim not in (2, 3) or faces.shape[-1] != 3:
-        raise ValueError(
-            f"faces must have shape [B, F, 3], or [F, 3] for all meshes, got {describe(faces)}"
-        )
-    if faces.ndim == 3 and faces.shape[0] not in (1, batch) and batch != 1:
-        raise ValueError(
-            f"faces [B, F, 3] must have the batch size of the vertices, {batch}, got {describe(faces)}"
-        )
-    whole = faces.long()
-    if faces.is_floating_point() and not torch.equal(whole.to(faces.dtype), faces):
-        raise ValueError(f"faces must be vertex numbers, got {describe(faces)} with fractions")
-    return whole[0] if whole.ndim == 3 and whole.shape[0] == 1 else whole
+    if isinstance(faces, Tensor) and faces.is_floating_point():
+        whole = faces.long()
+        if not torch.equal(whole.to(faces.dtype), faces):
+            raise ValueError(f"faces must be vertex numbers, got {describe(faces)} with fractions")
+        faces = whole
+    batch = len(vertices)
+    if batch == 1 and isinstance(faces, Tensor) and faces.ndim == 3:
+        batch = len(faces)
+    return check_faces(faces, batch, vertices.device)
 
 
 def check_textures(textures: object, batch: int, num_faces: int) -> Tensor:

@@ -214,7 +214,7 @@ class Renderer(torch.nn.Module):
 
     def _draw(self, vertices, faces, textures, camera, outputs) -> dict[str, Tensor | None]:
         vertices = check_batch(vertices)
-        faces = integer_faces(faces, vertices.shape[0]).to(vertices.device)
+        faces = integer_faces(faces, vertices)
         if faces.ndim == 3:
             vertices = vertices.expand(len(faces), -1, -1)
         on_screen = self._transform(vertices, *camera)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from nmr._validate import check_indices
 from nmr.neural_renderer._convert import check_batch, integer_faces
 
 
@@ -23,11 +24,8 @@ def vertices_to_faces(vertices: Tensor, faces: Tensor) -> Tensor:
     >>> nr.rasterize_silhouettes(nr.vertices_to_faces(vertices, faces), image_size=64)
     """
     vertices = check_batch(vertices)
-    faces = integer_faces(faces, vertices.shape[0]).to(vertices.device)
-    if faces.numel() and not 0 <= faces.min() <= faces.max() < vertices.shape[1]:
-        raise ValueError(
-            f"faces must refer to vertices 0..{vertices.shape[1] - 1}, got {faces.min().item()}..{faces.max().item()}"
-        )
+    faces = integer_faces(faces, vertices)
+    check_indices(faces, vertices.shape[1])
     batch = faces.shape[0] if faces.ndim == 3 else vertices.shape[0]
     first = vertices.shape[1] * torch.arange(batch, device=faces.device)
     # embedding, not indexing: its backward pass sums in a fixed order.
