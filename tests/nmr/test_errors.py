@@ -426,7 +426,7 @@ VALUES = [
     (r"use vertices\[None\]", lambda: renderer().render_silhouettes(V, FACES)),
     ("faces must have shape", lambda: nr.vertices_to_faces(BATCH, FACES[..., :2])),
     ("with fractions", lambda: nr.vertices_to_faces(BATCH, FACES + 0.5)),
-    ("vertices 0..41, got 1..42", lambda: nr.vertices_to_faces(BATCH, FACES + 1)),
+    ("faces refer to vertex 42", lambda: nr.vertices_to_faces(BATCH, FACES + 1)),
     ("RGB images need textures", lambda: renderer()(BATCH, FACES)),
     (
         "mode must be None, 'rgb', .* got 'normals'",
