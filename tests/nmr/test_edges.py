@@ -13,7 +13,8 @@ EPS = 1e-3
 
 
 def face_index_of(vertices, faces, size, fill_back=True):
-    return nmr.ops.rasterize(vertices, faces, None, size, size, fill_back, 0.1, 50.0, True)
+    size = (size, size) if isinstance(size, int) else size
+    return nmr.ops.rasterize(vertices, faces, None, *size, fill_back, 0.1, 50.0, True)
 
 
 def random_image(face_index, channels, dtype=torch.float64):
@@ -30,10 +31,11 @@ def resolve(image, vertices, faces, face_index, anti_aliasing=False, background=
 @pytest.mark.parametrize("seed, channels", [(0, 1), (1, 2), (2, 3), (3, 4), (4, 7)])
 def test_equals_the_slow_definition(seed, channels, anti_aliasing, fill_back):
     vertices, faces = random_soup(seed)
-    face_index = face_index_of(vertices, faces, 20 if anti_aliasing else 19, fill_back)
+    size = [(10, 10), (10, 16), (23, 7)][seed % 3]
+    raster = tuple(n * (1 + anti_aliasing) for n in size)
+    face_index = face_index_of(vertices, faces, raster, fill_back)
     image = random_image(face_index, channels)
-    size = 10 if anti_aliasing else 19
-    upstream = normal(2, size, size, channels) * (uniform(2, size, size, 1) > 0.3)
+    upstream = normal(2, *size, channels) * (uniform(2, *size, 1) > 0.3)
     resolved, grad = value_and_gradients(
         lambda x: resolve(image, x, faces, face_index, anti_aliasing), vertices, upstream=upstream
     )

@@ -1,11 +1,10 @@
 """The interface of nvdiffrast.torch: values against slow references, gradients against finite differences."""
 
-import functools
 import itertools
 
 import pytest
 import torch
-from scenes import double, leaf_of, normal, uniform, value_and_gradients
+from scenes import double, leaf_of, uniform, value_and_gradients
 from torch.autograd import gradcheck
 from torch.testing import assert_close
 
@@ -127,113 +126,6 @@ def test_interpolate():
     assert_close(out, torch.where(number > 0, wanted, 0))
     by_x = (a - c) * rast_db[..., :1] + (b - c) * rast_db[..., 2:3]
     assert_close(slopes[..., ::2], torch.where(number > 0, by_x, 0))
-
-
-def slow_texture(tex, u, v, mode):
-    """Bilinear at one place; tex [h, w, C] with row 0 at v = 0."""
-    height, width, _ = tex.shape
-    x, y = u * width - 0.5, v * height - 0.5
-    color = torch.zeros_like(tex[0, 0])
-    for dy, dx in itertools.product((0, 1), repeat=2):
-        row, column = int(y // 1) + dy, int(x // 1) + dx
-        weight = (1 - abs(x - column)) * (1 - abs(y - row))
-        if mode == "wrap":
-            row, column = row % height, column % width
-        inside = min(max(row, 0), height - 1), min(max(column, 0), width - 1)
-        if mode != "zero" or inside == (row, column):
-            color = color + weight * tex[inside]
-    return color
-
-
-def texture_inputs(seed=0, cube=False):
-    size, places = ((1, 6, 4, 4, 2), 3) if cube else ((2, 8, 4, 3), 2)
-    shapes = size, (2, 3, 4, places), (2, 3, 4, 2 * places), (2, 3, 4)
-    tex, uv, uv_da, bias = (uniform(*shape, seed=4 * seed + k) for k, shape in enumerate(shapes))
-    return tex, places * uv + (uv.shape[-1] == 2) * uv - 1, 0.3 * uv_da, bias
-
-
-@pytest.mark.parametrize("mode", ["wrap", "clamp", "zero"])
-def test_texture(mode):
-    tex, uv, uv_da, bias = texture_inputs()
-    levels = [tex]
-    while max(levels[-1].shape[1:3]) > 1:
-        image = levels[-1].permute(0, 3, 1, 2)
-        kernel = [min(2, side) for side in image.shape[2:]]
-        levels.append(torch.nn.functional.avg_pool2d(image, kernel).permute(0, 2, 3, 1))
-    sample = functools.partial(dr.texture, tex, uv, boundary_mode=mode)
-    plain, nearest = sample(), sample(filter_mode="nearest")
-    smooth, stepped = (
-        sample(uv_da, bias, filter_mode=f"linear-mipmap-{name}") for name in ("linear", "nearest")
-    )
-    assert torch.equal(sample(uv_da, bias), smooth)
-    assert mode != "wrap" or torch.allclose(dr.texture(tex, uv + 2**22), plain, atol=1e-7)
-    for at in itertools.product(*map(range, uv.shape[:3])):
-        u, v = uv[at].tolist()
-        samples = [slow_texture(level[at[0]], u, v, mode) for level in levels]
-        assert_close(plain[at], samples[0])
-        jacobian = uv_da[at].view(2, 2) * double([[4.0], [8.0]])
-        level = torch.linalg.matrix_norm(jacobian, 2).log2() + bias[at]
-        level = min(max(float(level), 0.0), 3.0)
-        low = min(int(level), 2)
-        assert_close(smooth[at], torch.lerp(samples[low], samples[low + 1], level - low))
-        assert_close(stepped[at], samples[round(level)])
-        snapped = [(x * n // 1 + 0.5) / n for x, n in zip((u, v), (4, 8), strict=True)]
-        assert_close(nearest[at], slow_texture(tex[at[0]], *snapped, mode))
-    for mip in (dr.texture_construct_mip(tex), levels[1:]):
-        assert_close(sample(uv_da, bias, mip=mip), smooth)
-    assert_close(sample(uv_da, bias, max_mip_level=1), sample(uv_da, bias, mip=levels[1:2]))
-
-
-@pytest.mark.parametrize("mode", ["wrap", "clamp", "zero", "cube"])
-def test_gradients_of_texture(mode):
-    inputs = texture_inputs(1, mode == "cube")
-    texture = functools.partial(dr.texture, boundary_mode=mode)
-    check_gradient(texture, *inputs)
-    check_gradient(texture, *inputs[:2])
-    check_gradient(lambda tex: texture(tex, inputs[1], filter_mode="nearest"), inputs[0])
-
-
-def test_cube_map():
-    """Texels that show their own direction are a smooth map without seams; faces are OpenGL's."""
-    unit = functools.partial(torch.nn.functional.normalize, dim=-1)
-    side = (2 * torch.arange(32) + 1) / 32 - 1
-    t, s = torch.meshgrid(side, side, indexing="ij")
-    one = torch.ones_like(s)
-    faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
-    texels = unit(torch.stack([torch.stack(face, -1) for face in faces]))[None]
-    toward, steps = (normal(1, 40, 50, 3, seed=seed).float() for seed in (0, 1))
-    toward[0, 0, :3] = torch.tensor([[1.0, 1.0, 0.3], [-1.0, 0.2, 1.0], [0.4, -1.0, -1.0]])  # edges
-    toward[0, 0, 3:5] = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]])  # corners
-    toward = unit(toward)
-    sample = functools.partial(dr.texture, texels, boundary_mode="cube")
-    seen = sample(3 * toward)
-    assert (seen - toward).abs().max() < 0.03
-    assert (sample(toward, filter_mode="nearest") - toward).abs().max() < 0.07
-    assert (sample(toward + 1e-5 * steps) - seen).abs().max() < 1e-3
-    invalid = torch.tensor([[[[0.0, 0.0, 0.0], [float("nan"), 1.0, 0.0]]]])
-    colors, grad = value_and_gradients(sample, invalid)
-    assert colors.eq(0).all() and grad.eq(0).all()
-
-
-def test_sample_texture():
-    """The same as a UVTexture at the same places."""
-    vertices, faces = nmr.icosphere(2)
-    image, uv = uniform(32, 64, 3, dtype=torch.float32), vertices[:, :2] * 2
-    fragments = nmr.render_fragments(vertices, faces, nmr.LookAt([0.0, 0.5, -3.0]), image_size=20)
-    places, inside = fragments.interpolate(uv), fragments.covered.unsqueeze(-1)
-    for wrap in ("repeat", "clamp", "mirror"):
-        wanted = nmr.UVTexture(image, uv, wrap=wrap).sample(fragments)
-        assert_close(inside * nmr.sample_texture(image, places, wrap=wrap), wanted)
-    tex, uv, uv_da, _ = texture_inputs(2)
-    uv_da[..., [1, 2]] = 0  # the axes of the ellipse are those of the pixel
-    assert_close(nmr.sample_texture(tex.flip(1), uv, uv_da), dr.texture(tex, uv, uv_da))
-    for error, given, words in (
-        (ValueError, (uv, uv), r"derivatives .* \[B, H, W, 4\], got float64 \[2, 3, 4, 2\]"),
-        (TypeError, ([0.5, 0.5],), r"uv must be a float tensor \[B, H, W, 2\], got list"),
-        (ValueError, (uv[:1],), r"image must be one for all 1 images"),
-    ):
-        with pytest.raises(error, match=words):
-            nmr.sample_texture(tex, *given)
 
 
 def slow_antialias(color, rast, pos, tri):

@@ -1,6 +1,6 @@
 """Images of height x width through the public functions.
 
-A wide image holds the square one as its middle, and a tall scene is the transpose of a wide one.
+A wide image holds the square one as its middle.
 """
 
 import functools
@@ -64,35 +64,6 @@ def test_the_middle_is_the_square_image(camera, size, anti_aliasing):
         for x in (square.fragments.sided_face_index, raster)
     )
     assert torch.equal(middle_of(cut, size), uncut)
-
-
-def across(vertices):
-    """Coordinates in renderer space of the transposed picture: rows become columns."""
-    return vertices[..., [1, 0, 2]] * double([-1, -1, 1])
-
-
-@pytest.mark.parametrize("size", [(23, 41), (12, 40), (64, 9)])
-def test_swapped_scenes_are_transposes(size, anti_aliasing):
-    """In renderer space, so that nothing but the raster is at work; all outputs, with gradients, in odd sizes."""
-    vertices, faces, tint = mesh()
-    vertices = vertices * double([0.8, 0.7, 0.3]) + double([0.15, -0.1, 2.0])
-    how = dict(outputs=("rgb", "alpha", "depth"), background=uniform(3), eps=1e-12)
-    how |= dict(fill_back=False, anti_aliasing=anti_aliasing)
-
-    def images(vertices, faces, tint, size):
-        colors = nmr.VertexColors(tint)
-        rgb, alpha, depth = nmr.render(vertices, faces, colors=colors, image_size=size, **how)
-        return torch.cat([rgb, alpha[..., None], depth[..., None]], dim=-1)
-
-    def swapped(vertices, tint):  # the transposed picture is a mirror image
-        return images(across(vertices), faces.flip(-1), tint, size[::-1]).transpose(1, 2)
-
-    results = [
-        value_and_gradients(draw, vertices, tint)
-        for draw in (lambda v, t: images(v, faces, t, size), swapped)
-    ]
-    assert 0.1 < results[0][0][..., 3].mean() < 0.9 and all(x.any() for x in results[0])
-    assert_near(results[1], results[0], 1e-5)
 
 
 @pytest.mark.parametrize("size", [(1, 64), (64, 1), (1, 1), (3, 8192), (8192, 3)])

@@ -1,16 +1,18 @@
 """Colours of meshes: read back what was painted, against slow definitions; gradients; bad input."""
 
+import functools
 import itertools
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from scenes import bumpy_sphere, double, leaf_of, square, uniform, value_and_gradients
+from scenes import bumpy_sphere, double, leaf_of, normal, square, uniform, value_and_gradients
 from torch.autograd import gradcheck
 from torch.testing import assert_close
 
 import nmr
+import nmr.nvdiffrast.torch as dr
 
 TILTED = square(depth=(1.0, 2.0, 4.0, 3.0))  # fills the screen, as `square()` does
 
@@ -36,7 +38,7 @@ def test_an_image_on_the_screen_is_read_back(channels):
 def slow_wrapped(index, size, wrap):
     if wrap == "repeat":
         return index % size
-    if wrap == "clamp":
+    if wrap in ("clamp", "zero"):
         return index.clamp(0, size - 1)
     index = index % (2 * size)
     return torch.minimum(index, 2 * size - 1 - index)
@@ -53,6 +55,8 @@ def slow_bilinear(image, uv, wrap):
         share = (1 - (x - column - dx).abs()) * (1 - (y - row - dy).abs())
         line = slow_wrapped(row.long() + dy, height, wrap)
         place = slow_wrapped(column.long() + dx, width, wrap)
+        if wrap == "zero":
+            share = share * (line == row + dy) * (place == column + dx)
         colors = colors + share * image[line, place].squeeze(-2)
     return colors
 
@@ -124,6 +128,14 @@ def test_values_and_gradients_equal_torch_operations(wrap, per_image, filter, pe
     assert all(x.any() for x in slow_grads)
     assert_close(color, wanted, rtol=1e-9, atol=1e-9)
     assert_close(grads, slow_grads, rtol=1e-7, atol=1e-9)
+
+    def sampled(image, uv, weights):
+        places = replace(fragments, weights=weights).interpolate(uv)
+        return fragments.covered.unsqueeze(-1) * nmr.sample_texture(image, places, wrap=wrap)
+
+    if filter == "bilinear":
+        results = value_and_gradients(sampled, image, uv, fragments.weights)
+        assert_close(results, [wanted, *slow_grads])
 
 
 def slow_level(fragments, uv, size, most):
@@ -236,3 +248,89 @@ def test_write_your_own():
 
     depth = nmr.render_depth(*TILTED, image_size=8, anti_aliasing=False)
     assert_close(draw(Stripes(), TILTED)[..., 0], (6 * depth).sin())
+
+
+# The interface of nvdiffrast, where row 0 is at v = 0.
+
+
+def texture_inputs(seed=0, cube=False):
+    size, places = ((1, 6, 4, 4, 2), 3) if cube else ((2, 8, 4, 3), 2)
+    shapes = size, (2, 3, 4, places), (2, 3, 4, 2 * places), (2, 3, 4)
+    tex, uv, uv_da, bias = (uniform(*shape, seed=4 * seed + k) for k, shape in enumerate(shapes))
+    return tex, places * uv + (uv.shape[-1] == 2) * uv - 1, 0.3 * uv_da, bias
+
+
+@pytest.mark.parametrize("mode", ["wrap", "clamp", "zero"])
+def test_texture(mode):
+    tex, uv, uv_da, bias = texture_inputs()
+    levels = [tex]
+    while max(levels[-1].shape[1:3]) > 1:
+        levels.append(torch.stack([slow_half(image) for image in levels[-1]]))
+    sample = functools.partial(dr.texture, tex, uv, boundary_mode=mode)
+    plain, nearest = sample(), sample(filter_mode="nearest")
+    smooth, stepped = (
+        sample(uv_da, bias, filter_mode=f"linear-mipmap-{name}") for name in ("linear", "nearest")
+    )
+    assert torch.equal(sample(uv_da, bias), smooth)
+    assert mode != "wrap" or torch.allclose(dr.texture(tex, uv + 2**22), plain, atol=1e-7)
+
+    def slow(image, uv):
+        wrap = "repeat" if mode == "wrap" else mode
+        return torch.stack([slow_bilinear(*x, wrap) for x in zip(image.flip(1), uv, strict=True)])
+
+    size = double([4.0, 8.0])
+    jacobian = uv_da.view(2, 3, 4, 2, 2) * size.view(2, 1)
+    level = (torch.linalg.matrix_norm(jacobian, 2).log2() + bias).clamp(0, 3)
+    assert_close(plain, slow(tex, uv))
+    assert_close(nearest, slow(tex, ((uv * size).floor() + 0.5) / size))
+    for found, at in ((smooth, level), (stepped, level.round())):
+        wanted = sum(share_of(n, at) * slow(image, uv) for n, image in enumerate(levels))
+        assert_close(found, wanted)
+    for mip in (dr.texture_construct_mip(tex), levels[1:]):
+        assert_close(sample(uv_da, bias, mip=mip), smooth)
+    assert_close(sample(uv_da, bias, max_mip_level=1), sample(uv_da, bias, mip=levels[1:2]))
+
+
+@pytest.mark.parametrize("mode", ["wrap", "clamp", "zero", "cube"])
+def test_gradients_of_texture(mode):
+    inputs = [leaf_of(x) for x in texture_inputs(1, mode == "cube")]
+    texture = functools.partial(dr.texture, boundary_mode=mode)
+    close = dict(eps=1e-7, atol=1e-4, rtol=1e-3)
+    gradcheck(texture, inputs, **close)
+    gradcheck(texture, inputs[:2], **close)
+    gradcheck(lambda tex: texture(tex, inputs[1], filter_mode="nearest"), inputs[0], **close)
+
+
+def test_cube_map():
+    """Texels that show their own direction are a smooth map without seams; faces are OpenGL's."""
+    unit = functools.partial(torch.nn.functional.normalize, dim=-1)
+    side = (2 * torch.arange(32) + 1) / 32 - 1
+    t, s = torch.meshgrid(side, side, indexing="ij")
+    one = torch.ones_like(s)
+    faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
+    texels = unit(torch.stack([torch.stack(face, -1) for face in faces]))[None]
+    toward, steps = (normal(1, 40, 50, 3, seed=seed).float() for seed in (0, 1))
+    toward[0, 0, :3] = torch.tensor([[1.0, 1.0, 0.3], [-1.0, 0.2, 1.0], [0.4, -1.0, -1.0]])  # edges
+    toward[0, 0, 3:5] = torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]])  # corners
+    toward = unit(toward)
+    sample = functools.partial(dr.texture, texels, boundary_mode="cube")
+    seen = sample(3 * toward)
+    assert (seen - toward).abs().max() < 0.03
+    assert (sample(toward, filter_mode="nearest") - toward).abs().max() < 0.07
+    assert (sample(toward + 1e-5 * steps) - seen).abs().max() < 1e-3
+    invalid = torch.tensor([[[[0.0, 0.0, 0.0], [float("nan"), 1.0, 0.0]]]])
+    colors, grad = value_and_gradients(sample, invalid)
+    assert colors.eq(0).all() and grad.eq(0).all()
+
+
+def test_sample_texture():
+    tex, uv, uv_da, _ = texture_inputs(2)
+    uv_da[..., [1, 2]] = 0  # the axes of the ellipse are those of the pixel
+    assert_close(nmr.sample_texture(tex.flip(1), uv, uv_da), dr.texture(tex, uv, uv_da))
+    for error, given, words in (
+        (ValueError, (uv, uv), r"derivatives .* \[B, H, W, 4\], got float64 \[2, 3, 4, 2\]"),
+        (TypeError, ([0.5, 0.5],), r"uv must be a float tensor \[B, H, W, 2\], got list"),
+        (ValueError, (uv[:1],), r"image must be one for all 1 images"),
+    ):
+        with pytest.raises(error, match=words):
+            nmr.sample_texture(tex, *given)
