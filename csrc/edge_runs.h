@@ -486,7 +486,7 @@ void pull_group(const EdgeImage<T>& image, const LineGroup<T>& group, const Pixe
     const int64_t last = group.runs_end[k], number = group.lines.first + k;
     EdgeLine<T> line{
         group.face_index + k * group.face_stride,
-        group.colors + k * C * group.stride,
+        image.pixels ? group.colors + k * C * group.stride : nullptr,
         group.grads + k / share * C * group.stride,
         group.length,
         group.stride,

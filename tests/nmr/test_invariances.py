@@ -343,12 +343,12 @@ def test_cuda_tensors_are_staged_through_the_host(name, eyes, device="cuda"):
         assert all(x.device == vertices.device for x in images)
         return torch.cat([x.flatten() for x in images if x.is_floating_point()])
 
-    wanted = value_and_gradients(draw, *given, upstream=torch.ones(()))
+    one = torch.ones(())
+    wanted = value_and_gradients(draw, *given, upstream=one)
     there = [x.to(device) for x in given]
-    one = torch.ones((), device=device)
     for inputs in (there, [there[0], given[1], *there[2:]]):
-        found = value_and_gradients(draw, *inputs, upstream=one)
-        for a, b, x in zip(wanted, found, [one, *inputs], strict=True):
+        found = value_and_gradients(draw, *inputs, upstream=one.to(device))
+        for a, b, x in zip(wanted, found, [there[0], *inputs], strict=True):
             assert b.device == x.device
             error = (a - b.cpu()).abs().flatten().double()
             assert error.quantile(0.98) <= 1e-3 * a.abs().max()  # a GPU rounds the camera otherwise

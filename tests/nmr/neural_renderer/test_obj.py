@@ -106,23 +106,20 @@ def test_textures_of_materials(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("library", "used", "made", "options", "image", "color"),
+    ("library", "used", "made", "color"),
     [
-        ("a.mtl # materials", "red # the roof", "red", " # oak", "wood.png", (51, 51, 51)),
-        ("a.mtl", "red", "red # the roof", "", "wood #1.png", 51),
-        ("none.mtl a.mtl", "red roof", "red", "-s 1 1 1 ", "wood.png", (51, 51, 51, 0)),
+        ("a.mtl # materials", "red # the roof", "red", (51, 51, 51)),
+        ("a.mtl", "red", "red # the roof", 51),
+        ("none.mtl a.mtl", "red roof", "red", (51, 51, 51, 0)),
     ],
 )
-def test_names_options_and_comments(
-    tmp_path, monkeypatch, library, used, made, options, image, color
-):
+def test_names_and_comments(tmp_path, monkeypatch, library, used, made, color):
     """Without a material of the whole name, the first word is the name, as published. Alpha is dropped."""
     image_module = pytest.importorskip("PIL.Image")
     mode = {1: "L", 3: "RGB", 4: "RGBA"}[np.size(color)]
-    image_module.new(mode, (2, 2), color).save(tmp_path / image)
-    words = options + image if options.endswith(" ") else image + options
+    image_module.new(mode, (2, 2), color).save(tmp_path / "wood.png")
     obj = f"mtllib {library}\n{TRIANGLE}vt 0.5\nusemtl {used}\nf 1/1 2/1 3/1\n"
-    mtl = f"newmtl blue\nKd 0 0 1\n\nnewmtl {made}\nKd 1 0 0 # red\nmap_Kd {words}\n"
+    mtl = f"newmtl blue\nKd 0 0 1\n\nnewmtl {made}\nKd 1 0 0 # red\nmap_Kd wood.png\n"
     write(tmp_path, a_obj=obj, a_mtl=mtl, none_mtl="# nothing")
     monkeypatch.chdir(tmp_path.parent)
     textures = nr.load_obj(f"{tmp_path.name}/a.obj", load_texture=True)[2]
