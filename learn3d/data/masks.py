@@ -5,20 +5,20 @@ from scipy import ndimage
 
 _CELLS = 512  # regions are found on a grid of at most so many cells a side
 _SPECK = 0.002  # area of a region, over that of the largest, below which it is a speck
-_NEAR = 0.04  # largest gap between parts of an object, over the length of its largest region,
+NEAR = 0.04  # largest gap between parts of an object, over the length of its largest region,
 _REACH = 0.1  # plus this share of the smaller part's own length
 _ROUNDS = 8  # parts in a row, each near the one before
 _SIMILAR = 0.5  # area of a region, over that of the object, from which it is another object of similar size
 _SAID = 0.01  # area that is left out, over that of the object, from which it is said
 
 
-def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
+def keep_object(mask: np.ndarray, near: float = NEAR) -> tuple[np.ndarray, str | None]:
     """The object of a mask uint8 [H, W], without specks and other things; what was left out, None
     if next to nothing.
 
     Pixels above 127 that touch, also diagonally, form a region. The object is the largest region
-    with its other parts: regions near it, and a larger one may be farther away. Fainter pixels
-    belong to the nearest region.
+    with its other parts: regions near it, and a larger one may be farther away. near: largest gap
+    over the length of the largest region. Fainter pixels belong to the nearest region.
     """
     inside = mask > 127
     step = max(1, -(-max(mask.shape) // _CELLS))
@@ -34,7 +34,7 @@ def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
     )
     largest = int(areas.argmax())
     kept = np.arange(count) == largest
-    reach = _NEAR * lengths[largest] + _REACH * lengths
+    reach = near * lengths[largest] + _REACH * lengths
     rest = np.flatnonzero(~kept & (areas >= _SPECK * areas[largest]))
     for _ in range(_ROUNDS):
         if not len(rest):
@@ -45,10 +45,10 @@ def keep_object(mask: np.ndarray) -> tuple[np.ndarray, str | None]:
             )
             - 1
         )
-        near = gaps <= reach[rest]
-        if not near.any():
+        close = gaps <= reach[rest]
+        if not close.any():
             break
-        kept[rest[near]], rest = True, rest[~near]
+        kept[rest[close]], rest = True, rest[~close]
     if kept.all():
         return mask, None
     nearest = regions[

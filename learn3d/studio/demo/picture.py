@@ -11,13 +11,14 @@ from PIL import Image
 
 import nmr
 from learn3d.data.conventions import DISTANCE, HALF_FOV_DEG, mesh_to_object
-from learn3d.data.masks import check_mask, keep_object, mask_box
+from learn3d.data.masks import check_mask, mask_box
 from learn3d.networks.encoders import CENTRED_SIZE
 from learn3d.pictures import photograph
 from learn3d.studio.make_data.looks import PALETTES, natural_look
 from learn3d.studio.picture_to_mesh.cutting import Box, Outline, correct, find_outline
 from learn3d.studio.picture_to_mesh.fit import LENS_HALF_FOV_DEG
 from learn3d.studio.picture_to_mesh.make import Model, reconstruct_guesses
+from learn3d.studio.picture_to_mesh.read import keep_parts
 from learn3d.studio.picture_to_mesh.write import Reconstruction, mesh_bytes
 from learn3d.studio.shapes import make_shape
 
@@ -59,7 +60,7 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
 
 
 def outline_object(picture: Picture) -> tuple[Outline, str | None]:
-    """The object's outline, and what was left out, see `keep_object`.
+    """The object's outline, and what was left out, see `keep_parts`.
 
     The mask is the given one, or is found in the box or picture. If it was corrected, nothing is
     left out.
@@ -70,7 +71,7 @@ def outline_object(picture: Picture) -> tuple[Outline, str | None]:
         outline = Outline(picture.mask, "by the picture's transparency")
     else:
         outline = find_outline(picture.colors, picture.box)
-    mask, left_out = keep_object(outline.mask)
+    mask, left_out = keep_parts(picture.colors, outline.mask)
     return outline._replace(mask=mask), left_out
 
 

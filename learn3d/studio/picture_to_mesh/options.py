@@ -66,7 +66,9 @@ class CutOptions:
     """Brightness up to which a pixel of a drawing is black."""
     black: float = 0.7
     """Share of black pixels from which a picture is a black drawing, see `fill_drawing`."""
-    gap: float = 0.015
+    apart: float = 0.12
+    """Largest gap between parts of a black drawing, over the length of its largest region."""
+    gap: float = 0.04
     """Half of the widest gap in a line that is closed, as a share of the drawing."""
     drawn: float = 0.75
     """Share of a drawing up to which it consists of lines."""
@@ -113,7 +115,7 @@ class MatchOptions:
     """Templates with the nearest codes, which are made and compared with the picture."""
     kept: int = 16
     """Best of them, which are stretched."""
-    bent: int = 6
+    bent: int = 8
     """Best of these, which are bent and then ranked."""
     poor: float = 0.86
     """IoU of the best stretched template below which other cameras are tried."""
@@ -157,11 +159,11 @@ class MatchOptions:
     """Weight of unequal factors along the axes."""
     stretch_steps: int = 30
     """Steps of stretching."""
-    lattice: int = 4
+    lattice: int = 6
     """Points of the lattice for bending along each axis."""
-    bending: float = 1.5
+    bending: float = 0.1
     """Weight of their moves."""
-    bending_steps: int = 40
+    bending_steps: int = 60
     """Steps of bending."""
 
 

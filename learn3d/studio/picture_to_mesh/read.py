@@ -12,7 +12,7 @@ from learn3d.data.crops import Crops
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.data.framing import MEAN_OBJECT_SIZE, frame, read_photo
 from learn3d.data.layouts import LAYOUTS, Layout
-from learn3d.data.masks import check_mask, keep_object, mask_box
+from learn3d.data.masks import NEAR, check_mask, keep_object, mask_box
 from learn3d.studio.picture_to_mesh.cutting import Box, check_box, find_outline
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, CutOptions
 from learn3d.terminal import note
@@ -58,12 +58,24 @@ def read_picture(
         advice = "Give --box or --masks, or cut the object out (transparency)"
         missed = f"no object was found in this photograph. {advice}"
         raise ValueError(f"{mask_path or path}: {missed if searched else error}") from None
-    kept, left_out = keep_object(mask)
+    kept, left_out = keep_parts(colors, mask, options)
     if left_out:
         note(f"note: {path}: {left_out}")
     if np.count_nonzero(kept > 127) < options.kept * np.count_nonzero(mask > 127):
         doubt = doubt or "large parts beside it were left out"
     return Photo(colors, kept, doubt)
+
+
+def keep_parts(
+    colors: np.ndarray, mask: np.ndarray, options: CutOptions = DEFAULTS.cut
+) -> tuple[np.ndarray, str | None]:
+    """Call `keep_object` with a picture's mask; the parts of a black drawing may be farther apart."""
+    return keep_object(mask, options.apart if _is_black(colors, mask, options) else NEAR)
+
+
+def _is_black(colors: np.ndarray, mask: np.ndarray, options: CutOptions) -> bool:
+    inside = mask > 127
+    return inside.any() and np.quantile(colors[inside].mean(1), options.black) <= options.ink
 
 
 def _reduce(colors: np.ndarray, box: Box | None, side: int) -> tuple[np.ndarray, Box | None]:
@@ -123,9 +135,9 @@ def fill_drawing(
     colors, mask: uint8 [H, W, 3] and [H, W]. Lines may have small gaps. Pictures other than black
     drawings stay as they are. Returns colours on white, and the mask.
     """
-    inside = mask > 127
-    if not inside.any() or np.quantile(colors[inside].mean(1), options.black) > options.ink:
+    if not _is_black(colors, mask, options):
         return colors, mask
+    inside = mask > 127
     left, top, right, bottom = mask_box(mask)
     gap = math.ceil(options.gap * max(right - left, bottom - top))
     padded = np.pad(inside, gap + 1)

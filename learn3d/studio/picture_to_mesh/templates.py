@@ -377,7 +377,7 @@ def bend(found: Candidates, outline: Tensor, options: MatchOptions) -> Candidate
     def loss(views: View) -> Tensor:
         return (costs() - views.ious(bent(), found.faces, outline)).sum()
 
-    views = minimize(loss, found.views, options.bending_steps, (0.005, 0.01), lattice)
+    views = minimize(loss, found.views, options.bending_steps, (0.01, 0.02), lattice)
     return found._replace(shapes=bent(), views=views, prior=found.prior - costs())
 
 

@@ -12,7 +12,7 @@ from learn3d.studio.picture_to_mesh.fit import Target, frame_target
 from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.make import load_model, reconstruct_picture
 from learn3d.studio.picture_to_mesh.options import DEFAULTS
-from learn3d.studio.picture_to_mesh.read import fill_drawing
+from learn3d.studio.picture_to_mesh.read import fill_drawing, keep_parts
 
 SIZE = 200
 Y, X = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
@@ -87,10 +87,17 @@ def test_drawings_of_black_lines_are_filled() -> None:
 def test_gaps_of_a_silhouette_become_white_lines_and_holes_stay() -> None:
     distance = np.hypot(X, Y)
     whole = (distance < 60) & (distance > 20)
-    mask = 255 * (whole & (np.abs(Y) > 1)).astype(np.uint8)
+    mask = 255 * (whole & (np.abs(Y) > 3)).astype(np.uint8)
     colors, filled = fill_drawing(np.zeros((SIZE, SIZE, 3), np.uint8), mask)
     assert np.mean((filled > 0) == whole) > 0.99
-    assert (colors[whole & (np.abs(Y) < 1)] == 255).all()
+    assert (colors[whole & (np.abs(Y) < 3)] == 255).all()
+
+
+def test_a_lamp_of_black_parts_keeps_its_shade() -> None:
+    mask = 255 * ((np.abs(X) < 30) & ((Y < -10) & (Y > -50) | (Y > 0) & (Y < 60))).astype(np.uint8)
+    ink = np.zeros((SIZE, SIZE, 3), np.uint8)
+    assert keep_parts(ink, mask) == (mask, None)
+    assert keep_parts(ink + 90, mask)[1].startswith("several objects"), "not a drawing"
 
 
 def test_a_smooth_shape_is_made_if_it_is_asked_for() -> None:

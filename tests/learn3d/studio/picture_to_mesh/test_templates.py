@@ -32,6 +32,7 @@ from learn3d.studio.picture_to_mesh.smoothing import divide, smooth
 from learn3d.studio.picture_to_mesh.templates import (
     MIRROR,
     Candidates,
+    bend,
     compare_lines,
     learn_templates,
     spread_out,
@@ -104,6 +105,24 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
 def test_templates_have_no_boxes_on_their_roofs() -> None:
     bare, loaded = (template("car", 0, loads=loads)[0] for loads in (False, True))
     assert len(bare) < len(loaded)
+
+
+def test_a_table_gets_the_slanted_legs_and_the_round_top_of_a_picture() -> None:
+    shape = trimesh.creation.box((0.9, 0.06, 0.5)).apply_translation((0, 0.3, 0))
+    legs = [trimesh.creation.box((0.06, 0.6, 0.06)) for _ in range(2)]
+    legs = [leg.apply_translation((x, 0, 0)) for leg, x in zip(legs, (-0.35, 0.35), strict=True)]
+    shape = trimesh.util.concatenate([shape.subdivide().subdivide(), *legs])
+    vertices, faces = torch.tensor(shape.vertices).float(), torch.tensor(shape.faces)
+    view = frame_view(vertices, torch.tensor([0.0]), torch.tensor([0.0]))
+    x, y, z = vertices.unbind(1)
+    wanted = torch.stack([x * (1 - 0.6 * y), y - 0.3 * (y > 0.2) * x**2, z], 1)
+    outline = view.silhouettes(wanted[None], faces)[0]
+    found = Candidates([vertices], [faces], ["table"], view, torch.zeros(1))
+    bent = bend(found, outline, DEFAULTS.match)
+    before, after = (
+        float(each.views.ious(each.shapes, each.faces, outline).detach()) for each in (found, bent)
+    )
+    assert before < 0.5 and after > 0.82
 
 
 @pytest.mark.parametrize("roll_deg", [45.0, -60.0])
