@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
@@ -96,6 +97,7 @@ def _seen(
     pixels, inside = target.pixels[:3], (target.pixels[3:] > 0.5).float()
     widths = (1, options.border)
     reliable = sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in widths) / 2
+    reliable[:, torch.from_numpy(_contour(target, options))] *= options.drawn
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         placed = view.place(points[None])
@@ -115,6 +117,17 @@ def _seen(
     return look_up
 
 
+def _contour(target: Target, options: ColorOptions) -> np.ndarray:
+    """The pixels of a line that a drawing has along its outline, bool [S, S]: hidden parts do not get its colour."""
+    pixels, depth = target.pixels[:3].numpy(), distance_transform_edt(target.pixels[3] > 0.5)
+    rim, core = (depth > 1) & (depth <= 3), depth > options.contour
+    if not (rim.any() and core.any()):
+        return core & rim
+    alike = np.abs(pixels - np.median(pixels[:, rim], 1)[:, None, None]).max(0) < options.even
+    drawn = alike[rim].mean() > 1 - options.others and alike[core].mean() < options.others
+    return alike & (depth > 0) & ~core & drawn
+
+
 def _spread(
     colors: Tensor,
     weight: Tensor,
@@ -129,11 +142,10 @@ def _spread(
     |c_v - like_v|^2. So seen vertices (w_v near 1) keep their colours, and neighbours become
     alike. The last term, with s = `options.spreading`, decides far from them: see `_alike`.
     """
-    clear = (weight >= min(0.5, float(weight.max()))).numpy()
     neighbours = joined(faces.numpy(), len(colors))
     given = weight.double().numpy()[:, None] ** 2
     colors = colors.double().numpy()
-    alike = _alike(colors, clear, vertices.numpy(), normals.numpy(), neighbours, options)
+    alike = _alike(colors, weight.numpy(), vertices.numpy(), normals.numpy(), neighbours, options)
     laplacian = diags_array(neighbours.sum(1)) - neighbours
     system = (diags_array(given[:, 0] + options.spreading) + 0.01 * laplacian).tocsr()
     right = given * colors + options.spreading * alike
@@ -146,7 +158,7 @@ def _spread(
 
 def _alike(
     colors: np.ndarray,
-    clear: np.ndarray,
+    weight: np.ndarray,
     points: np.ndarray,
     normals: np.ndarray,
     neighbours: coo_array,
@@ -162,6 +174,9 @@ def _alike(
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, part, points)
     np.maximum.at(high, part, points)
+    best = np.zeros(count)
+    np.maximum.at(best, part, weight)
+    clear = weight >= best.clip(min(options.drawn, weight.max()) / 2, 0.5)[part]
     seen = np.bincount(part, clear, count)
     features = np.column_stack([0.2 * points[:, [0, 2]], points[:, 1], 0.2 * np.abs(normals[:, 1])])
     alike = np.empty_like(colors)

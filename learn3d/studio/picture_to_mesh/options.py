@@ -161,7 +161,7 @@ class MatchOptions:
     """Steps of stretching."""
     lattice: int = 6
     """Points of the lattice for bending along each axis."""
-    bending: float = 0.1
+    bending: float = 0.25
     """Weight of their moves."""
     bending_steps: int = 60
     """Steps of bending."""
@@ -178,13 +178,21 @@ class ColorOptions:
     border: int = 2
     """Width in pixels of the border inside the outline that may have the background's colours. Its
     inner pixels count half, as thin legs have no others."""
-    coarse: float = 0.1
+    contour: float = 24.0
+    """Widest line along the outline of a drawing, in pixels of 256."""
+    even: float = 0.15
+    """Largest difference of its pixels from its colour, in 0 .. 1."""
+    others: float = 0.3
+    """Largest share of other colours in it, and of its colour deeper inside."""
+    drawn: float = 0.2
+    """Reliability of its colour: parts that show another one spread that to what is hidden."""
+    coarse: float = 0.05
     """Longest edge of the mesh on which the colours of hidden parts are found."""
     fine: float = 0.025
     """Longest edge of the coloured mesh."""
     equal: float = 0.06
     """Two parts are equal if the sizes of their boxes and their heights differ by less."""
-    neighbours: int = 15
+    neighbours: int = 60
     """Clearly seen vertices at a similar height whose median colour a hidden part has."""
     spreading: float = 1e-2
     """Weight of these colours; that of alike neighbours is 0.01."""

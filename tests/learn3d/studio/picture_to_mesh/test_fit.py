@@ -10,6 +10,7 @@ import torch
 import trimesh
 from painted import seen
 from PIL import Image
+from scipy.ndimage import distance_transform_edt
 
 import nmr
 from learn3d.data.dataset import DatasetInfo
@@ -150,7 +151,7 @@ def test_hidden_parts_have_the_colours_of_equal_ones() -> None:
     places = torch.tensor([(-0.3, -0.2, -0.3), (-0.3, -0.2, 0.3), (0.0, 0.2, 0.3)])
     vertices = (box + places[:, None]).flatten(0, 1)
     faces = torch.cat([faces, faces + 8, faces + 16])
-    clear = np.arange(24) // 8 != 1
+    clear = 1.0 * (np.arange(24) // 8 != 1)
     colors = np.arange(24)[:, None] // 8 + np.zeros((1, 3))
     normals = np.zeros((24, 3))
     neighbours = joined(faces.numpy(), 24)
@@ -172,6 +173,31 @@ def test_hidden_sides_have_the_colours_at_their_height() -> None:
     for side, wanted in ((surface.vertices[:, 1] > 0.1, 2), (surface.vertices[:, 1] < -0.1, 0)):
         found = surface.colors[behind & side].mean(0)
         assert found.argmax() == wanted and found[wanted] > 2 * found[2 - wanted], found
+
+
+def test_the_line_around_a_drawing_stays_where_it_is_seen() -> None:
+    """A red board on a thin leg; the drawing has a black line around it, and the leg is black."""
+    board = divide(*map(torch.tensor, _box(0.8, 0.5, 0.2)), 0.05)
+    leg = divide(*map(torch.tensor, _box(0.06, 0.3, 0.06)), 0.05)
+    leg = leg[0] - torch.tensor([0.0, 0.4, 0.0]), leg[1] + len(board[0])
+    vertices, faces = torch.cat([board[0], leg[0]]).float(), torch.cat([board[1], leg[1]])
+    view = frame_view(vertices[None], torch.tensor([0.0]), torch.tensor([0.0]))
+    pixels = seen(vertices, faces, (0.9, 0.1, 0.1), view).pixels
+    line = distance_transform_edt(pixels[3] > 0.5) < 12
+    pixels[:3, torch.from_numpy(line)] = 0
+    surface = color_mesh((vertices, faces), view, Target(pixels), fine=True)
+    red, (x, y, z) = surface.colors[:, 0], surface.vertices.T
+    back, front = z > 0.09, z < -0.09
+    assert red[back].min() > 0.6, "no line where none was seen"
+    side = front & (y.abs() < 0.2)
+    assert red[side & ((x - 0.37).abs() < 0.015)].mean() < 0.4, "the line"
+    assert red[side & (x.abs() < 0.3)].mean() > 0.6
+    assert red[y < -0.35].max() < 0.3, "all of the leg"
+
+
+def _box(*sides: float) -> tuple[np.ndarray, np.ndarray]:
+    box = trimesh.creation.box(sides)
+    return np.array(box.vertices), np.array(box.faces)
 
 
 def test_a_picture_without_a_seen_vertex_still_has_colours() -> None:
