@@ -208,9 +208,7 @@ void edges_backward(const EdgesBackward<T>& args) {
     image.channels = args.channels;
     image.grad = args.grad_resolved + b * args.image.pixels() * args.channels;
     image.pixels = args.pixels + b * raster.pixels() * args.channels;
-    image.background = args.background
-                           ? args.background + (args.background_batch == 1 ? 0 : b * args.channels)
-                           : nullptr;
+    image.background = args.background.of(b, args.channels);
     return image;
   });
 }

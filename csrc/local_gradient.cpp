@@ -263,12 +263,10 @@ void local_edges_backward(const EdgesBackward<T>& args) {
   const Size raster = raster_of(args.image, args.anti_aliasing);
   const int64_t C = args.channels;
   local_pulls(args.mesh, raster, args.grad_vertices, args.num_threads, [&](int64_t b) {
-    return LocalColors<T>{
-        raster_of_image(args.mesh, args.image, args.anti_aliasing, args.perspective, args.eps,
-                        args.face_index, b),
-        args.pixels + b * raster.pixels() * C,
-        args.background ? args.background + (args.background_batch == 1 ? 0 : b * C) : nullptr,
-        args.grad_resolved + b * args.image.pixels() * C, C};
+    return LocalColors<T>{raster_of_image(args.mesh, args.image, args.anti_aliasing,
+                                          args.perspective, args.eps, args.face_index, b),
+                          args.pixels + b * raster.pixels() * C, args.background.of(b, C),
+                          args.grad_resolved + b * args.image.pixels() * C, C};
   });
 }
 

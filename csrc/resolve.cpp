@@ -64,8 +64,9 @@ void resolve_forward(const Resolve<T>& args) {
   const int64_t h = args.image.height, w = args.image.width, C = args.channels,
                 scale = args.anti_aliasing ? 2 : 1, W = scale * w;
   std::vector<T> behind;  // colour of each background, as resolve_row takes it
-  for (int64_t b = 0; args.background && b < args.background_batch; ++b) {
-    const T* color = args.background + b * C;
+  const bool mixed = args.background.values;
+  for (int64_t b = 0; mixed && b < (args.background.each ? args.batch : 1); ++b) {
+    const T* color = args.background.of(b, C);
     behind.insert(behind.end(), color, color + C);
     for (int64_t c = 0; c < C; ++c)
       behind.push_back(average(color[c], color[c], color[c], color[c]));
@@ -73,10 +74,9 @@ void resolve_forward(const Resolve<T>& args) {
   with_channels<T>(C, [&](auto known) {
     constexpr int64_t kChannels = known();
     parallel_for(args.batch * h, args.num_threads, [&](int64_t n) {  // n: image b, row y
-      const T* background = args.background
-                                ? behind.data() + (args.background_batch == 1 ? 0 : n / h * 2 * C)
-                                : nullptr;
-      const int32_t* face_index = args.background ? args.face_index + n * scale * W : nullptr;
+      const T* background =
+          mixed ? behind.data() + (args.background.each ? n / h * 2 * C : 0) : nullptr;
+      const int32_t* face_index = mixed ? args.face_index + n * scale * W : nullptr;
       resolve_row<kChannels>(face_index, args.pixels + n * scale * W * C, background, w,
                              args.anti_aliasing, C, args.resolved + n * w * C);
     });
@@ -94,7 +94,7 @@ void resolve_backward(const Resolve<T>& args) {
     with_channels<T>(C, [&](auto known) {
       constexpr int64_t kChannels = known();
       parallel_for(args.batch * H, args.num_threads, [&](int64_t n) {  // n: image b, raster row
-        resolve_row_backward<kChannels>(args.background ? args.face_index + n * W : nullptr,
+        resolve_row_backward<kChannels>(args.background.values ? args.face_index + n * W : nullptr,
                                         args.grad_resolved + n / scale * w * C, w,
                                         args.anti_aliasing, C, args.grad_pixels + n * W * C);
       });

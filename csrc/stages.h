@@ -49,7 +49,7 @@ struct MeshBatch {
   const int64_t* image_faces(int64_t b) const { return faces + 3 * face_rows.first(b); }
 };
 
-// A parameter of cameras: one for all, or one for each.
+// A parameter of cameras, or of images: one for all, or one for each.
 template <class P>
 struct Parameter {
   const P* values;  // [size] or [n, size]; nullptr if it is not given
@@ -466,10 +466,9 @@ struct Resolve {
   int64_t channels;           // C
   const int32_t* face_index;  // [B, H, W]
   const T* pixels;            // [B, H, W, C] of the raster
-  const T* background;  // [B or 1, C] colour of pixels without a face, or nullptr: that in `pixels`
-  int64_t background_batch;  // 1 or B
-  T* resolved;               // forward out [B, h, w, C]
-  const T* grad_resolved;    // backward in
+  Parameter<T> background;    // [C] colour of pixels without a face; not given: that in `pixels`
+  T* resolved;                // forward out [B, h, w, C]
+  const T* grad_resolved;     // backward in
   T* grad_pixels;  // backward out [B, H, W, C], or nullptr; 0 at background pixels if `background`
                    // is given
   T* grad_background;  // backward out [B, C], or nullptr
@@ -487,10 +486,9 @@ struct EdgesBackward {
   const int32_t* face_index;  // [B, H, W]
   const T* pixels;            // [B, H, W, C]
   int64_t channels;           // C
-  const T* background;  // [B or 1, C] colour of pixels without a face, or nullptr: that in `pixels`
-  int64_t background_batch;  // 1 or B
-  const T* grad_resolved;    // [B, h, w, C]
-  T* grad_vertices;          // out, like mesh.vertices; z gets 0
+  Parameter<T> background;    // [C] colour of pixels without a face; not given: that in `pixels`
+  const T* grad_resolved;     // [B, h, w, C]
+  T* grad_vertices;           // out, like mesh.vertices; z gets 0
   int num_threads;
   bool perspective;  // kind of the cameras; only the local gradient reads it
 };

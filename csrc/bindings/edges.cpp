@@ -4,11 +4,13 @@
 namespace nmr {
 namespace {
 
-// The colour of pixels without a face, in both structs.
-template <class T, class Args>
-void read_background(Call& call, Args& args) {
-  const Argument& background = call.read("background? [1|B, C]", args.background);
-  args.background_batch = args.background ? background.shape[0] : 0;
+// The colour of pixels without a face.
+template <class T>
+Parameter<T> read_background(Call& call) {
+  Parameter<T> background{};
+  const Argument& given = call.read("background? [1|B, C]", background.values);
+  background.each = background.values && given.shape[0] != 1;
+  return background;
 }
 
 template <class T>
@@ -22,7 +24,7 @@ Resolve<T> read_resolve(Call& call) {
   args.channels = call["C"];
   require(args.channels >= 1,
           "image must have at least one channel, got " + call("image").shape_text());
-  read_background<T>(call, args);
+  args.background = read_background<T>(call);
   args.num_threads = num_threads(call);
   call.result("resolved [B, h, w, C]", args.resolved, args.grad_resolved);
   call.gradient("image", args.grad_pixels);
@@ -44,7 +46,6 @@ void pull_edges(Call& call, const Resolve<T>& mean) {
   args.pixels = mean.pixels;
   args.channels = mean.channels;
   args.background = mean.background;
-  args.background_batch = mean.background_batch;
   args.grad_resolved = mean.grad_resolved;
   args.perspective = call.flag("perspective");
   call.gradient("vertices", args.grad_vertices);
@@ -56,7 +57,7 @@ void pull_edges(Call& call, const Resolve<T>& mean) {
 template <class T>
 void resolve_gradients(Call& call) {
   Resolve<T> args = read_resolve<T>(call);
-  T* of_shared = args.background_batch == 1 ? args.grad_background : nullptr;
+  T* of_shared = args.background.each ? nullptr : args.grad_background;
   std::vector<T> rows(of_shared ? args.batch * args.channels : 0);
   if (of_shared) args.grad_background = rows.data();
   if (args.grad_pixels || args.grad_background) resolve_backward(args);

@@ -380,7 +380,8 @@ struct Run {
   void edges() {
     const int64_t size = image_pixels * C, backgrounds = s.per_image_values ? s.batch : 1;
     const T *image = in("image", pixels * C), *grad = in("grad_resolved", size);
-    const T* background = in_if(s.fill_back, "background", backgrounds * C);
+    const Parameter<T> background{in_if(s.fill_back, "background", backgrounds * C),
+                                  s.fill_back && backgrounds != 1, nullptr};
     EdgesBackward<T> edges{mesh,
                            s.image,
                            s.anti_aliasing,
@@ -389,7 +390,6 @@ struct Run {
                            image,
                            C,
                            background,
-                           backgrounds,
                            grad,
                            out("grad_edges", 3 * rows),
                            threads,
@@ -404,7 +404,6 @@ struct Run {
                              face_index,
                              image,
                              background,
-                             backgrounds,
                              out("resolved", size),
                              grad,
                              out("grad_image", pixels * C),
