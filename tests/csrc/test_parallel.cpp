@@ -49,18 +49,6 @@ TEST(a_caller_that_waited_in_vain_works_alone_for_a_while) {
   CHECK(wants(0, 0, 0));
 }
 
-TEST(scratch_belongs_to_a_thread_and_grows) {
-  struct Scratch {
-    std::vector<double> values;
-  };
-  CHECK_EQUAL(&thread_scratch<Scratch>(), &thread_scratch<Scratch>());
-  parallel_for(50, 4, [](int64_t i) {
-    double* values = reserve(thread_scratch<Scratch>().values, 100 + i);
-    for (int64_t n = 0; n < 100 + i; ++n) values[n] = static_cast<double>(i);
-    for (int64_t n = 0; n < 100 + i; ++n) CHECK_EQUAL(values[n], static_cast<double>(i));
-  });
-}
-
 // A buffer that counts how many of its kind exist.
 struct Counted {
   static std::atomic<int> alive;

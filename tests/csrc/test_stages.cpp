@@ -1,6 +1,5 @@
 // Properties of every stage: its results do not depend on threads, company, packing, the order of
 // faces or earlier calls; float agrees with double; hostile inputs keep what broken_promise lists.
-#include <algorithm>
 #include <cmath>
 
 #include "check.h"
