@@ -45,8 +45,8 @@ NMR_INLINE Sides sides_of(const T* vertices, const int64_t* face, T near) {
 template <class T>
 bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
   const T* vertices = mesh.image_vertices(b);
-  for (int64_t f = 0; f < mesh.face_rows.count(b); ++f) {
-    const int64_t* face = mesh.image_faces(b) + 3 * f;
+  const int64_t *face = mesh.image_faces(b), num_faces = mesh.face_rows.count(b);
+  for (int64_t f = 0; f < num_faces; ++f, face += 3) {
     if (sides_of(vertices, face, near).count != 3) continue;
     const T z0 = vertices[3 * face[0] + 2], z1 = vertices[3 * face[1] + 2],
             z2 = vertices[3 * face[2] + 2];
@@ -58,8 +58,10 @@ bool any_around_eye(const MeshBatch<T>& mesh, int64_t b, T near) {
 // Whether the mesh does not stay as it is.
 template <class T>
 bool changes(const MeshBatch<T>& mesh, int64_t b, T near) {
-  for (int64_t f = 0; f < mesh.face_rows.count(b); ++f)
-    if (sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, near).cut()) return true;
+  const T* vertices = mesh.image_vertices(b);
+  const int64_t *faces = mesh.image_faces(b), num_faces = mesh.face_rows.count(b);
+  for (int64_t f = 0; f < num_faces; ++f)
+    if (sides_of(vertices, faces + 3 * f, near).cut()) return true;
   return any_around_eye(mesh, b, near);
 }
 
@@ -69,10 +71,11 @@ template <class T>
 void clip_count(const ClipCount<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
-    const int64_t num_faces = mesh.face_rows.count(b);
+    const T* vertices = mesh.image_vertices(b);
+    const int64_t *faces = mesh.image_faces(b), num_faces = mesh.face_rows.count(b);
     int64_t cut = 0, drawn = 0;
     for (int64_t f = 0; f < num_faces; ++f) {
-      const Sides sides = sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f, args.near);
+      const Sides sides = sides_of(vertices, faces + 3 * f, args.near);
       cut += sides.cut();
       drawn += kPieces[sides.count];
     }
@@ -86,6 +89,8 @@ template <class T>
 void clip_faces(const ClipFaces<T>& args) {
   const MeshBatch<T>& mesh = args.mesh;
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
+    const T* vertices = mesh.image_vertices(b);
+    const int64_t *faces = mesh.image_faces(b), num_faces = mesh.face_rows.count(b);
     const int64_t vertex_start = mesh.vertex_rows.first(b),
                   num_vertices = mesh.vertex_rows.count(b);
     const int64_t first_vertex = args.starts[2 * b], last_vertex = args.starts[2 * b + 2];
@@ -104,7 +109,7 @@ void clip_faces(const ClipFaces<T>& args) {
     };
     // A triangle of face f; each corner is a corner k of f (k < 3), or the new vertex k - 3.
     const auto draw = [&](int64_t f, int64_t k0, int64_t k1, int64_t k2) {
-      const int64_t* face = mesh.image_faces(b) + 3 * f;
+      const int64_t* face = faces + 3 * f;
       const int64_t corner[3] = {k0, k1, k2};
       for (int k = 0; k < 3; ++k) {
         args.corners[3 * n + k] = corner[k];
@@ -113,9 +118,9 @@ void clip_faces(const ClipFaces<T>& args) {
       args.source[n++] = static_cast<int32_t>(f);
     };
     const bool stays = !changes(mesh, b, args.near);
-    for (int64_t f = 0; f < mesh.face_rows.count(b); ++f) {
-      const int64_t* face = mesh.image_faces(b) + 3 * f;
-      const Sides sides = sides_of(mesh.image_vertices(b), face, args.near);
+    for (int64_t f = 0; f < num_faces; ++f) {
+      const int64_t* face = faces + 3 * f;
+      const Sides sides = sides_of(vertices, face, args.near);
       if (stays || sides.count == 0) {
         draw(f, 0, 1, 2);
       } else if (sides.cut()) {

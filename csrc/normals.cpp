@@ -80,9 +80,10 @@ NMR_INLINE void sides_backward(const Sides& s, const int64_t* face, const Vec3d&
 template <class T>
 std::vector<Vec3d> vertex_sums(const MeshBatch<T>& mesh, int64_t b) {
   std::vector<Vec3d> sums(mesh.vertex_rows.count(b), Vec3d::Zero());
-  const int64_t* face = mesh.image_faces(b);
-  for (int64_t f = 0; f < mesh.face_rows.count(b); ++f, face += 3) {
-    const Vec3d across = sides_of(mesh.image_vertices(b), face).across;
+  const T* vertices = mesh.image_vertices(b);
+  const int64_t *face = mesh.image_faces(b), num_faces = mesh.face_rows.count(b);
+  for (int64_t f = 0; f < num_faces; ++f, face += 3) {
+    const Vec3d across = sides_of(vertices, face).across;
     for (int k = 0; k < 3; ++k) sums[face[k]] += across;
   }
   return sums;
@@ -113,10 +114,10 @@ void normals_forward(const Normals<T>& args) {
         store(normals + 3 * v, direction_of<T>(sums[v]).unit);
       return;
     }
-    for (int64_t f = 0; f < mesh.face_rows.count(b); ++f)
-      store(normals + 3 * f,
-            direction_of<T>(sides_of(mesh.image_vertices(b), mesh.image_faces(b) + 3 * f).across)
-                .unit);
+    const T* vertices = mesh.image_vertices(b);
+    const int64_t *faces = mesh.image_faces(b), num_faces = mesh.face_rows.count(b);
+    for (int64_t f = 0; f < num_faces; ++f)
+      store(normals + 3 * f, direction_of<T>(sides_of(vertices, faces + 3 * f).across).unit);
   });
 }
 
@@ -127,7 +128,8 @@ void normals_backward(const Normals<T>& args) {
   parallel_for(mesh.batch, args.num_threads, [&](int64_t b) {
     const T *vertices = mesh.image_vertices(b),
             *grad_normals = args.grad_normals + 3 * first_normal(args, b);
-    const int64_t V = mesh.vertex_rows.count(b), *face = mesh.image_faces(b);
+    const int64_t V = mesh.vertex_rows.count(b), F = mesh.face_rows.count(b),
+                  *face = mesh.image_faces(b);
     std::vector<Vec3d> grads(V, Vec3d::Zero()), grad_sums;
     if (args.smooth) {
       grad_sums = vertex_sums(mesh, b);
@@ -135,7 +137,7 @@ void normals_backward(const Normals<T>& args) {
         grad_sums[v] = direction_backward(direction_of<T>(grad_sums[v]),
                                           load3(grad_normals + 3 * v).template cast<double>());
     }
-    for (int64_t f = 0; f < mesh.face_rows.count(b); ++f, face += 3) {
+    for (int64_t f = 0; f < F; ++f, face += 3) {
       const Sides sides = sides_of(vertices, face);
       const Vec3d grad_across =
           args.smooth ? Vec3d(grad_sums[face[0]] + grad_sums[face[1]] + grad_sums[face[2]])
