@@ -79,8 +79,8 @@ def main(
         found = []
         for picture in pictures:
             with torch.no_grad():
-                (code,) = model.method.encode(torch.from_numpy(model.prepare(*picture))[None])
-            found.append(recognize(model, code)[1] is not None)
+                chances = model.chances(torch.from_numpy(model.prepare(*picture)))
+            found.append(recognize(model, chances)[1] is not None)
         print(f"{group:12}{name:16}{len(found):6}{np.mean(found):8.1%}", flush=True)
         warned.setdefault(group, []).extend(found)
     for group, found in warned.items():

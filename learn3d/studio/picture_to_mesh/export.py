@@ -9,7 +9,7 @@ from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.multi_view import ManyViewsSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
-from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, known_codes
+from learn3d.studio.picture_to_mesh.familiarity import known_codes
 from learn3d.studio.picture_to_mesh.templates import TEMPLATES, learn_templates
 from learn3d.terminal import note
 
@@ -47,8 +47,7 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         )
     elif isinstance(method, MeshMethod):
         dataset = checkpoint.load_data(config, "train")
-        known = zip(KNOWN_CODES, known_codes(method, dataset, others), strict=True)
-        tensors |= {name: tensor for name, tensor in known if tensor is not None}
+        tensors |= known_codes(method, dataset, others).tensors()
         if (templates := learn_templates(method, dataset)) is not None:
             tensors |= dict(zip(TEMPLATES, templates, strict=True))
     settings = {name: value for name, value in _UNUSED.items() if hasattr(config.settings, name)}

@@ -1,67 +1,78 @@
 """Predicts the category of a picture, and whether it is an unknown object, by comparing its code with known ones."""
 
-from collections.abc import Iterable
+from __future__ import annotations
+
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.cluster.vq import kmeans2
-from torch import Tensor, nn
+from torch import Tensor
 
-from learn3d.data.dataset import ViewDataset
+from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
-from learn3d.networks.encoders import CODE_SIZE
+from learn3d.networks.encoders import CODE_SIZE, ViewClassifier
+from learn3d.runs import checkpoint
 
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
 FAR = 0.82  # distance above which a picture is unknown if no other objects were learnt
-# names of the tensors of `KnownCodes` in a checkpoint
-KNOWN_CODES = (
-    "known_codes",
-    "hidden_layer",
-    "output_layer",
-)
+CENTRES_NAME, JUDGE_PREFIX = "known_codes", "judge."  # names of the tensors in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
-_HIDDEN = 64  # width of a classifier
-_MEMBERS = 2  # classifiers, whose logits are averaged
-_DROPOUT = 0.3
-_STEPS = 120
-_SCALE = 10.0  # length of the codes that they see
+_BATCH = 96  # images in a step
+_EPOCHS = 20  # how often all images are seen, on average
+_RATE = 2e-3  # largest learning rate
+_OTHERS = 0.35  # share of other things in a batch
+
+Vary = Callable[[Tensor, Tensor, np.random.Generator], Tensor]
 
 
 class KnownCodes(NamedTuple):
     """Cluster centres (k-means) of normalised codes, and a network that knows kinds and other things."""
 
     kinds: Tensor  # float [N, K, C]: centres of the training images of N categories
-    # float [H, C + 1]: weights of its hidden units, the bias last; None: not learnt
-    hidden: Tensor | None = None
-    # float [N + 1, H + 1]: weights of the categories' logits and of that of other things, the bias last
-    output: Tensor | None = None
+    judge: ViewClassifier | None = None  # logits of the categories, then of other things
 
-    def fits(self, categories: int) -> bool:
-        """Whether the shapes are those of so many categories."""
-        if self.kinds.ndim != 3 or self.kinds.shape[::2] != (categories, CODE_SIZE):
-            return False
-        if self.hidden is None or self.output is None:
-            return self.kinds.numel() > 0 and self.hidden is self.output is None
-        units = self.hidden.numel() // (CODE_SIZE + 1)
-        shapes = [(units, CODE_SIZE + 1), (categories + 1, units + 1)]
-        return self.kinds.numel() > 0 and [self.hidden.shape, self.output.shape] == shapes
+    @classmethod
+    def from_tensors(
+        cls, tensors: dict[str, Tensor], categories: int, inverted: bool
+    ) -> KnownCodes | None:
+        """Those of a checkpoint, None if it has none. ValueError if they are not of so many categories."""
+        kinds = tensors.get(CENTRES_NAME)
+        if kinds is None:
+            return None
+        if kinds.ndim != 3 or kinds.shape[::2] != (categories, CODE_SIZE) or not kinds.numel():
+            raise ValueError
+        weights = checkpoint.starting_with(JUDGE_PREFIX, tensors)
+        if not weights:
+            return cls(kinds)
+        judge = ViewClassifier(categories + 1, inverted).requires_grad_(False)
+        try:
+            judge.load_state_dict(weights)
+        except RuntimeError:
+            raise ValueError from None
+        return cls(kinds, judge)
 
-    def probabilities(self, code: Tensor) -> Tensor:
-        """How probably a code [C] is of each category, and of another thing, [N + 1].
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors for a checkpoint."""
+        weights = {} if self.judge is None else self.judge.state_dict()
+        named = {JUDGE_PREFIX + name: weight for name, weight in weights.items()}
+        return {CENTRES_NAME: self.kinds, **named}
+
+    def probabilities(self, image: Tensor, code: Tensor) -> Tensor:
+        """How probably a stored image uint8 [4, S, S] with a code [C] shows each category, and another thing, [N + 1].
 
         Without a network the nearest category has the probability 1, or another thing if all are
         far away.
         """
-        if self.hidden is None:
+        if self.judge is None:
             far = float(_distance(code, self.kinds.flatten(0, 1))) > FAR
             kind = len(self.kinds) if far else int(self.distances(code).argmin())
             return F.one_hot(torch.tensor(kind), len(self.kinds) + 1).float()
-        hidden, output = self.hidden.float(), self.output.float()
-        units = F.relu(hidden[:, :-1] @ (_SCALE * F.normalize(code, dim=0)) + hidden[:, -1])
-        return F.softmax(output[:, :-1] @ units + output[:, -1], dim=0)
+        pixels = _pixels(image[None])
+        return self.judge(torch.cat([pixels, pixels.flip(3)])).mean(0).softmax(0)
 
     def distances(self, code: Tensor) -> Tensor:
         """The distance of a code [C] to each category, [N]."""
@@ -73,6 +84,16 @@ def _distance(code: Tensor, centres: Tensor) -> Tensor:
     return apart.topk(min(_NEAREST, len(apart)), largest=False).values.mean()
 
 
+def _pixels(images: Tensor) -> Tensor:
+    return F.adaptive_avg_pool2d(images.float() / 255, MASK_SIZE)
+
+
+def mirror(images: Tensor, kinds: Tensor, rng: np.random.Generator) -> Tensor:
+    """Half of the images mirrored."""
+    chosen = torch.from_numpy(rng.random((len(images), 1, 1, 1)) < 0.5)
+    return _pixels(torch.where(chosen, images.flip(3), images))
+
+
 def known_codes(
     method: MeshMethod, dataset: ViewDataset, others: Tensor | None = None
 ) -> KnownCodes:
@@ -82,7 +103,10 @@ def known_codes(
     )
     batches = [dataset.batch(part, voxels=False) for part in chosen.split(128)]
     classes = torch.cat([b.class_ids for b in batches])
-    codes = _directions(method, (b.images for b in batches))
+    images = torch.cat([b.images for b in batches])
+    with torch.no_grad():
+        codes = torch.cat([method.encode(part) for part in images.split(128)])
+    codes = F.normalize(codes, dim=1)
     count = min(
         CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min())
     )
@@ -94,35 +118,36 @@ def known_codes(
     if others is None:
         return KnownCodes(kinds)
     unknown = torch.full((len(others),), dataset.num_classes)
-    codes = torch.cat([codes, _directions(method, others.split(128))])
-    return KnownCodes(kinds, *learn_kinds(codes, torch.cat([classes, unknown])))
+    judge = learn_kinds(
+        torch.cat([images, others]), torch.cat([classes, unknown]), dataset.inverted
+    )
+    return KnownCodes(kinds, judge)
 
 
-def learn_kinds(codes: Tensor, kinds: Tensor) -> tuple[Tensor, Tensor]:
-    """`KnownCodes.hidden` and `.output` from normalised codes [M, C] and their kinds int64 [M], other things last.
+def learn_kinds(
+    images: Tensor, kinds: Tensor, inverted: bool, vary: Vary = mirror
+) -> ViewClassifier:
+    """`KnownCodes.judge` from stored images uint8 [M, 4, S, S] and their kinds int64 [M], other things last.
 
-    They are small networks with dropout, trained on all codes at once; all kinds have the same
-    total weight.
+    vary: makes float images [B, 4, 64, 64] in 0 .. 1 of stored ones and their kinds [B], changed at
+    random.
     """
-    count = int(kinds.max()) + 1
-    share = 1 / kinds.bincount().clamp(min=1)
-    hidden, output = [], []
+    rng = np.random.default_rng(0)
+    count = int(kinds.max())
+    share = torch.full((count + 1,), (1 - _OTHERS) / count)
+    share[count] = _OTHERS
+    chance = (share / kinds.bincount())[kinds].double().numpy()
+    steps = max(20, _EPOCHS * len(kinds) // _BATCH)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        for _ in range(_MEMBERS):
-            first, last = nn.Linear(codes.shape[1], _HIDDEN), nn.Linear(_HIDDEN, count)
-            network = nn.Sequential(first, nn.ReLU(), nn.Dropout(_DROPOUT), last)
-            optimizer = torch.optim.AdamW(network.parameters(), 1e-2, weight_decay=0.1)
-            for _ in range(_STEPS):
-                optimizer.zero_grad()
-                F.cross_entropy(network(_SCALE * codes), kinds, share).backward()
-                optimizer.step()
-            hidden.append(torch.cat([first.weight, first.bias[:, None]], 1).detach())
-            output.append(torch.cat([last.weight, last.bias[:, None]], 1).detach() / _MEMBERS)
-    weights = torch.cat([part[:, :-1] for part in output], 1)
-    return torch.cat(hidden), torch.cat([weights, sum(part[:, -1:] for part in output)], 1)
-
-
-@torch.no_grad()
-def _directions(method: MeshMethod, images: Iterable[Tensor]) -> Tensor:
-    return F.normalize(torch.cat([method.encode(part) for part in images]), dim=1)
+        judge = ViewClassifier(count + 1, inverted)
+        optimizer = torch.optim.AdamW(judge.parameters(), _RATE, weight_decay=0.05)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, steps, pct_start=0.1)
+        for _ in range(steps):
+            rows = torch.from_numpy(rng.choice(len(kinds), _BATCH, p=chance / chance.sum()))
+            pixels = vary(images[rows], kinds[rows], rng)
+            optimizer.zero_grad()
+            F.cross_entropy(judge(pixels), kinds[rows], label_smoothing=0.02).backward()
+            optimizer.step()
+            schedule.step()
+    return judge.requires_grad_(False)

@@ -23,7 +23,7 @@ from learn3d.pictures import Surface
 from learn3d.runs import checkpoint
 from learn3d.settings import split_names
 from learn3d.studio.picture_to_mesh.coloring import color_mesh
-from learn3d.studio.picture_to_mesh.familiarity import KNOWN_CODES, KnownCodes
+from learn3d.studio.picture_to_mesh.familiarity import KnownCodes
 from learn3d.studio.picture_to_mesh.fit import (
     Fit,
     Prediction,
@@ -67,6 +67,16 @@ class Model(NamedTuple):
         """The categories that it was trained on."""
         return split_names(self.config.category)
 
+    def chances(self, image: Tensor, category: str | None = None) -> Tensor:
+        """How probably a stored image uint8 [4, S, S] shows each category, and another thing, float32 [N + 1].
+
+        category: the object's, None if unknown.
+        """
+        if category is not None or self.known_codes is None:
+            right = [category in (None, name) for name in self.categories]
+            return torch.tensor([*right, False]) / sum(right)
+        return self.known_codes.probabilities(image, self.method.encode(image[None])[0])
+
     def prepare(self, colors: np.ndarray, mask: np.ndarray, *, crop: bool = True) -> np.ndarray:
         """Call `prepare_image` with the image size, object size and layout of these networks."""
         size, layout = self.method.image_size, self.config.layout
@@ -80,17 +90,19 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
     tensors = checkpoint.load(path)[0]
-    if "output_layer" in tensors and tensors["output_layer"].ndim == 1:  # it does not tell kinds
+    if "output_layer" in tensors:
         note(f"{path} is of an earlier version; export it again with --others to warn of these")
-        tensors = {name: x for name, x in tensors.items() if name not in KNOWN_CODES[1:]}
-    stored = ((KnownCodes, KNOWN_CODES), (Templates, TEMPLATES))
-    parts = [
-        kind(*map(tensors.get, names)) if names[0] in tensors else None for kind, names in stored
-    ]
     categories = len(split_names(config.category))
-    if not all(part is None or part.fits(categories) for part in parts):
-        raise DamagedFile(path, "has known codes or templates of other shapes than its categories")
-    return Model(method, config, metadata.progress.object_share or MEAN_OBJECT_SIZE, *parts)
+    try:
+        known = KnownCodes.from_tensors(tensors, categories, method.info.inverted)
+        templates = Templates(*map(tensors.get, TEMPLATES)) if TEMPLATES[0] in tensors else None
+        if templates is not None and not templates.fits(categories):
+            raise ValueError
+    except ValueError:
+        wrong = "has known codes or templates of other shapes than its categories"
+        raise DamagedFile(path, wrong) from None
+    size = metadata.progress.object_share or MEAN_OBJECT_SIZE
+    return Model(method, config, size, known, templates)
 
 
 @torch.no_grad()
@@ -163,10 +175,10 @@ def reconstruct_guesses(
         return
     progress("camera", 0.0)
     predicted = predict(method, image, outline, options=options.fit)
-    kind, warning = (
-        (category, None) if category else recognize(model, predicted.code[0], options.match)
-    )
     if model.templates is None:
+        kind, warning = (
+            (category, None) if category else recognize(model, model.chances(image), options.match)
+        )
         fitted = fit(method, predicted, outline, progress, options.fit)
         mesh = outer_surface(fitted.vertices, fitted.faces)
         progress("colours", 0.9)
@@ -206,44 +218,38 @@ def match_templates(
     progress("shape", 0.3)
     target = frame_target(*photo)
     outline = target.outline()
-    warning = None if category else recognize(model, predicted.code[0], options.match)[1]
+    chances = model.chances(torch.from_numpy(model.prepare(*photo)), category)
+    likely, warning = recognize(model, chances, options.match)
 
-    def find(predicted: Prediction, level: bool = False, few: bool = False) -> Candidates:
+    def find(
+        predicted: Prediction, chances: Tensor, level: bool = False, few: bool = False
+    ) -> Candidates:
         match = options.match
         if few:
             fewer = {"candidates": match.candidates // 3, "kept": match.kept // 2}
             match = dataclasses.replace(match, **fewer)
         known = model.templates, model.categories
-        bonus = match.kind * _chances(model, predicted.code[0], category)
+        bonus = match.kind * chances[:-1] / chances[:-1].sum().clamp(min=1e-6)
         if category is not None:
             bonus = bonus.log()  # -inf for all others
         return find_candidates(*known, predicted, outline, bonus, level, match)
 
-    found = find(predicted)
+    found = find(predicted, chances)
     best = float(found.views.ious(found.shapes, found.faces, outline).max())
     if warning or best < options.match.poor:
         progress("camera", 0.5)
-        more = [found, find(predicted, level=True, few=True)]
-        for roll_deg in _familiar_rolls(model, predicted, photo, category, options):
+        more = [found, find(predicted, chances, level=True, few=True)]
+        for roll_deg in _familiar_rolls(model, predicted, photo, category, options.match):
             turned = torch.from_numpy(model.prepare(*_turn(*photo, roll_deg)))
             rolled = predict(model.method, turned, outline, roll_deg, options.fit)
-            tried = find(rolled, few=True)
+            tried = find(rolled, model.chances(turned, category), few=True)
             more.append(tried._replace(prior=tried.prior - options.match.rolled))
         found = join(more)
         found = found._replace(prior=options.match.doubted * found.prior)
     progress("surface", 0.7)
     bent = bend_best(found, target, guesses, options.match)
-    return [(fitted, kind, warning) for fitted, kind in bent]
-
-
-def _chances(model: Model, code: Tensor, category: str | None) -> Tensor:
-    """How probably a code [C] is of each category if it is of one, float32 [N]; 1 for a given one."""
-    if category is not None:
-        return torch.tensor([float(name == category) for name in model.categories])
-    if model.known_codes is None:
-        return torch.full((len(model.categories),), 1 / len(model.categories))
-    chances = model.known_codes.probabilities(code)[:-1] + 1e-6
-    return chances / chances.sum()
+    also = f"this may also be of the kind {likely}: tell its kind" if likely else None
+    return [(fitted, kind, warning or (also if kind != likely else None)) for fitted, kind in bent]
 
 
 def _familiar_rolls(
@@ -251,26 +257,23 @@ def _familiar_rolls(
     predicted: Prediction,
     photo: tuple[np.ndarray, np.ndarray],
     category: str | None,
-    options: Options,
+    options: MatchOptions,
 ) -> list[float]:
     """The angles of the camera about its axis at which a picture is more like something that flies, the best first."""
-    flies = torch.tensor([name in options.match.flying for name in model.categories])
+    flies = torch.tensor([name in options.flying for name in model.categories])
     if model.known_codes is None or not flies.any():
         return []
-    rolls = options.match.rolls_deg
-    turned = [model.prepare(*_turn(*photo, roll)) for roll in rolls]
-    codes = model.method.encode(torch.from_numpy(np.stack(turned)))
 
     def distance(code: Tensor) -> float:
         return float(model.known_codes.distances(code)[flies].min())
 
-    order = sorted(
-        (distance(code), roll)
-        for code, roll in zip(codes, rolls, strict=True)
-        if _chances(model, code, category)[flies].sum() > options.match.flies
-    )
+    order = []
+    for roll_deg in options.rolls_deg:
+        turned = torch.from_numpy(model.prepare(*_turn(*photo, roll_deg)))
+        if model.chances(turned, category)[:-1][flies].sum() > options.flies:
+            order.append((distance(model.method.encode(turned[None])[0]), roll_deg))
     upright = distance(predicted.code[0])
-    return [roll for apart, roll in order if apart < upright][: options.match.retries]
+    return [roll for apart, roll in sorted(order) if apart < upright][: options.retries]
 
 
 def _turn(colors: np.ndarray, mask: np.ndarray, roll_deg: float) -> tuple[np.ndarray, np.ndarray]:
@@ -290,16 +293,16 @@ def check_category(model: Model, category: str) -> None:
 
 
 def recognize(
-    model: Model, code: Tensor, options: MatchOptions = DEFAULTS.match
+    model: Model, chances: Tensor, options: MatchOptions = DEFAULTS.match
 ) -> tuple[str | None, str | None]:
-    """Predicted category of a picture's code [C], and a warning if it is that of an unknown kind of object.
+    """Category with the best of `Model.chances`, and a warning if the picture may show another thing.
 
     The category is None if the model has only one.
     """
     if model.known_codes is None:
         return None, None
     kinds = model.categories
-    *of_kinds, other = model.known_codes.probabilities(code).tolist()
+    *of_kinds, other = chances.tolist()
     kind = kinds[int(np.argmax(of_kinds))] if len(kinds) > 1 else None
     if other < options.other:
         return kind, None

@@ -232,25 +232,32 @@ def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> No
     export(finished_run, tmp_path / "small.safetensors")
     model = load_model(tmp_path / "small.safetensors")
     images = load_dataset("kato", tiny_folder, "airplane", "train").batch(torch.arange(20)).images
-    codes = model.method.encode(images)
-    assert all(model.known_codes.probabilities(code).tolist() == [1, 0] for code in codes)
-    assert all(model.known_codes.probabilities(code).tolist() == [0, 1] for code in -codes)
-    assert recognize(model, codes[0]) == (None, None), "it knows only one category"
     other = model._replace(known_codes=KnownCodes(-model.known_codes.kinds))
-    assert recognize(other, codes[0])[1].startswith("this may be none of airplane: tell its kind")
+    assert all(model.chances(image).tolist() == [1, 0] for image in images)
+    assert all(other.chances(image).tolist() == [0, 1] for image in images)
+    assert recognize(model, model.chances(images[0])) == (None, None), "it knows only one category"
+    _, warning = recognize(other, other.chances(images[0]))
+    assert warning.startswith("this may be none of airplane: tell its kind")
 
 
 def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, tmp_path) -> None:
-    torch.manual_seed(0)
-    first, second, other = torch.nn.functional.normalize(
-        torch.eye(3, 16)[:, None] + 0.05 * torch.randn(3, 40, 16), dim=2
-    )
-    codes = torch.cat([first[:20], second[:20], other[:20]])
-    kinds = torch.arange(3).repeat_interleave(20)
-    known = KnownCodes(codes[:40].view(2, 20, -1), *learn_kinds(codes, kinds))
-    for kind, unseen in enumerate((first[20:], second[20:], other[20:])):
-        chances = torch.stack([known.probabilities(7 * code) for code in unseen])
-        assert torch.allclose(chances.sum(1), torch.ones(20)) and (chances[:, kind] > 0.5).all()
+    rng = np.random.default_rng(0)
+    rows, columns = np.ogrid[:64, :64]
+    stored, kinds = [], np.arange(90) % 3
+    for kind in kinds:  # discs, squares and triangles
+        far = [np.hypot(rows - 32, columns - 32), np.maximum(abs(rows - 32), abs(columns - 32))]
+        far.append(abs(columns - 32) + (rows - 10) / 2)
+        inside = 255 * (far[kind] < rng.uniform(15, 25))
+        stored.append(rng.uniform(0, 1, (4, 1, 1)) * inside)
+        stored[-1][3] = inside
+    images, kinds = torch.from_numpy(np.stack(stored).astype(np.uint8)), torch.from_numpy(kinds)
+    judge = learn_kinds(images[:60].repeat(4, 1, 1, 1), kinds[:60].repeat(4), True)
+    known = KnownCodes(torch.ones(2, 1, 512), judge)
+    chances = torch.stack([known.probabilities(image, torch.ones(512)) for image in images[60:]])
+    assert torch.allclose(chances.sum(1), torch.ones(30))
+    assert (chances.argmax(1) == kinds[60:]).float().mean() > 0.9
+    first, again = (learn_kinds(images[:9], kinds[:9], True).state_dict() for _ in range(2))
+    assert all(torch.equal(first[name], again[name]) for name in first), "bit-identical"
     model = load_model(finished_run)
     with pytest.raises(ValueError, match="no PNG file in"):
         cut_out_pictures(model, tmp_path)
@@ -260,7 +267,7 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
     )
     export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
     known = load_model(tmp_path / "small.safetensors").known_codes
-    assert known.output.shape == (2, len(known.hidden) + 1) == (2, 2 * 64 + 1)
+    assert known.judge.layers[-1].out_features == 2
 
 
 def test_a_picture_is_taken_for_the_nearest_kind(finished_run, tiny_folder) -> None:
@@ -269,7 +276,8 @@ def test_a_picture_is_taken_for_the_nearest_kind(finished_run, tiny_folder) -> N
     kinds = np.arange(dataset.num_objects)  # each object one kind
     dataset = dataclasses.replace(dataset, class_ids=kinds, class_names=tuple("abc"))
     known = known_codes(method, dataset)
-    assert len(known.kinds) == 3 and known.hidden is None
+    assert len(known.kinds) == 3 and known.judge is None
     batch = dataset.batch(torch.arange(len(dataset)))
-    found = [int(known.probabilities(code).argmax()) for code in method.encode(batch.images)]
+    pairs = zip(batch.images, method.encode(batch.images), strict=True)
+    found = [int(known.probabilities(*pair).argmax()) for pair in pairs]
     assert np.mean(np.equal(found, batch.class_ids.numpy())) > 0.9

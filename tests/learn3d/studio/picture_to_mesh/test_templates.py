@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import io
 import json
@@ -95,11 +96,15 @@ def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model)
     assert torch.allclose(
         made.surface.colors.mean(0), torch.tensor([0.15, 0.38, 0.23]), atol=0.08
     ), "the picture's"
-    unknown = model.known_codes._replace(output=model.known_codes.output.clone())
-    unknown.output[-1, -1] += 100
+    unknown = model.known_codes._replace(judge=copy.deepcopy(model.known_codes.judge))
+    unknown.judge.layers[-1].bias[-1] += 100
     doubted = reconstruct_picture(model._replace(known_codes=unknown), *shown)
     assert "none of airplane, car, chair" in doubted.warning
     assert doubted.kind == "chair" and bodies(doubted.surface) >= 3, "the mesh comes first"
+    unknown.judge.layers[-1].bias[-2] += 200
+    blind = dataclasses.replace(DEFAULTS, match=dataclasses.replace(DEFAULTS.match, kind=0.0))
+    doubted = reconstruct_picture(model._replace(known_codes=unknown), *shown, options=blind)
+    assert doubted.kind == "chair" and "may also be of the kind table" in doubted.warning
 
 
 def test_templates_have_no_boxes_on_their_roofs() -> None:
