@@ -21,6 +21,7 @@ IMAGES = 4000  # training images whose codes are clustered
 FAR = 0.82  # distance above which a picture is unknown if no other objects were learnt
 CENTRES_NAME, JUDGE_PREFIX = "known_codes", "judge."  # names of the tensors in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
+_DISTANCE = 5.0  # weight of a category's distance, beside that of its logit
 _BATCH = 96  # images in a step
 _EPOCHS = 20  # how often all images are seen, on average
 _RATE = 2e-3  # largest learning rate
@@ -72,7 +73,10 @@ class KnownCodes(NamedTuple):
             kind = len(self.kinds) if far else int(self.distances(code).argmin())
             return F.one_hot(torch.tensor(kind), len(self.kinds) + 1).float()
         pixels = _pixels(image[None])
-        return self.judge(torch.cat([pixels, pixels.flip(3)])).mean(0).softmax(0)
+        logits = self.judge(torch.cat([pixels, pixels.flip(3)])).mean(0)
+        apart = self.distances(code)  # the codes know renderings better, the network drawings
+        logits[:-1] -= _DISTANCE * (apart - apart.min())
+        return logits.softmax(0)
 
     def distances(self, code: Tensor) -> Tensor:
         """The distance of a code [C] to each category, [N]."""

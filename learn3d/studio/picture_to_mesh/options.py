@@ -135,9 +135,9 @@ class MatchOptions:
     """Weight of the IoU with the predicted shape; that of the outline is 1."""
     nearness: float = 0.5
     """Weight of the codes' cosine and of the bonus below."""
-    other: float = 0.45
+    other: float = 0.5
     """Probability of other things from which a picture is doubted."""
-    kind: float = 0.8
+    kind: float = 0.4
     """Bonus to the cosine for the templates of a category that is certain."""
     edges: float = 0.15
     """Weight of the distance of two outlines in pixels of 64."""
