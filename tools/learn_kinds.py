@@ -33,11 +33,13 @@ from learn3d.studio.make_data.meshes import fit_to_box
 from learn3d.studio.picture_to_mesh.familiarity import learn_kinds
 from learn3d.studio.picture_to_mesh.fit import frame_view
 from learn3d.studio.picture_to_mesh.make import SMALL_MODEL, load_model
+from learn3d.studio.picture_to_mesh.options import CutOptions
 from learn3d.studio.picture_to_mesh.read import fill_drawing, prepare_image
 from learn3d.studio.shapes import make_shape
 
 SEED = 78
 SIDE = 96  # side in pixels of the pictures before they are varied
+CUT = CutOptions(gap=0.015)  # narrow, so that drawings keep their parts
 EMOJI = {
     "noto": "1.2.9",
     "twemoji": "1.2.5",
@@ -206,7 +208,7 @@ def main(path: Path = SMALL_MODEL, objects: int = 400, others: int = 240) -> Non
     names = (*model.categories, "other")
 
     def store(picture: Picture) -> np.ndarray:
-        return prepare_image(*fill_drawing(*picture), size=SIDE, object_size=0.8)
+        return prepare_image(*fill_drawing(*picture, CUT), size=SIDE, object_size=0.8)
 
     drawn = {name: [] for name in names}
     for package, version in (EMOJI | SIGNS).items():
