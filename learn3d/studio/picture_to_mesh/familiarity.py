@@ -1,4 +1,4 @@
-"""Predicts the category of a picture, and whether it is an unknown object, by comparing its code with known ones."""
+"""Predicts the category of a picture, and whether it is an unknown object: by a network, and by known codes."""
 
 from __future__ import annotations
 
