@@ -113,7 +113,7 @@ class MatchOptions:
 
     candidates: int = 80
     """Templates with the nearest codes, which are made and compared with the picture."""
-    kept: int = 16
+    kept: int = 32
     """Best of them, which are stretched."""
     bent: int = 8
     """Best of these, which are bent and then ranked."""
