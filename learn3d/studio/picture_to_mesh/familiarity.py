@@ -18,10 +18,10 @@ from learn3d.runs import checkpoint
 
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
-FAR = 0.82  # distance above which a picture is unknown if no other objects were learnt
+FAR = 0.82  # distance of other things: above it a picture is unknown if none were learnt
 CENTRES_NAME, JUDGE_PREFIX = "known_codes", "judge."  # names of the tensors in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
-_DISTANCE = 5.0  # weight of a category's distance, beside that of its logit
+_DISTANCE = 4.0  # weight of the distance, beside the logit
 _BATCH = 96  # images in a step
 _EPOCHS = 20  # how often all images are seen, on average
 _RATE = 2e-3  # largest learning rate
@@ -74,9 +74,9 @@ class KnownCodes(NamedTuple):
             return F.one_hot(torch.tensor(kind), len(self.kinds) + 1).float()
         pixels = _pixels(image[None])
         logits = self.judge(torch.cat([pixels, pixels.flip(3)])).mean(0)
-        apart = self.distances(code)  # the codes know renderings better, the network drawings
-        logits[:-1] -= _DISTANCE * (apart - apart.min())
-        return logits.softmax(0)
+        # the codes know renderings better, the network drawings
+        apart = torch.cat([self.distances(code), torch.tensor([FAR])])
+        return (logits - _DISTANCE * apart).softmax(0)
 
     def distances(self, code: Tensor) -> Tensor:
         """The distance of a code [C] to each category, [N]."""

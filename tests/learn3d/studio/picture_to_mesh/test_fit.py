@@ -21,7 +21,7 @@ from learn3d.networks.encoders import centre
 from learn3d.presets import PRESETS
 from learn3d.studio.picture_to_mesh.coloring import _alike, color_mesh
 from learn3d.studio.picture_to_mesh.export import export
-from learn3d.studio.picture_to_mesh.familiarity import KnownCodes, known_codes, learn_kinds
+from learn3d.studio.picture_to_mesh.familiarity import FAR, KnownCodes, known_codes, learn_kinds
 from learn3d.studio.picture_to_mesh.fit import (
     AZIMUTHS,
     CENTRED_SIZE,
@@ -252,7 +252,7 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
         stored[-1][3] = inside
     images, kinds = torch.from_numpy(np.stack(stored).astype(np.uint8)), torch.from_numpy(kinds)
     judge = learn_kinds(images[:60].repeat(4, 1, 1, 1), kinds[:60].repeat(4), True)
-    known = KnownCodes(torch.ones(2, 1, 512), judge)
+    known = KnownCodes(torch.full((2, 1, 512), (1 - FAR) / 512**0.5), judge)  # no kind is nearer
     chances = torch.stack([known.probabilities(image, torch.ones(512)) for image in images[60:]])
     assert torch.allclose(chances.sum(1), torch.ones(30))
     assert (chances.argmax(1) == kinds[60:]).float().mean() > 0.9
