@@ -240,7 +240,9 @@ def test_unknown_things_are_warned_of(finished_run, tiny_folder, tmp_path) -> No
     assert warning.startswith("this may be none of airplane: tell its kind")
 
 
-def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, tmp_path) -> None:
+def test_pictures_of_other_things_teach_what_to_warn_of(
+    finished_run, tiny_set, tmp_path, capsys
+) -> None:
     rng = np.random.default_rng(0)
     rows, columns = np.ogrid[:64, :64]
     stored, kinds = [], np.arange(90) % 3
@@ -266,6 +268,7 @@ def test_pictures_of_other_things_teach_what_to_warn_of(finished_run, tiny_set, 
         tmp_path / "other.png"
     )
     export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
+    assert "learning other things from 1 pictures" in capsys.readouterr().err
     known = load_model(tmp_path / "small.safetensors").known_codes
     assert known.judge.layers[-1].out_features == 2
 
