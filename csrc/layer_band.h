@@ -9,7 +9,7 @@
 
 namespace nmr {
 
-// The lists of the rows first, ..., last - 1 (from the bottom) of one image.
+// The faces of each pixel in the rows first to last - 1 of one image, counted from the bottom.
 template <class T>
 struct LayerBand {
   RasterSettings<T> settings;

@@ -13,7 +13,7 @@
 
 namespace nmr {
 
-// The gradient of one camera, summed over vertices. Numbers are double, or kGroup partial sums.
+// The gradient of one camera, summed over vertices. Number: double, or a group of partial sums.
 template <class Number>
 struct LensGradient {
   Number matrix[12], intrinsics[6], distortion[kMostCoefficients];

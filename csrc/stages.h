@@ -23,12 +23,13 @@ inline Size raster_of(Size image, bool anti_aliasing) {
   return anti_aliasing ? Size{2 * image.height, 2 * image.width} : image;
 }
 
-// The rows of an array that belong to the images: [B, N, ...], [N, ...] for all images, or packed.
+// Which rows of an array belong to which image. Arrays are [B, N, ...], [N, ...] if all images
+// share the rows, or packed: the rows of all images in turn.
 struct Rows {
   int64_t size;  // N; packed: rows of all images
   bool each;     // every image has its own
-  const int64_t*
-      starts;  // packed: first row of each image at every second place, then N; or nullptr
+  // packed: the first row of each image at every second place, then N; else nullptr
+  const int64_t* starts;
 
   int64_t first(int64_t b) const { return starts ? starts[2 * b] : each ? b * size : 0; }
   int64_t count(int64_t b) const { return starts ? starts[2 * b + 2] - starts[2 * b] : size; }

@@ -1,4 +1,4 @@
-"""Measures how much meshes look like the pictures of which they are made.
+"""Measures how much meshes look like their pictures.
 
 python tools/measure_likeness.py --pictures strangers/report --sheet likeness.png
 """

@@ -573,6 +573,7 @@ def test_an_upstream_gradient_that_is_not_finite_is_seen_in_its_image_alone(name
         reached = any(x.any() for x in healthy)
         assert not reached or not all(x.isfinite().all() for x in spoiled)
         for x, a, b in zip(behind, healthy, spoiled, strict=True):
+            # a tensor of equal items has one for each image
             assert len(same(x)) == len(x) or torch.equal(a[1], b[1])
 
 

@@ -122,7 +122,7 @@ def _contour(target: Target, options: ColorOptions) -> np.ndarray:
     pixels, depth = target.pixels[:3].numpy(), distance_transform_edt(target.pixels[3] > 0.5)
     rim, core = (depth > 1) & (depth <= 3), depth > options.contour
     if not (rim.any() and core.any()):
-        return core & rim
+        return np.zeros_like(core)
     alike = np.abs(pixels - np.median(pixels[:, rim], 1)[:, None, None]).max(0) < options.even
     drawn = alike[rim].mean() > 1 - options.others and alike[core].mean() < options.others
     return alike & (depth > 0) & ~core & drawn

@@ -48,7 +48,7 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
     elif isinstance(method, MeshMethod):
         dataset = checkpoint.load_data(config, "train")
         if others is not None:
-            note(f"learning other things from {len(others)} pictures, for some minutes")
+            note(f"learning other things ({len(others)} pictures) takes some minutes")
         tensors |= known_codes(method, dataset, others).tensors()
         if (templates := learn_templates(method, dataset)) is not None:
             tensors |= dict(zip(TEMPLATES, templates, strict=True))

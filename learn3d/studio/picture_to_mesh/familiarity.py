@@ -18,7 +18,7 @@ from learn3d.runs import checkpoint
 
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
-FAR = 0.82  # distance of other things: above it a picture is unknown if none were learnt
+FAR = 0.82  # distance from all kinds at which a picture counts as another thing
 CENTRES_NAME, JUDGE_PREFIX = "known_codes", "judge."  # names of the tensors in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
 _DISTANCE = 4.0  # weight of the distance, beside the logit

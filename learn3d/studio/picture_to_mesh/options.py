@@ -179,13 +179,13 @@ class ColorOptions:
     """Width in pixels of the border inside the outline that may have the background's colours. Its
     inner pixels count half, as thin legs have no others."""
     contour: float = 24.0
-    """Widest line along the outline of a drawing, in pixels of 256."""
+    """Width of the widest line that a drawing may have along its outline, in pixels of a picture of 256."""
     even: float = 0.15
-    """Largest difference of its pixels from its colour, in 0 .. 1."""
+    """Pixels belong to this line if they differ from its colour by less, in 0 .. 1."""
     others: float = 0.3
-    """Largest share of other colours in it, and of its colour deeper inside."""
+    """There is such a line if fewer pixels along the outline have another colour, and fewer inside have its."""
     drawn: float = 0.2
-    """Reliability of its colour: parts that show another one spread that to what is hidden."""
+    """Weight of pixels of this line, beside 1 of others, when hidden parts get colours."""
     coarse: float = 0.05
     """Longest edge of the mesh on which the colours of hidden parts are found."""
     fine: float = 0.025

@@ -188,7 +188,7 @@ def test_the_line_around_a_drawing_stays_where_it_is_seen() -> None:
     surface = color_mesh((vertices, faces), view, Target(pixels), fine=True)
     red, (x, y, z) = surface.colors[:, 0], surface.vertices.T
     back, front = z > 0.09, z < -0.09
-    assert red[back].min() > 0.6, "no line where none was seen"
+    assert red[back].min() > 0.6, "hidden parts have no line"
     side = front & (y.abs() < 0.2)
     assert red[side & ((x - 0.37).abs() < 0.015)].mean() < 0.4, "the line"
     assert red[side & (x.abs() < 0.3)].mean() > 0.6
@@ -268,7 +268,7 @@ def test_pictures_of_other_things_teach_what_to_warn_of(
         tmp_path / "other.png"
     )
     export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
-    assert "learning other things from 1 pictures" in capsys.readouterr().err
+    assert "learning other things (1 pictures)" in capsys.readouterr().err
     known = load_model(tmp_path / "small.safetensors").known_codes
     assert known.judge.layers[-1].out_features == 2
 
