@@ -65,17 +65,20 @@ NOT_THEM = (
 )
 
 
+def load_package(name: str, version: str, folder: Path) -> Path:
+    """The file of a package of npm, loaded into a folder."""
+    command = ["npm", "pack", "--silent", f"{name}@{version}"]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    (path,) = folder.glob("*.tgz")
+    return path
+
+
 def read_set(package: str, version: str, folder: Path) -> dict[str, bytes]:
     """The drawings of a package by their names, SVG or PNG files; the package is loaded into a folder."""
-    version = f"{package}@{version}"
-    subprocess.run(
-        ["npm", "pack", "--silent", version], cwd=folder, check=True, capture_output=True
-    )
-    (path,) = folder.glob("*.tgz")
-    with tarfile.open(path) as packed:
+    with tarfile.open(load_package(package, version, folder)) as packed:
         if package.startswith("@iconify-json"):
             icons = json.load(packed.extractfile("package/icons.json"))
-            return {name: _svg(icons | icon) for name, icon in icons["icons"].items()}
+            return {name: icon_svg(icons | icon) for name, icon in icons["icons"].items()}
         place = re.compile(
             r"package/(images/[a-z]+|demo/src/catalog/items/[a-z-]+)/[a-z_A-Z-]+\.(svg|png)"
         )
@@ -85,7 +88,8 @@ def read_set(package: str, version: str, folder: Path) -> dict[str, bytes]:
         }
 
 
-def _svg(icon: dict) -> bytes:
+def icon_svg(icon: dict) -> bytes:
+    """The SVG file of an icon of iconify."""
     size = icon.get("width", 16), icon.get("height", 16)
     spaces = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
     return f'<svg {spaces} viewBox="0 0 {size[0]} {size[1]}">{icon["body"]}</svg>'.encode()

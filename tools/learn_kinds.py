@@ -8,7 +8,9 @@ same command gives the same file on the same machine. It needs npm, and a core f
 """
 
 import io
+import json
 import re
+import tarfile
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +20,7 @@ import resvg_py
 import torch
 import torch.nn.functional as F
 import tyro
-from draw_strangers import read_set
+from draw_strangers import icon_svg, load_package
 from PIL import Image
 from scipy import ndimage
 from torch import Tensor
@@ -33,65 +35,41 @@ from learn3d.studio.make_data.meshes import fit_to_box
 from learn3d.studio.picture_to_mesh.familiarity import learn_kinds
 from learn3d.studio.picture_to_mesh.fit import frame_view
 from learn3d.studio.picture_to_mesh.make import SMALL_MODEL, load_model
-from learn3d.studio.picture_to_mesh.options import CutOptions
 from learn3d.studio.picture_to_mesh.read import fill_drawing, prepare_image
 from learn3d.studio.shapes import make_shape
 
 SEED = 78
 SIDE = 96  # side in pixels of the pictures before they are varied
-CUT = CutOptions(gap=0.015)  # narrow, so that drawings keep their parts
-EMOJI = {
-    "noto": "1.2.9",
-    "twemoji": "1.2.5",
-    "openmoji": "1.2.29",
-    "fluent-emoji-flat": "1.2.6",
-    "fxemoji": "1.2.2",
-    "fluent-emoji-high-contrast": "1.2.6",
-    "streamline-emojis": "1.2.4",
-}
-SIGNS = {
-    "fa6-solid": "1.2.4",
-    "mingcute": "1.2.8",
-    "ion": "1.2.7",
-    "tabler": "1.2.41",
-    "fluent": "1.2.60",
-    "ri": "1.2.10",
-    "bxs": "1.2.3",
-    "streamline": "1.2.5",
-    "streamline-flex": "1.2.3",
-    "streamline-plump": "1.2.0",
-    "streamline-freehand-color": "1.2.2",
-    "hugeicons": "1.2.35",
-    "lucide": "1.2.137",
-    "healthicons": "1.2.13",
-    "bi": "1.2.7",
-    "carbon": "1.2.29",
-    "temaki": "1.2.6",
-    "maki": "1.2.5",
-    "fluent-mdl2": "1.2.1",
-    "uil": "1.2.3",
-    "clarity": "1.2.4",
-    "guidance": "1.2.2",
-    "vaadin": "1.2.1",
-    "f7": "1.2.2",
-    "material-symbols": "1.2.98",
-}
+PACKAGE = "@iconify/json", "2.2.535"  # of npm, with all icon sets
+EMOJI = (
+    "noto twemoji openmoji fluent-emoji-flat fluent-emoji fxemoji fluent-emoji-high-contrast streamline-emojis"
+).split()
+SIGNS = (
+    "fa6-solid mingcute ion tabler fluent ri bxs streamline streamline-flex streamline-plump "
+    "streamline-freehand-color hugeicons lucide healthicons bi carbon temaki maki fluent-mdl2 uil clarity guidance "
+    "vaadin f7 material-symbols at-icons bitcoin-icons boxicons cil flat-ui glyphs glyphs-poly griddy-icons "
+    "ic iconmind iconoir keyline-icons la lucide-lab mage majesticons marketeq mynaui picon pinhead "
+    "pixelarticons reicon si-glyph streamline-color streamline-cyber streamline-cyber-color streamline-flex-color "
+    "streamline-plump-color streamline-sharp streamline-sharp-color vs whh wpf"
+).split()
 STYLES = (
-    "(-(fill|filled|solid|(outline-)?sharp|line|outline|remix|(20|24|32|48)-(filled|regular)))?"
+    "(-(fill|filled|solid|line|outline|sharp|remix|flat|duotone|duo|two-tone|bold|regular|thin|light|rounded|alt|"
+    "[0-9]+))*"
 )
 NAMES = {
-    "airplane": "((small|ios|md|airport|(northeast|up)-pointing(-small|-military)?)-)?(air)?plane"
-    "(-0?[12]|-alt|-private|-sea|-tilt|-fly|-up|-engines|-(arrival|departure|landing|takeoff)(-01)?)?|"
-    "(md-)?jet|jet-fighter(-up)?|fighter-jet",
-    "car": "((oncoming|police|racing|ios|md|vehicle|oncoming-police)-)?(car|automobile|taxi|cab)"
-    "(-0?[1-5]|-side|-rear|-sport|-front|-taxi-front|-taxi-1|-alt|-sideview|-suv|-profile(-ltr)?)?|"
-    "sport-utility-vehicle|jeep",
-    "chair": "(arm|office-|rocking-)?chair(-0?[1-5]|-alt|-counter|-director)?|seat|stool|armchair-2",
-    "lamp": "((table|desk|study|wall|floor|ceiling)-)?lamp"
-    "(-0?[1-5]|-alt|-ceiling|-desk|-floor|-wall-(up|down))?",
-    "sofa": "(sofa|couch)(-0?[123]|-single|-and-lamp)?",
-    "table": "((workspace|computer|study|office)-)?desk(-0?[123])?|"
-    "(dining|dressing|restaurant|picnic|bedside|coffee)-table(-0?[123])?|table-(restaurant|round|bar)",
+    "airplane": "((small|ios|md|airport|jet|transportation|(northeast|up)-pointing(-small|-military)?)-)?(air)?plane"
+    "(-(private|sea|tilt|fly|up|engines|side|right|arrival|departure|landing|takeoff))?|"
+    "aeroplane|aircraft|(md-)?jet|jet-fighter(-up)?|fighter-jet",
+    "car": "((oncoming|police|racing|race|ios|md|vehicle|oncoming-police|electric|hybrid|toy|"
+    "baseline-(directions|local))-)?(car|automobile|taxi|cab)"
+    "(-(side|rear|sport|front|taxi|taxi-front|sideview|suv|profile|profile-ltr|electric))?|sport-utility-vehicle|jeep",
+    "chair": "((baseline|office|rocking|dining|garden|camping|director|sleeper|club)-)?(arm)?chair"
+    "(-(counter|director))?|seat|((bar|health)-)?stool",
+    "lamp": "((table|desk|study|wall|floor|ceiling|small|street|pole)-)?lamp"
+    "(-(ceiling|desk|floor|wall-up|wall-down|round|arm))?",
+    "sofa": "(two-seater-)?(sofa|couch)(-(single|and-lamp))?|loveseat",
+    "table": "((baseline|workspace|computer|study|office|home|school)-)?desk|"
+    "(dining|picnic|coffee)-table|(baseline-)?table-(restaurant|round|bar)",
 }
 # names of people, signs, and of things that are nearly of a known kind
 SKIPPED = (
@@ -104,8 +82,12 @@ SKIPPED = (
 Picture = tuple[np.ndarray, np.ndarray]  # colours uint8 [H, W, 3] and mask uint8 [H, W]
 
 
-def draw_styled(category: str, rng: np.random.Generator) -> Picture:
-    """A generated object as a rendering, a flat drawing, one with ink lines, or a silhouette with gaps."""
+def draw_styled(category: str, rng: np.random.Generator, plain: bool) -> Picture:
+    """A generated object as a rendering, a flat drawing, one with ink lines, or a silhouette with gaps.
+
+    plain: as a rendering.
+    """
+    shares = (1, 0, 0, 0) if plain else (0.25, 0.25, 0.3, 0.2)
     mesh = make_shape(category, rng)
     vertices = torch.tensor(fit_to_box(mesh.vertices) @ mesh_to_object("y", "z").T).float()
     faces = torch.tensor(np.asarray(mesh.faces))
@@ -115,7 +97,7 @@ def draw_styled(category: str, rng: np.random.Generator) -> Picture:
     angles = (torch.tensor([float(value)]) for value in (azimuth, elevation))
     view = frame_view(vertices, *angles)
     placed, camera = view.place(vertices[None])[0], view.cameras()
-    style = rng.choice(["rendering", "flat", "ink", "gaps"], p=[0.25, 0.25, 0.3, 0.2])
+    style = rng.choice(["rendering", "flat", "ink", "gaps"], p=shares)
     colors, lights = natural_look(vertices.numpy(), mesh.faces, rng)
     if style != "rendering":
         lights = studio_lights((0.3, 1.0, 0.2), rng.uniform(0.75, 1.0))
@@ -136,10 +118,17 @@ def draw_styled(category: str, rng: np.random.Generator) -> Picture:
     return np.ascontiguousarray(rgb), keep_object(alpha)[0]
 
 
-def icons(package: str, version: str, others: int) -> Iterator[tuple[str, Picture]]:
-    """Kinds, "other" among them, and the icons of a set that are of a known kind, and `others` at random."""
+def read_sets() -> Iterator[tuple[str, dict[str, bytes]]]:
+    """The names of `EMOJI` and `SIGNS`, each with its drawings, SVG files by name."""
     with tempfile.TemporaryDirectory() as folder:
-        drawings = read_set(f"@iconify-json/{package}", version, Path(folder))
+        with tarfile.open(load_package(*PACKAGE, Path(folder))) as packed:
+            for name in (*EMOJI, *SIGNS):
+                icons = json.load(packed.extractfile(f"package/json/{name}.json"))
+                yield name, {key: icon_svg(icons | icon) for key, icon in icons["icons"].items()}
+
+
+def choose_icons(drawings: dict[str, bytes], others: int) -> Iterator[tuple[str, Picture]]:
+    """Kinds, "other" among them, and the icons of a set that are of a known kind, and `others` at random."""
     kinds = {}
     for name in sorted(drawings):
         for kind, wanted in NAMES.items():
@@ -197,35 +186,37 @@ def vary(images: Tensor, kinds: Tensor, rng: np.random.Generator) -> Tensor:
     return torch.cat([(1 - colors.clamp(0, 1)) * masks, masks], 1)
 
 
-def main(path: Path = SMALL_MODEL, objects: int = 400, others: int = 240) -> None:
+def main(path: Path = SMALL_MODEL, objects: int = 400, icons: int = 400, others: int = 240) -> None:
     """Learn the network of `KnownCodes` for an exported model of renderings, and write the model again.
 
-    path: the model's file. objects: generated ones of each kind, and as many icons, some of them
-    several times. others: icons of other things of each set of emoji; other sets give a third.
+    path: the model's file. objects: generated ones of each kind in all styles, and as many plain
+    renderings. icons: fewest of each kind, some of them several times. others: icons of other
+    things of each set of emoji; other sets give a quarter.
     """
     torch.set_num_threads(1)
     model = load_model(path)
     names = (*model.categories, "other")
 
     def store(picture: Picture) -> np.ndarray:
-        return prepare_image(*fill_drawing(*picture, CUT), size=SIDE, object_size=0.8)
+        return prepare_image(*fill_drawing(*picture), size=SIDE, object_size=0.8)
 
     drawn = {name: [] for name in names}
-    for package, version in (EMOJI | SIGNS).items():
-        for kind, picture in icons(package, version, others if package in EMOJI else others // 3):
+    for package, drawings in read_sets():
+        for kind, picture in choose_icons(drawings, others if package in EMOJI else others // 4):
             drawn[kind].append(store(picture))
     images, kinds = [], []
     for kind, name in enumerate(names):
         found = drawn[name]
         print(f"{name}: {len(found)} icons", flush=True)
         if name != "other":
-            found = [found[k % len(found)] for k in range(objects)]
-            seeds = ([SEED, kind, number] for number in range(objects))
-            found += [store(draw_styled(name, np.random.default_rng(seed))) for seed in seeds]
+            found = [found[k % len(found)] for k in range(max(icons, len(found)))]
+            for plain in (False, True):
+                seeds = ([SEED, kind, number, *[1] * plain] for number in range(objects))
+                rngs = map(np.random.default_rng, seeds)
+                found += [store(draw_styled(name, rng, plain)) for rng in rngs]
         images += found
         kinds += [kind] * len(found)
-    stored = torch.from_numpy(np.stack(images))
-    judge = learn_kinds(stored, torch.tensor(kinds), True, vary)
+    judge = learn_kinds(torch.from_numpy(np.stack(images)), torch.tensor(kinds), True, vary)
     tensors, metadata = checkpoint.load(path)
     learnt = model.known_codes._replace(judge=judge.half()).tensors()
     checkpoint.save(path, tensors | learnt, metadata)

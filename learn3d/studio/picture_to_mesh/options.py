@@ -52,7 +52,7 @@ class CutOptions:
     ragged: float = 600.0
     """Squared length of an outline over its area from which it is doubtful; a thin-legged chair has
     200."""
-    sure: float = 0.86
+    sure: float = 0.84
     """Least sureness of a mask, see `cut_out`; less is a doubt."""
     possible: float = 0.15
     """Least probability of pixels that may belong to the same thing."""
@@ -135,7 +135,7 @@ class MatchOptions:
     """Weight of the IoU with the predicted shape; that of the outline is 1."""
     nearness: float = 0.5
     """Weight of the codes' cosine and of the bonus below."""
-    other: float = 0.5
+    other: float = 0.6
     """Probability of other things from which a picture is doubted."""
     kind: float = 0.4
     """Bonus to the cosine for the templates of a category that is certain."""
