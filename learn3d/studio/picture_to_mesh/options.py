@@ -52,7 +52,7 @@ class CutOptions:
     ragged: float = 600.0
     """Squared length of an outline over its area from which it is doubtful; a thin-legged chair has
     200."""
-    sure: float = 0.84
+    sure: float = 0.86
     """Least sureness of a mask, see `cut_out`; less is a doubt."""
     possible: float = 0.15
     """Least probability of pixels that may belong to the same thing."""
