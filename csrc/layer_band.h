@@ -9,7 +9,8 @@
 
 namespace nmr {
 
-// The faces of each pixel in the rows first to last - 1 of one image, counted from the bottom.
+// For some rows of one image, the nearest faces of each pixel. The rows are first to last - 1,
+// where row 0 is the lowest of the image.
 template <class T>
 struct LayerBand {
   RasterSettings<T> settings;

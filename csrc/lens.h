@@ -13,7 +13,8 @@
 
 namespace nmr {
 
-// The gradient of one camera, summed over vertices. Number: double, or a group of partial sums.
+// The gradient of one camera, summed over its vertices. While it is summed, Number is a vector of
+// partial sums; the result has Number = double.
 template <class Number>
 struct LensGradient {
   Number matrix[12], intrinsics[6], distortion[kMostCoefficients];

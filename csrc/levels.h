@@ -13,8 +13,8 @@
 // of every processor, because functions of a level are local to their file, and those of the
 // library are not. Levels above `base` exist for x86-64 with GCC 12 or later and glibc, if
 // NMR_MULTIVERSION is defined. Level v4 (AVX-512) exists if NMR_LEVEL_V4 is defined first: plain
-// loops are faster with it, code written with lanes is 5 % slower on Intel. NMR_CPU_LEVEL=base or
-// v3 in the environment keeps a process at that level; results do not depend on it.
+// loops are faster with it, code written with lanes is 5 % slower on Intel. The environment
+// variable NMR_CPU_LEVEL (base or v3) chooses a lower level; results are the same at all levels.
 #define NMR_LEVEL base
 #include NMR_LEVEL_FILE
 #undef NMR_LEVEL

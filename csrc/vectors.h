@@ -21,8 +21,9 @@ NMR_INLINE void add3(T* p, const Vec3<T>& v) {
   for (int k = 0; k < 3; ++k) p[k] += v[k];
 }
 
-// The gradient of v from `grad`, that of v / length. A length above `shortest` is |v|. Another one
-// is a constant: `shortest`, or 0 if v has no direction, and then the gradient is 0.
+// The gradient of v, where unit = v / length and `grad` is the gradient of unit. If |v| is above
+// `shortest`, length is |v|. If not, length does not depend on v: it is `shortest`, and with a
+// `shortest` of 0 the gradient is 0.
 template <class T>
 NMR_INLINE Vec3<T> unit_backward(const Vec3<T>& unit, T length, T shortest, const Vec3<T>& grad) {
   if (length > shortest) return (grad - unit * unit.dot(grad)) / length;

@@ -119,7 +119,7 @@ def draw_styled(category: str, rng: np.random.Generator, plain: bool) -> Picture
 
 
 def read_sets() -> Iterator[tuple[str, dict[str, bytes]]]:
-    """The names of `EMOJI` and `SIGNS`, each with its drawings, SVG files by name."""
+    """Each icon set of `EMOJI` and `SIGNS`: its name, and its icons by name, as SVG files."""
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(load_package(*PACKAGE, Path(folder))) as packed:
             for name in (*EMOJI, *SIGNS):

@@ -1,4 +1,4 @@
-"""What fits the processor: the precision, and one thread or all by the time of the steps."""
+"""What fits the processor: the precision, the layout of images, and one thread or all by the time of the steps."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from steps import make_method
 
 from learn3d import device
 from learn3d.device import TRIAL, ThreadTuner, resolve_precision
@@ -106,3 +107,14 @@ def test_auto_precision_follows_the_cpu(monkeypatch, tmp_path, vendor, flags, wa
     assert resolve_precision("fp32", "cpu") == "fp32"
     monkeypatch.setattr(device, "CPUINFO", str(tmp_path / "missing"))
     assert resolve_precision("auto", "cpu") == "fp32"
+
+
+@pytest.mark.parametrize(
+    ("capability", "layout"),
+    [("AVX512", torch.channels_last), ("AVX2", torch.contiguous_format)],
+)
+def test_convolutions_in_fp32_have_the_faster_layout(monkeypatch, capability, layout) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    method = make_method("peng2020-kato")
+    assert method.memory_format is layout
+    assert method.encoder.convolutions[0].weight.is_contiguous(memory_format=layout)

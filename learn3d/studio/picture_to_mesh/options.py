@@ -181,9 +181,10 @@ class ColorOptions:
     contour: float = 24.0
     """Width of the widest line that a drawing may have along its outline, in pixels of a picture of 256."""
     even: float = 0.15
-    """Pixels belong to this line if they differ from its colour by less, in 0 .. 1."""
+    """A pixel belongs to this line if no channel differs more from the line's colour, in 0 .. 1."""
     others: float = 0.3
-    """There is such a line if fewer pixels along the outline have another colour, and fewer inside have its."""
+    """A drawing has such a line if at most this share of the pixels along its outline have another
+    colour, and at most this share of the pixels deeper inside have the line's colour."""
     drawn: float = 0.2
     """Weight of pixels of this line, beside 1 of others, when hidden parts get colours."""
     coarse: float = 0.05
