@@ -1,6 +1,7 @@
 """Composes photographs of cut-out objects, for training (train_outlines.py) and measuring (measure_cutouts.py)."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from learn3d.studio.make_data.meshes import fit_to_box
 RADIUS = 0.87  # of the sphere around an object that fits the unit cube
 
 Box = tuple[float, float, float, float]  # left, top, width, height in pixels
+Surroundings = Literal["photograph", "room", "plain room"]
 
 
 def draw_object(
@@ -64,14 +66,17 @@ class Composer:
         sprite: np.ndarray,
         box: Box,
         size: tuple[int, int],
-        room: bool,
+        around: Surroundings,
     ) -> tuple[np.ndarray, np.ndarray]:
         """The photograph uint8 [H, W, 3] of a cut-out RGBA [h, w, 4], and its alpha, float32 [H, W] in 0 .. 1.
 
         box: its place, which may reach out of the photograph. size: W, H.
         """
         left, top, wide, tall = box
-        scene = self._room(rng, *size, top + tall) if room else self.part(rng, *size)
+        if around == "photograph":
+            scene = self.part(rng, *size)
+        else:
+            scene = self._room(rng, *size, top + tall, around == "plain room")
         if rng.random() < 0.1:  # a background with the colour of the object
             own = sprite[sprite[..., 3] > 127][:, :3]
             scene += rng.uniform(0.6, 1) * (own.mean(0) - scene.mean((0, 1)))
@@ -97,9 +102,11 @@ class Composer:
             found = cv2.GaussianBlur(found, (0, 0), rng.choice([0.4, 0.7, 1.5, 4]))
         return np.float32(found * rng.uniform(0.6, 1.15) * rng.uniform(0.85, 1.1, 3))
 
-    def _surface(self, rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-        """A wall, a floor or a board: a part of a picture, or paint with noise, stripes or checks."""
-        if rng.random() < 0.4:
+    def _surface(
+        self, rng: np.random.Generator, width: int, height: int, plain: bool
+    ) -> np.ndarray:
+        """A wall, a floor or a board: a part of a picture, or paint with noise, stripes or checks; faint if plain."""
+        if rng.random() < 0.4 and not plain:
             return self.part(rng, width, height)
         y, x = np.mgrid[:height, :width] / height
         # no waves along one axis make stripes, none at all plain paint
@@ -108,15 +115,19 @@ class Composer:
         tone = np.sign(np.sin(across * x)) + np.sign(np.sin(along * y))
         tone = rng.uniform(2, 25) * tone + rng.uniform(0, 15) * cv2.resize(grain, (width, height))
         color = rng.uniform(40, 245) + rng.normal(0, rng.choice([6, 25]), 3)
-        return np.float32(color + tone[..., None])
+        return np.float32(color + (0.1 if plain else 1) * tone[..., None])
 
-    def _room(self, rng: np.random.Generator, width: int, height: int, ground: float) -> np.ndarray:
+    def _room(
+        self, rng: np.random.Generator, width: int, height: int, ground: float, plain: bool
+    ) -> np.ndarray:
         """One or two walls with pictures, a skirting board, and a floor that reaches up behind `ground`."""
-        scene = self._surface(rng, width, height)
+        scene = self._surface(rng, width, height, plain)
         for _ in range(rng.integers(4)):  # pictures, windows, shelves
             (left, top), (right, bottom) = np.sort(rng.integers((width, height), size=(2, 2)), 0)
             if min(right - left, bottom - top) > 2:
-                scene[top:bottom, left:right] = self._surface(rng, right - left, bottom - top)
+                scene[top:bottom, left:right] = self._surface(
+                    rng, right - left, bottom - top, plain
+                )
         if rng.random() < 0.35:  # another wall, in other light
             scene[:, rng.integers(width) :] *= rng.uniform(0.65, 1.2)
         y, x = np.mgrid[:height, :width]
@@ -130,7 +141,7 @@ class Composer:
         corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
         laid = [[0, far], [width, far], [width + near, height], [-near, height]]
         view = cv2.getPerspectiveTransform(corners, np.float32(laid))
-        floor = cv2.warpPerspective(self._surface(rng, width, height), view, (width, height))
+        floor = cv2.warpPerspective(self._surface(rng, width, height, plain), view, (width, height))
         scene = np.where((y > edge)[..., None], floor, scene)
         light = rng.uniform(-0.5, 0.5, 2) @ [(x / width - 0.5).ravel(), (y / height - 0.5).ravel()]
         return np.float32(scene * (1 + light.reshape(height, width, 1)))

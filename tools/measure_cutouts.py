@@ -1,16 +1,17 @@
 """Measures how well objects are cut out of photographs with walls, floors and shadows.
 
 python tools/measure_cutouts.py --images 40 --seed 2 --sheet cutouts.png
+python tools/measure_cutouts.py --images 40 --seed 2 --kind cut-off
 """
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 import tyro
-from composing import Composer, draw_object
+from composing import Composer, Surroundings, draw_object
 
 from learn3d.data.masks import keep_object, mask_box
 from learn3d.pictures import save_png, tile
@@ -22,12 +23,15 @@ SIZES = ((480, 360), (400, 400), (360, 480))  # width and height in pixels
 GOOD = 0.85  # least IoU of an outline that needs no hand
 
 
+Kind = Literal["usual", "plain-room", "cut-off"]
+
+
 class Scene(NamedTuple):
     """A composed photograph."""
 
     colors: np.ndarray  # uint8 [H, W, 3]
     mask: np.ndarray  # bool [H, W]: the object
-    kind: str  # of the background: "room" or "photograph"
+    around: Surroundings
 
     def box(self, rng: np.random.Generator) -> Box:
         """The box that a hand would draw: up to a twentieth of its sides too large."""
@@ -42,18 +46,22 @@ class Scene(NamedTuple):
         return left, top, right - left, bottom - top
 
 
-def compose_scene(rng: np.random.Generator, compose: Composer) -> Scene:
-    """A generated object in a drawn room or before a part of a photograph."""
-    size = width, height = SIZES[rng.integers(len(SIZES))]
-    room = rng.random() < 0.6
+def compose_scene(rng: np.random.Generator, compose: Composer, kind: Kind = "usual") -> Scene:
+    """A generated object in a drawn room or before a part of a photograph; a part of it may be cut off by a side."""
+    size = np.array(SIZES[rng.integers(len(SIZES))])
+    around: Surroundings = "room" if rng.random() < 0.6 else "photograph"
+    if kind == "plain-room":
+        around = "plain room"
     mesh = make_shape(str(rng.choice(CATEGORIES)), rng)
     sprite = draw_object(mesh.vertices, mesh.faces, rng, 512)
-    largest = min(width, height) * rng.uniform(0.55, 0.85)
-    tall, wide = largest * np.array(sprite.shape[:2]) / max(sprite.shape)
-    free = np.array([width - wide, height - tall])
-    left, top = (free * rng.uniform((0.35, 0.45), (0.65, 0.8))).clip(2, free - 2)
-    colors, alpha = compose(rng, sprite, (left, top, wide, tall), size, room)
-    return Scene(colors, alpha > 0.5, "room" if room else "photograph")
+    own = min(size) * rng.uniform(0.55, 0.85) * np.array(sprite.shape[1::-1]) / max(sprite.shape)
+    free = size - own
+    place = (free * rng.uniform((0.35, 0.45), (0.65, 0.8))).clip(2, free - 2)
+    if kind == "cut-off":
+        axis, end = rng.integers(2, size=2)
+        place[axis] = end * free[axis] + (2 * end - 1) * rng.uniform(0.08, 0.35) * own[axis]
+    colors, alpha = compose(rng, sprite, (*place, *own), tuple(size.tolist()), around)
+    return Scene(colors, alpha > 0.5, around)
 
 
 def package_photographs() -> list[np.ndarray]:
@@ -72,11 +80,11 @@ def package_photographs() -> list[np.ndarray]:
     return [color.gray2rgb(picture) if picture.ndim == 2 else picture for picture in pictures]
 
 
-def scenes(images: int, seed: int) -> Iterator[Scene]:
-    """Composed photographs; the same number and seed give the same ones."""
+def scenes(images: int, seed: int, kind: Kind = "usual") -> Iterator[Scene]:
+    """Composed photographs; the same number, seed and kind give the same ones."""
     compose = Composer(package_photographs())
     for number in range(images):
-        yield compose_scene(np.random.default_rng([seed, number]), compose)
+        yield compose_scene(np.random.default_rng([seed, number]), compose, kind)
 
 
 def iou(found: np.ndarray, mask: np.ndarray) -> float:
@@ -87,35 +95,38 @@ def iou(found: np.ndarray, mask: np.ndarray) -> float:
 def main(
     images: int = 40,
     seed: int = 2,
+    kind: Kind = "usual",
     sheet: Path | None = None,
     options: CutOptions = DEFAULTS.cut,
 ) -> None:
     """Print the share of outlines with an IoU above 0.85, found without a hand and with a box, and of doubts.
 
     The objects are generated, before drawn rooms and photographs out of scikit-image and
-    scikit-learn.
+    scikit-learn. kind: usual scenes, rooms with plain walls and floors, or objects that a side of
+    the picture cuts off, which are to be doubted.
     sheet: a PNG of the pictures with the outlines that were found without a hand and with a box.
     """
     torch.set_num_threads(1)
-    kinds, values, shown = [], [], []
-    for number, scene in enumerate(scenes(images, seed)):
+    backgrounds, values, shown = [], [], []
+    for number, scene in enumerate(scenes(images, seed, kind)):
         box = scene.box(np.random.default_rng([seed, number, 1]))
         for each in (None, box):
             outline = find_outline(scene.colors, each, options)
             mask = keep_object(outline.mask)[0]
             right, doubted = iou(mask, scene.mask) > GOOD, outline.doubt is not None
-            values.append((right, not right and not doubted, right and doubted))
+            silent = not doubted and (not right or kind == "cut-off")
+            values.append((right, silent, right and doubted))
             shown.append(_draw(scene.colors, mask))
-        kinds.append(scene.kind)
-    shares, kinds = np.reshape(values, (-1, 6)), np.array(kinds)
+        backgrounds.append(scene.around)
+    shares, found = np.reshape(values, (-1, 6)), np.array(backgrounds)
     print(f"{'':24}{'no hand':>27}{'box':>27}")
     titles = ("right", "silent", "asked") * 2
     print(f"{'':12}{'pictures':>12}" + "".join(f"{title:>9}" for title in titles))
-    for name in ("room", "photograph", "all"):
-        rows = (kinds == name) | (name == "all")
+    for name in (*dict.fromkeys(backgrounds), "all"):
+        rows = (found == name) | (name == "all")
         means = shares[rows].mean(axis=0)
         print(f"{name:12}{rows.sum():12}" + "".join(f"{share:9.0%}" for share in means))
-    print("silent: wrong without a doubt; asked: right, with a doubt")
+    print("silent: wrong or cut off without a doubt; asked: right, with a doubt")
     if sheet is not None:
         save_png(
             sheet,

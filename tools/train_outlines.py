@@ -6,7 +6,8 @@ python tools/train_outlines.py --models models
 Objects are generated, drawn by nmr, and composed with rooms and parts of photographs (composing.py).
 The photographs, textures, and cut-outs of other things come from Debian's packages, which apt-get
 downloads (500 MB). `tools/measure_cutouts.py` measures the result; none of its photographs and
-objects is used here. It takes fifty minutes of processor time.
+objects is used here. It takes fifty minutes of processor time. The weights in the package came from
+views of 96 and 128 pixels, and went on with `--start`, `--steps 6000 --learning-rate 1e-3`.
 """
 
 import io
@@ -53,12 +54,11 @@ SEED = 1_000_000  # tools/measure_cutouts.py has smaller seeds
 SMALLEST, LARGEST = 128, 640  # sides of pictures in pixels; larger ones are reduced
 FLAT = 8  # least standard deviation of their values, 0 .. 255
 NARROWEST = 8  # least side in pixels of a cut-out
-OBJECT = 176  # side in pixels of drawn objects
-SIDES = (96, 128)  # side in pixels of the views, one after the other
-BATCH = 16
-NEW = 4  # views of a batch that are new; the others were seen before
-KEPT = 2048  # views that may be seen again
-CALIBRATED = 512  # last views, by which batch norms are set
+OBJECT = 256  # side in pixels of drawn objects
+BATCHES = {96: 16, 128: 16, 192: 8, 256: 8}  # views of a batch, for each of their sides in pixels
+NEW = 0.25  # share of a batch's views that are new; the others were seen before
+KEPT = 1024  # views of each size that may be seen again
+CALIBRATED = 128  # last views of each size, by which batch norms are set
 AVERAGE = 0.995  # decay of the moving average of the weights
 
 
@@ -150,7 +150,7 @@ def draw_objects(count: int, models: Path | None) -> list[np.ndarray]:
 def make_view(
     compose: Composer, sprites: Sequence[np.ndarray], rng: np.random.Generator, side: int
 ) -> np.ndarray:
-    """A view of the network, uint8 [S, S, 5]: R, G, B, place of the object, mask."""
+    """A view of the network, uint8 [S, S, 5]: R, G, B, where the object may be, mask."""
     sprite = _recolor(compose, sprites[rng.integers(len(sprites))], rng)
     tall, wide = sprite.shape[:2]
     boxed, near = rng.random(2) < (0.45, 0.5)
@@ -160,29 +160,37 @@ def make_view(
     if boxed or near:
         far = 9 * max(wide, tall)
         view = np.array(place_view(tuple(box + far), 3 * far, 3 * far)) - far
-        # sides of the picture that are near
-        cut = np.where(rng.random(4) < 0.15, rng.random(4), 1)
+        # sides of the picture that are near, or cut a part of the object off
+        cut = np.where(rng.random(4) < 0.15, rng.uniform(-0.5, 1, 4), 1)
         view = np.where(cut < 1, box + cut * (view - box), view)
     else:  # the whole picture
         aspect = np.exp(rng.uniform(-0.45, 0.45))
         high = max(tall, wide / aspect) / rng.uniform(0.25, 0.92)
         room = np.array([high * aspect - wide, high - tall])
-        start = -room * rng.normal((0.5, 0.58), 0.17).clip(0.02, 0.98)
+        share = rng.normal((0.5, 0.58), 0.17).clip(0.02, 0.98)
+        start = -room * share
+        if rng.random() < 0.1:  # cut off by a side of the picture
+            axis, lost = rng.integers(2), rng.uniform(0.05, 0.4)
+            size = (wide, tall)[axis]
+            start[axis] = lost * size - rng.integers(2) * (room[axis] + 2 * lost * size)
         view = np.concatenate([start, start + [high * aspect, high]])
     scale = side / (view[2:] - view[:2])
     at = (*(-view[:2] * scale), *(scale * [wide, tall]))
-    colors, alpha = compose(rng, sprite, at, (side, side), room=rng.random() < 0.55)
-    place = np.full((side, side), 0 if boxed else 255, np.uint8)
+    place = rng.choice(("room", "plain room", "photograph"), p=(0.4, 0.2, 0.4))
+    colors, alpha = compose(rng, sprite, at, (side, side), place)
+    allowed = np.full((side, side), 0 if boxed else 255, np.uint8)
     if boxed:
         (left, top), (right, bottom) = np.rint((box.reshape(2, 2) - view[:2]) * scale).astype(int)
-        place[max(0, top) : bottom, max(0, left) : right] = 255
-    return np.dstack([colors, place, np.uint8(255 * alpha)])
+        allowed[max(0, top) : bottom, max(0, left) : right] = 255
+    return np.dstack([colors, allowed, np.uint8(255 * alpha)])
 
 
 def _recolor(compose: Composer, sprite: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A cut-out in other colours, perhaps mirrored or with a pattern."""
     sprite = sprite[:, :: rng.choice([-1, 1])]
     colors = sprite[..., :3] * rng.normal(1, 0.1, 3) * rng.uniform(0.7, 1.25)
+    if rng.random() < 0.15:  # little shading
+        colors = rng.uniform(15, 240, 3) + rng.uniform(0, 0.3) * (colors - colors.mean((0, 1)))
     if rng.random() < 0.35:
         pattern = compose.part(rng, *sprite.shape[1::-1]).mean(2, keepdims=True)
         colors *= 1 + rng.uniform(0.1, 0.7) * (pattern / max(pattern.mean(), 20) - 1)
@@ -208,11 +216,10 @@ def train(
     weights: Path,
     steps: int,
     learning_rate: float = 2e-3,
-    coarse: float = 0.45,
 ) -> None:
-    """Train the network on views, and write the moving average of its weights in float16.
+    """Train the network on views of all sizes, and write the moving average of its weights in float16.
 
-    make(rng, S): a new view uint8 [S, S, 5]. coarse: share of the steps with smaller views.
+    make(rng, S): a new view uint8 [S, S, 5].
     """
     rng = np.random.default_rng([SEED, 1])
     network.to(memory_format=torch.channels_last)
@@ -221,17 +228,18 @@ def train(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, learning_rate, total_steps=steps, pct_start=0.05
     )
-    losses, seen = [], deque(maxlen=KEPT)
+    losses = []
+    seen: dict[int, deque[np.ndarray]] = {side: deque(maxlen=KEPT) for side in BATCHES}
     for step in range(1, steps + 1):
-        side = SIDES[step > coarse * steps]
-        if seen and seen[0].shape[0] != side:
-            seen.clear()
-        seen.extend(make(rng, side) for _ in range(BATCH if len(seen) < BATCH else NEW))
-        numbers = [*range(-NEW, 0), *rng.integers(-len(seen), -NEW, BATCH - NEW)]
-        views = vary([seen[number] for number in numbers], rng)
-        logits = network(views[:, :4].contiguous(memory_format=torch.channels_last))
-        loss = F.binary_cross_entropy_with_logits(logits, views[:, 4])
-        loss = loss + soft_iou_loss(logits.sigmoid(), views[:, 4])
+        side = int(rng.choice([*BATCHES]))
+        batch, views = BATCHES[side], seen[side]
+        new = round(NEW * batch) if len(views) > batch else batch
+        views.extend(make(rng, side) for _ in range(new))
+        numbers = [*range(-new, 0), *rng.integers(len(views), size=batch - new)]
+        inputs = vary([views[number] for number in numbers], rng)
+        logits = network(inputs[:, :4].contiguous(memory_format=torch.channels_last))
+        loss = F.binary_cross_entropy_with_logits(logits, inputs[:, 4])
+        loss = loss + soft_iou_loss(logits.sigmoid(), inputs[:, 4])
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -241,14 +249,14 @@ def train(
         losses.append(loss.item())
         if step % 100 == 0:
             print(
-                f"step {step}: side {side}, loss {np.mean(losses[-100:]):.3f}, "
+                f"step {step}: loss {np.mean(losses[-100:]):.3f}, "
                 f"{time.process_time():.0f} s of processor",
                 flush=True,
             )
         if step % 500 == 0 or step == steps:
-            recent = [*seen][-CALIBRATED:]
-            starts = range(0, len(recent) - BATCH + 1, BATCH)
-            update_bn((vary(recent[k : k + BATCH], rng)[:, :4] for k in starts), average.module)
+            recent = [[*views][-CALIBRATED:] for views in seen.values()]
+            batches = [each[k : k + 8] for each in recent for k in range(0, len(each) - 7, 8)]
+            update_bn((vary(each, rng)[:, :4] for each in batches), average.module)
             halves = {
                 name: (value.half() if value.is_floating_point() else value).contiguous()
                 for name, value in average.module.state_dict().items()
@@ -273,7 +281,6 @@ def main(
     objects: int = 4000,
     steps: int = 13000,
     learning_rate: float = 2e-3,
-    coarse: float = 0.45,
     weights: Path = WEIGHTS,
     start: Path | None = None,
     threads: int = 1,
@@ -282,7 +289,7 @@ def main(
 
     output: a folder for packages and drawn objects, which are used again. models: a folder of
     meshes, as `tools/free_meshes/fetch.py` writes it. objects: to be drawn. weights: the file to
-    write. start: weights to begin with. coarse: share of the steps with smaller views.
+    write. start: weights to begin with.
     """
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
@@ -311,7 +318,7 @@ def main(
     network = OutlineNetwork()
     if start is not None:
         network.load_state_dict(safetensors.torch.load_file(start))
-    train(make, network, weights, steps, learning_rate, coarse)
+    train(make, network, weights, steps, learning_rate)
 
 
 if __name__ == "__main__":

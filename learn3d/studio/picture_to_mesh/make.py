@@ -229,9 +229,10 @@ def match_templates(
             fewer = {"candidates": match.candidates // 3, "kept": match.kept // 2}
             match = dataclasses.replace(match, **fewer)
         known = model.templates, model.categories
-        bonus = match.kind * chances[:-1] / chances[:-1].sum().clamp(min=1e-6)
-        if category is not None:
-            bonus = bonus.log()  # -inf for all others
+        bonus = chances[:-1] / chances[:-1].sum().clamp(min=1e-6)
+        if category is None:
+            bonus = bonus.clamp(min=match.least)
+        bonus = match.kind * bonus.log()  # -inf for all others than a known category
         return find_candidates(*known, predicted, outline, bonus, level, match)
 
     found = find(predicted, chances)

@@ -52,7 +52,7 @@ class CutOptions:
     ragged: float = 600.0
     """Squared length of an outline over its area from which it is doubtful; a thin-legged chair has
     200."""
-    sure: float = 0.86
+    sure: float = 0.82
     """Least sureness of a mask, see `cut_out`; less is a doubt."""
     possible: float = 0.15
     """Least probability of pixels that may belong to the same thing."""
@@ -137,8 +137,10 @@ class MatchOptions:
     """Weight of the codes' cosine and of the bonus below."""
     other: float = 0.6
     """Probability of other things from which a picture is doubted."""
-    kind: float = 0.4
-    """Bonus to the cosine for the templates of a category that is certain."""
+    kind: float = 0.2
+    """Weight of the logarithm of their category's probability, beside the cosine."""
+    least: float = 0.01
+    """Least probability that counts."""
     edges: float = 0.15
     """Weight of the distance of two outlines in pixels of 64."""
     farthest: float = 6.0

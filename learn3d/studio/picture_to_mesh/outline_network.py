@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from learn3d.networks.layers import norm_relu
 
-SIDES = 96, 128, 160  # sides in pixels of the pictures that the network sees
+SIDES = 128, 160, 192  # sides in pixels of the pictures that the network sees
 VIEW = SIDES[-1]  # side in pixels of its answer
 MARGIN = 0.2  # of the background around an object in its view, as a share of the object's sides
 NARROW = 0.6  # least ratio of a view's shorter side to its longer one, before it becomes a square

@@ -144,10 +144,11 @@ def test_reconstruct_takes_a_box(
     status, _, said = command(*words, "--box", 80, 50, 220, 220, "--masks", tmp_path / "disc.png")
     assert status == 1 and "--box is for one photograph" in said
     noise = np.random.default_rng(0).integers(0, 256, (120, 120, 3)).astype(np.uint8)
-    noise[50:70] = (200, 30, 30)
     Image.fromarray(noise).save(tmp_path / "disc.png")
     status, _, said = command(*words)
     assert status == 1 and "no object was found" in said and "Give --box or --masks" in said
+    noise[50:70] = (200, 30, 30)
+    Image.fromarray(noise).save(tmp_path / "disc.png")
     status, _, said = command(*words, "--box", 10, 45, 100, 30)
     assert status == 0, said
 

@@ -20,6 +20,7 @@ from learn3d import tasks
 from learn3d.data.layouts import load_dataset
 from learn3d.pictures import Surface, photograph
 from learn3d.studio.make_data.render import DatasetConfig, make_shards
+from learn3d.studio.picture_to_mesh import make
 from learn3d.studio.picture_to_mesh.coloring import clash
 from learn3d.studio.picture_to_mesh.fit import Target, frame_view
 from learn3d.studio.picture_to_mesh.make import (
@@ -139,6 +140,24 @@ def test_an_airplane_that_is_turned_in_its_picture_is_found(model: Model, roll_d
     assert made.kind == "airplane" and made.silhouette_iou > 0.75
     apart = (float(made.view.roll_deg) - roll_deg + 180) % 360 - 180
     assert abs(apart) <= 20
+
+
+def test_a_kind_counts_with_the_logarithm_of_its_probability(model: Model, monkeypatch) -> None:
+    shown, given = picture("sofa", int(model.templates.numbers[4, 7])), []
+    original = make.find_candidates
+
+    def find(templates, categories, predicted, outline, bonus, *others) -> Candidates:
+        given.append(dict(zip(categories, bonus.tolist(), strict=True)))
+        return original(templates, categories, predicted, outline, bonus, *others)
+
+    monkeypatch.setattr(make, "find_candidates", find)
+    for of_chair in (0.55, 0.98):
+        chances = torch.tensor([0, 0, of_chair, 0, 0.99 - of_chair, 0, 0.01])
+        monkeypatch.setattr(Model, "chances", lambda *_, chances=chances: chances)
+        reconstruct_picture(model, *shown)
+    unsure, sure = given[0], given[-1]
+    assert 0 < unsure["chair"] - unsure["sofa"] < 0.1 < 0.8 < sure["chair"] - sure["sofa"] < 1
+    assert -1 < sure["lamp"] <= sure["sofa"], "what is least probable is still possible"
 
 
 def test_guesses_are_good_and_different() -> None:
