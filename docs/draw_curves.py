@@ -91,14 +91,17 @@ def read_mean_shapes(files: list[str]) -> dict[str, float]:
 
 
 def draw(curves: Curves, mean_shapes: dict[str, float], angles: Curves) -> Figure:
-    """IoU above, MMD below it, then the IoU of silhouettes if there are angles."""
-    count = 2 + bool(angles)
-    size = (max(2.6 * len(curves) + 0.4, 4.8), 2.2 * count + 0.2)
+    """IoU, MMD, then the IoU of silhouettes if there are angles: one below the other; of one category side by side."""
+    count, alone = 2 + bool(angles), len(curves) == 1
+    size = (3.2 * count, 2.9) if alone else (max(2.6 * len(curves) + 0.4, 4.8), 2.2 * count + 0.2)
     figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(count, len(curves), squeeze=False)
+    axes = figure.subplots(*((1, count) if alone else (count, len(curves))), squeeze=False)
+    axes = axes.reshape(count, -1)
     for column, (title, methods) in enumerate(curves.items()):
-        axes[0, column].set_title(title)
-        axes[1, column].set_xlabel(f"steps of {STEP_IMAGES} images")
+        if not alone:
+            axes[0, column].set_title(title)
+        for panel in axes[:2, column] if alone else axes[1:2, column]:
+            panel.set_xlabel(f"steps of {STEP_IMAGES} images")
         for row in range(2):
             _draw_methods(axes[row, column], methods, 1 + row)
         if title in mean_shapes:
