@@ -4,8 +4,8 @@ python docs/draw_curves.py --output results-curves.png kato-5000 ablation-5000=f
 
 The name of a file may be followed by a word for its data. Files with the same word are drawn together, and the longer
 curve of a run counts. Several seeds are drawn as their mean, in the band from the lowest to the highest. If a file has
-the IoU of the mean shape (of the test objects), it is a dashed line. A third row has the IoU of silhouettes by the
-angle from the input's view, if a file has it.
+the IoU of the mean shape (of the test objects), it is a dashed line. One category alone has its panels side by side; if
+its files have them, a third one shows the IoU of silhouettes by the angle from the input's view.
 """
 
 import json
@@ -91,12 +91,13 @@ def read_mean_shapes(files: list[str]) -> dict[str, float]:
 
 
 def draw(curves: Curves, mean_shapes: dict[str, float], angles: Curves) -> Figure:
-    """IoU, MMD, then the IoU of silhouettes if there are angles: one below the other; of one category side by side."""
-    count, alone = 2 + bool(angles), len(curves) == 1
-    size = (3.2 * count, 2.9) if alone else (max(2.6 * len(curves) + 0.4, 4.8), 2.2 * count + 0.2)
+    """IoU above, MMD below it; of one category IoU, MMD and, if given, the angles, side by side."""
+    alone = len(curves) == 1
+    count = 3 if alone and angles else 2
+    rows, columns = (1, count) if alone else (2, len(curves))
+    size = (3.2 * count, 2.9) if alone else (2.6 * columns + 0.4, 4.6)
     figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(*((1, count) if alone else (count, len(curves))), squeeze=False)
-    axes = axes.reshape(count, -1)
+    axes = figure.subplots(rows, columns, squeeze=False).reshape(count, -1)
     for column, (title, methods) in enumerate(curves.items()):
         if not alone:
             axes[0, column].set_title(title)
@@ -107,12 +108,12 @@ def draw(curves: Curves, mean_shapes: dict[str, float], angles: Curves) -> Figur
         if title in mean_shapes:
             style = {"color": "black", "ls": "--", "lw": 1, "label": "mean shape"}
             axes[0, column].axhline(mean_shapes[title], **style)
-        if angles:
+        if count == 3:
             _draw_methods(axes[2, column], angles.get(title, {}), 1)
             axes[2, column].set_xlabel("degrees from the input's view")
     axes[0, 0].set_ylabel("voxel IoU")
     axes[1, 0].set_ylabel("MMD: pose in the code")
-    if angles:
+    if count == 3:
         axes[2, 0].set_ylabel("IoU of silhouettes")
     for panel in axes[1]:
         panel.set_ylim(bottom=0)

@@ -89,6 +89,17 @@ _SCRIPTS = {  # picture that a script draws, and the part of it that the gallery
     "draw_surfaces": ("room.png", (0, 0, 1, 1)),
     "make_photo_folder": ("chair/images/chair000_0.jpg", (0, 0, 1, 1)),
 }
+
+
+def _grid(runs: str, images: int = 2) -> Picture:
+    """Meshes of test images, beside the truth."""
+    return Picture(
+        f"learn3d figures grid --truth --images {images} --runs {runs} --output {{folder}}/grid.png",
+        "{folder}/grid.png",
+        ("learn3d/studio/tables/grids.py",),
+    )
+
+
 PICTURES = {
     "views.png": Picture(
         "python docs/examples/draw_views.py --output {folder}",
@@ -175,26 +186,10 @@ PICTURES = {
         )
         for name in _FUNCTIONS
     },
-    "results-grid.png": Picture(
-        f"learn3d figures grid --truth --images 3 --runs {_THREE} --output {{folder}}/grid.png",
-        "{folder}/grid.png",
-        ("learn3d/studio/tables/grids.py",),
-    ),
-    "results-long.png": Picture(
-        f"learn3d figures grid --truth --images 2 --runs {_LONG} --output {{folder}}/grid.png",
-        "{folder}/grid.png",
-        ("learn3d/studio/tables/grids.py",),
-    ),
-    "results-airplanes.png": Picture(
-        f"learn3d figures grid --truth --images 2 --runs {_LONG} --output {{folder}}/grid.png",
-        "{folder}/grid.png",
-        ("learn3d/studio/tables/grids.py",),
-    ),
-    "results-cars.png": Picture(
-        f"learn3d figures grid --truth --images 2 --runs {_CARS} --output {{folder}}/grid.png",
-        "{folder}/grid.png",
-        ("learn3d/studio/tables/grids.py",),
-    ),
+    "results-grid.png": _grid(_THREE, images=3),
+    "results-long.png": _grid(_LONG),
+    "results-airplanes.png": _grid(_LONG),
+    "results-cars.png": _grid(_CARS),
     "results-curves.png": Picture(
         f"python docs/draw_curves.py --output {{folder}}/curves.png {' '.join(_CURVES)}",
         "{folder}/curves.png",

@@ -344,6 +344,8 @@ def test_the_mean_shape_and_angles_are_drawn_with_the_curves(
     ]
     assert above == {"Vanilla-AE": [[9, 0.5]], "mean shape": [[0, 0.43], [1, 0.43]]}
     assert below == {"Vanilla-AE": [[0, 0.9], [30, 0.7]]}
+    two = draw_curves.draw(draw_curves.read_curves(["new", "new=generated"]), shapes, angles)
+    assert len(two.axes) == 4 and all(axes.get_lines() for axes in two.axes), "no empty panel"
 
 
 def test_rows_of_another_file_are_added_below_a_table(

@@ -118,12 +118,12 @@ def main(
             values.append((right, silent, right and doubted))
             shown.append(_draw(scene.colors, mask))
         backgrounds.append(scene.around)
-    shares, found = np.reshape(values, (-1, 6)), np.array(backgrounds)
+    shares = np.reshape(values, (-1, 6))
     print(f"{'':24}{'no hand':>27}{'box':>27}")
     titles = ("right", "silent", "asked") * 2
     print(f"{'':12}{'pictures':>12}" + "".join(f"{title:>9}" for title in titles))
     for name in (*dict.fromkeys(backgrounds), "all"):
-        rows = (found == name) | (name == "all")
+        rows = np.array([name in (each, "all") for each in backgrounds])
         means = shares[rows].mean(axis=0)
         print(f"{name:12}{rows.sum():12}" + "".join(f"{share:9.0%}" for share in means))
     print("silent: wrong or cut off without a doubt; asked: right, with a doubt")

@@ -6,8 +6,8 @@ python tools/train_outlines.py --models models
 Objects are generated, drawn by nmr, and composed with rooms and parts of photographs (composing.py).
 The photographs, textures, and cut-outs of other things come from Debian's packages, which apt-get
 downloads (500 MB). `tools/measure_cutouts.py` measures the result; none of its photographs and
-objects is used here. It takes fifty minutes of processor time. The weights in the package came from
-views of 96 and 128 pixels, and went on with `--start`, `--steps 6000 --learning-rate 1e-3`.
+objects is used here. It takes fifty minutes of processor time. The weights in the package were trained with
+views of 96 and 128 pixels first, and then by `--start FILE --steps 6000 --learning-rate 1e-3`.
 """
 
 import io
@@ -150,7 +150,7 @@ def draw_objects(count: int, models: Path | None) -> list[np.ndarray]:
 def make_view(
     compose: Composer, sprites: Sequence[np.ndarray], rng: np.random.Generator, side: int
 ) -> np.ndarray:
-    """A view of the network, uint8 [S, S, 5]: R, G, B, where the object may be, mask."""
+    """A view of the network, uint8 [S, S, 5]: the colours, the allowed part of the view, and the mask."""
     sprite = _recolor(compose, sprites[rng.integers(len(sprites))], rng)
     tall, wide = sprite.shape[:2]
     boxed, near = rng.random(2) < (0.45, 0.5)
@@ -255,7 +255,9 @@ def train(
             )
         if step % 500 == 0 or step == steps:
             recent = [[*views][-CALIBRATED:] for views in seen.values()]
-            batches = [each[k : k + 8] for each in recent for k in range(0, len(each) - 7, 8)]
+            size = min(BATCHES.values())
+            starts = range(0, CALIBRATED, size)
+            batches = [part for each in recent for k in starts if (part := each[k : k + size])]
             update_bn((vary(each, rng)[:, :4] for each in batches), average.module)
             halves = {
                 name: (value.half() if value.is_floating_point() else value).contiguous()

@@ -149,6 +149,8 @@ def test_reconstruct_takes_a_box(
     assert status == 1 and "no object was found" in said and "Give --box or --masks" in said
     noise[50:70] = (200, 30, 30)
     Image.fromarray(noise).save(tmp_path / "disc.png")
+    status, _, said = command(*words)
+    assert status == 0 and "warning: disc: its outline touches the border" in said
     status, _, said = command(*words, "--box", 10, 45, 100, 30)
     assert status == 0, said
 
