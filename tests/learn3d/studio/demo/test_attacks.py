@@ -264,7 +264,7 @@ def nonsense_behind_a_picture(page: Page) -> None:
 
 def visitors_who_leave(page: Page) -> None:
     """Thirty come and leave while a picture is in work: theirs are not started."""
-    before = len(page.started)
+    before, made = len(page.started), len(page.held)
     page.goes_on.clear()
     with contextlib.ExitStack() as crowd:
         crowd.callback(page.goes_on.set)
@@ -273,6 +273,7 @@ def visitors_who_leave(page: Page) -> None:
         for _ in range(30):
             with page.connect() as visitor:
                 visitor.sendall(page.head() + page.box.content)
+        wait_until(lambda: len(page.held) - made > 30)  # the page has seen all of them
         wait_until(lambda: page.connections() == 1)
     page.visit()
     assert len(page.started) - before == 2
