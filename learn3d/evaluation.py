@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import nmr
-from learn3d.data.conventions import view_poses
+from learn3d.data.conventions import Definition, VoxelConvention, view_poses
 from learn3d.data.dataset import MASK_SIZE, Batch, ViewDataset
 from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.losses import mmd
@@ -91,8 +91,9 @@ def evaluate(
     max_images: use only that many images, always the same ones (see `spread_samples`).
     detailed: add the voxel IoU with kato19, that without the clamp, the MMD as the paper prints it
     and its floor (`shuffle_views`), the IoU of silhouettes by angle (`images_by_angle`), and
-    Chamfer-L1 and F-score between 2,000 points on each surface. If the data set has no points, the
-    truth is the surface of its voxels, which limits distances to about 1/32.
+    Chamfer-L1 and F-score between 2,000 points on each surface. If the data set has no points, both
+    surfaces are those of kato18's voxels: the true voxels reach about half a cell, 1/64, beyond the
+    true surface, so a mesh would have to be too thick to meet them.
     """
     samples = spread_samples(
         dataset.object_ids, dataset.view_ids, len(dataset) if max_images is None else max_images
@@ -113,10 +114,13 @@ def evaluate(
             code = method.encode(batch.images)
             shapes = method.decode(code)
             unclamped = shapes.without_clamp() if isinstance(shapes, Meshes) else None
-            measured = (
-                {} if dataset.voxels is None else _compare_voxels(shapes, batch, dataset, detailed)
-            )
+            measured = {}
+            if dataset.voxels is not None:
+                filled = _voxelize(shapes, dataset)
+                measured = _compare_voxels(shapes, filled, batch, dataset)
             if detailed and measured:
+                conservative = _voxelize(shapes, dataset, "kato19")
+                measured["voxel_iou_kato19"] = nmr.metrics.voxel_iou(conservative, batch.voxels)
                 measured["voxel_iou_unclamped"] = measured["voxel_iou"]
                 if unclamped is not None:
                     grid = dataset.convention.voxelize(unclamped.vertices, unclamped.faces)
@@ -133,9 +137,13 @@ def evaluate(
                     torch.stack([_compare_silhouettes(shapes, dataset, s) for s in samples_at])
                 )
             if surfaces:
-                measured |= _compare_surfaces(
-                    shapes, [surfaces[k] for k in batch.object_ids.tolist()], generator
+                ours = (
+                    shapes.surfaces()
+                    if dataset.points is not None
+                    else _surfaces_of_voxels(filled, dataset.convention)
                 )
+                truth = [surfaces[k] for k in batch.object_ids.tolist()]
+                measured |= _compare_surfaces(ours, truth, generator)
             unknown = torch.full((len(chosen),), math.nan)
             values.append(
                 torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1)
@@ -161,28 +169,31 @@ def evaluate(
     return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds, angle_ious)
 
 
-def _compare_voxels(
-    shapes: Meshes | Grids, batch: Batch, dataset: ViewDataset, detailed: bool
-) -> dict[str, Tensor]:
-    convention = dataset.convention
-    definitions = ("kato18", "kato19")[: 1 + detailed]
+def _voxelize(
+    shapes: Meshes | Grids, dataset: ViewDataset, definition: Definition = "kato18"
+) -> Tensor:
+    """Occupancy of predictions, in the axes of the stored voxels: bool [B, 32, 32, 32].
+
+    A grid has no definition: it is pooled to that size.
+    """
     if isinstance(shapes, Meshes):
-        grids = [
-            convention.voxelize(shapes.vertices, shapes.faces, definition)
-            for definition in definitions
-        ]
-        hollow = convention.exceeds_grid(shapes.vertices, "kato18")
-    elif convention.cube_side == 1.0:
-        grids = [convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))] * len(definitions)
-        hollow = torch.zeros(len(batch))
-    else:
+        return dataset.convention.voxelize(shapes.vertices, shapes.faces, definition)
+    if dataset.convention.cube_side != 1.0:
         raise ValueError(
-            f"grids over the box [-0.5, 0.5] cannot be compared with {convention.name} voxels"
+            f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels"
         )
-    precision, recall = nmr.metrics.voxel_precision_recall(grids[0], batch.voxels)
-    ious = (nmr.metrics.voxel_iou(grid, batch.voxels) for grid in grids)
-    found = dict(zip(("voxel_iou", "voxel_iou_kato19"), ious, strict=False))
-    return found | {"precision": precision, "recall": recall, "hollow": hollow}
+    return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
+
+
+def _compare_voxels(
+    shapes: Meshes | Grids, filled: Tensor, batch: Batch, dataset: ViewDataset
+) -> dict[str, Tensor]:
+    precision, recall = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
+    hollow = torch.zeros(len(batch))
+    if isinstance(shapes, Meshes):
+        hollow = dataset.convention.exceeds_grid(shapes.vertices)
+    iou = nmr.metrics.voxel_iou(filled, batch.voxels)
+    return {"voxel_iou": iou, "precision": precision, "recall": recall, "hollow": hollow}
 
 
 def _compare_silhouettes(shapes: Meshes, dataset: ViewDataset, samples: Tensor) -> Tensor:
@@ -208,11 +219,11 @@ def _compare_silhouettes(shapes: Meshes, dataset: ViewDataset, samples: Tensor) 
 
 
 def _compare_surfaces(
-    shapes: Meshes | Grids, truth: list[Tensor], generator: torch.Generator
+    surfaces: list[Surface], truth: list[Tensor], generator: torch.Generator
 ) -> dict[str, Tensor]:
     """Chamfer-L1 and F-score with the true points [P, 3] of each object."""
     found = []
-    for surface, theirs in zip(shapes.surfaces(), truth, strict=True):
+    for surface, theirs in zip(surfaces, truth, strict=True):
         ours = _sample(surface, generator)
         if len(ours) and len(theirs):
             distance = nmr.metrics.chamfer_distance(ours, theirs, form="l1")
@@ -232,12 +243,18 @@ def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Ten
         if dataset.points is not None:
             found += torch.from_numpy(dataset.points[part]).float()
         elif dataset.voxels is not None:
-            grids = dataset.convention.to_object(torch.from_numpy(dataset.voxels[part])).float()
-            found += [
-                _sample(grid_surface(grid, box=dataset.convention.cube_side), generator)
-                for grid in grids
-            ]
+            voxels = torch.from_numpy(dataset.voxels[part])
+            surfaces = _surfaces_of_voxels(voxels, dataset.convention)
+            found += [_sample(surface, generator) for surface in surfaces]
     return found
+
+
+def _surfaces_of_voxels(voxels: Tensor, convention: VoxelConvention) -> list[Surface]:
+    """The surfaces of grids [B, s, s, s] in the axes of the stored voxels, in the object frame."""
+    return [
+        grid_surface(grid, box=convention.cube_side)
+        for grid in convention.to_object(voxels).float()
+    ]
 
 
 def _sample(surface: Surface, generator: torch.Generator) -> Tensor:

@@ -47,7 +47,8 @@ MEASURES = {
     "recall": ("recall", "part of the true voxels that is predicted: low if parts are missing"),
     "chamfer_l1": (
         "Chamfer-L1",
-        f"mean distance of {SURFACE_POINTS} points of either surface to the other, without empty predictions",
+        f"mean distance of {SURFACE_POINTS} points of either surface to the other, without empty predictions; "
+        "without true points in the data the surfaces are those of the voxels",
     ),
     "f_score": (
         "F-score",
