@@ -165,6 +165,8 @@ class MatchOptions:
     """Points of the lattice for bending along each axis."""
     bending: float = 0.25
     """Weight of their moves."""
+    bent_cost: float = 0.5
+    """Share of the cost of these moves that counts in the ranking."""
     bending_steps: int = 60
     """Steps of bending."""
 

@@ -378,7 +378,8 @@ def bend(found: Candidates, outline: Tensor, options: MatchOptions) -> Candidate
         return (costs() - views.ious(bent(), found.faces, outline)).sum()
 
     views = minimize(loss, found.views, options.bending_steps, (0.01, 0.02), lattice)
-    return found._replace(shapes=bent(), views=views, prior=found.prior - costs())
+    prior = found.prior - options.bent_cost * costs()
+    return found._replace(shapes=bent(), views=views, prior=prior)
 
 
 def _lattice_weights(vertices: Tensor, count: int) -> Tensor:
