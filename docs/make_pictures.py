@@ -6,7 +6,7 @@ REPORT=report.html python docs/make_pictures.py report.png           # of tools/
 OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of `learn3d experiment plus`
 OUTPUT=long python docs/make_pictures.py results-long.png         # from those of `learn3d experiment kato`, 5,000 steps
 OUTPUT=CARS_OUTPUT python docs/make_pictures.py results-cars.png  # the same for generated cars
-OUTPUT=GENERATED_OUTPUT python docs/make_pictures.py results-airplanes.png  # generated airplanes, 10,000 steps
+OUTPUT=GENERATED_OUTPUT python docs/make_pictures.py results-airplanes.png  # generated airplanes, 20,000 steps
 """
 
 import base64
