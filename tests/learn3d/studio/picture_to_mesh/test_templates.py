@@ -129,6 +129,10 @@ def test_a_table_gets_the_slanted_legs_and_the_round_top_of_a_picture() -> None:
         float(each.views.ious(each.shapes, each.faces, outline).detach()) for each in (found, bent)
     )
     assert before < 0.5 and after > 0.82
+    whole = bend(found, outline, dataclasses.replace(DEFAULTS.match, bent_cost=1.0))
+    costs = [-float(each.prior.detach()) for each in (bent, whole)]
+    assert costs[0] == pytest.approx(costs[1] / 2) and costs[1] > 0.01, "half of it ranks"
+    assert torch.equal(bent.shapes[0], whole.shapes[0]), "the shape is bent at its full cost"
 
 
 @pytest.mark.parametrize("roll_deg", [45.0, -60.0])
