@@ -20,7 +20,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import resvg_py
 import tyro
 from PIL import Image
 
@@ -95,6 +94,14 @@ def icon_svg(icon: dict) -> bytes:
     return f'<svg {spaces} viewBox="0 0 {size[0]} {size[1]}">{icon["body"]}</svg>'.encode()
 
 
+def draw_svg(svg: bytes, width: int) -> Image.Image:
+    """An SVG file as a picture in RGBA, `width` pixels wide."""
+    import resvg_py  # here, so that the tests need no such package
+
+    content = bytes(resvg_py.svg_to_bytes(svg_string=svg.decode(), width=width))
+    return Image.open(io.BytesIO(content)).convert("RGBA")
+
+
 def choose(names: dict[str, list[str]], kind: str, count: int) -> Iterator[tuple[str, str]]:
     """Up to `count` pairs of set and name of a known kind. names: of each set."""
     wanted = set(WORDS[kind].split())
@@ -138,11 +145,13 @@ def main(output: Path, count: int = 10) -> None:
     for number, (kind, package, name) in enumerate(chosen):
         content = drawings[package][name]
         if b"<svg" in content[:2000]:
-            content = bytes(resvg_py.svg_to_bytes(svg_string=content.decode(), width=SIDE))
+            image = draw_svg(content, SIDE)
+        else:
+            image = Image.open(io.BytesIO(content)).convert("RGBA")
         path = (
             output / PARTS[number % 2] / f"{number:02}-{kind}-{package.split('/')[-1]}-{name}.png"
         )
-        Image.open(io.BytesIO(content)).convert("RGBA").save(path)
+        image.save(path)
         print(path.stem)
 
 

@@ -7,7 +7,6 @@ It learns from other icon sets than those of draw_strangers.py, and changes `sma
 same command gives the same file on the same machine. It needs npm, and a core for ten minutes.
 """
 
-import io
 import json
 import re
 import tarfile
@@ -16,12 +15,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import resvg_py
 import torch
 import torch.nn.functional as F
 import tyro
-from draw_strangers import icon_svg, load_package
-from PIL import Image
+from draw_strangers import draw_svg, icon_svg, load_package
 from scipy import ndimage
 from torch import Tensor
 
@@ -139,8 +136,7 @@ def choose_icons(drawings: dict[str, bytes], others: int) -> Iterator[tuple[str,
     for name in np.random.default_rng(SEED).permutation(free)[:others]:
         kinds[str(name)] = "other"
     for name, kind in kinds.items():
-        content = bytes(resvg_py.svg_to_bytes(svg_string=drawings[name].decode(), width=128))
-        image = np.asarray(Image.open(io.BytesIO(content)).convert("RGBA"))
+        image = np.asarray(draw_svg(drawings[name], 128))
         mask = keep_object(image[..., 3])[0]
         if (mask > 127).mean() > 0.02:
             yield kind, (np.ascontiguousarray(image[..., :3]), mask)
