@@ -1,7 +1,7 @@
 # The commands that made the files of this folder, each with the table of docs/results.md that it fills.
 # Words in capitals are folders. Repeat `make-dataset` for each category. VPL ran with one seed, by a command of its own.
 
-# On Debian; then, for each category:
+# On Debian with the components main, contrib and non-free; then, for each category:
 python tools/free_meshes/fetch.py --output models
 
 learn3d make-dataset --output DATA --category airplane --source models/airplane --front z --augment 6
