@@ -71,7 +71,7 @@ def test_the_tool_changes_nothing_but_the_network_of_kinds(
     before, after = (checkpoint.load(file)[0] for file in (SMALL_MODEL, path))
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert before.keys() == after.keys()
-    assert changed == {name for name in before if name.startswith("judge.")}
+    assert changed == {name for name in before if name.startswith("kind_network.")}
     assert load_model(path).chances(torch.zeros(4, 64, 64, dtype=torch.uint8)).isfinite().all()
     assert re.search(r"car: \d+ icons", capsys.readouterr().out)
 

@@ -9,17 +9,19 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.cluster.vq import kmeans2
-from torch import Tensor
+from torch import Tensor, nn
 
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
 from learn3d.methods.mesh_method import MeshMethod
 from learn3d.networks.encoders import CODE_SIZE, ViewClassifier
+from learn3d.networks.layers import norm_relu
+from learn3d.networks.resnet import ResidualBlock
 from learn3d.runs import checkpoint
 
 CENTRES = 120  # clusters of the codes of all training images
 IMAGES = 4000  # training images whose codes are clustered
 FAR = 0.82  # distance from all kinds at which a picture counts as another thing
-CENTRES_NAME, JUDGE_PREFIX = "known_codes", "judge."  # names of the tensors in a checkpoint
+CENTRES_NAME, JUDGE_PREFIX = "known_codes", "kind_network."  # names of the tensors in a checkpoint
 _NEAREST = 3  # centres whose mean distance is compared
 _DISTANCE = 2.0  # weight of the distance, beside the logit
 _BATCH = 96  # images in a step
@@ -30,11 +32,35 @@ _OTHERS = 0.35  # share of other things in a batch
 Vary = Callable[[Tensor, Tensor, np.random.Generator], Tensor]
 
 
+class KindNetwork(ViewClassifier):
+    """Images [B,4,64,64], as for an encoder -> logits [B,K] over K kinds of objects.
+
+    Objects are scaled to one size. Six residual blocks, 0.7 million weights.
+    """
+
+    def __init__(self, kinds: int, inverted: bool) -> None:
+        nn.Module.__init__(self)
+        self.inverted = inverted
+        self.convolutions = nn.Sequential(
+            nn.PixelUnshuffle(2),
+            nn.Conv2d(16, 24, 3, padding=1, bias=False),
+            *norm_relu(24),
+            ResidualBlock(24, 24),
+            ResidualBlock(24, 48, 2),
+            ResidualBlock(48, 48),
+            ResidualBlock(48, 96, 2),
+            ResidualBlock(96, 96),
+            ResidualBlock(96, 160, 2),
+            nn.AdaptiveAvgPool2d(1),
+        )
+        self.layers = nn.Sequential(nn.Dropout(0.2), nn.Linear(160, kinds))
+
+
 class KnownCodes(NamedTuple):
     """Cluster centres (k-means) of normalised codes, and a network that knows kinds and other things."""
 
     kinds: Tensor  # float [N, K, C]: centres of the training images of N categories
-    judge: ViewClassifier | None = None  # logits of the categories, then of other things
+    judge: KindNetwork | None = None  # logits of the categories, then of other things
 
     @classmethod
     def from_tensors(
@@ -49,7 +75,7 @@ class KnownCodes(NamedTuple):
         weights = checkpoint.starting_with(JUDGE_PREFIX, tensors)
         if not weights:
             return cls(kinds)
-        judge = ViewClassifier(categories + 1, inverted).requires_grad_(False)
+        judge = KindNetwork(categories + 1, inverted).requires_grad_(False).eval()
         try:
             judge.load_state_dict(weights)
         except RuntimeError:
@@ -128,9 +154,7 @@ def known_codes(
     return KnownCodes(kinds, judge)
 
 
-def learn_kinds(
-    images: Tensor, kinds: Tensor, inverted: bool, vary: Vary = mirror
-) -> ViewClassifier:
+def learn_kinds(images: Tensor, kinds: Tensor, inverted: bool, vary: Vary = mirror) -> KindNetwork:
     """`KnownCodes.judge` from stored images uint8 [M, 4, S, S] and their kinds int64 [M], other things last.
 
     vary: makes float images [B, 4, 64, 64] in 0 .. 1 of stored ones and their kinds [B], changed at
@@ -144,7 +168,7 @@ def learn_kinds(
     steps = max(20, _EPOCHS * len(kinds) // _BATCH)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        judge = ViewClassifier(count + 1, inverted)
+        judge = KindNetwork(count + 1, inverted)
         optimizer = torch.optim.AdamW(judge.parameters(), _RATE, weight_decay=0.05)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, steps, pct_start=0.1)
         for _ in range(steps):
@@ -154,4 +178,4 @@ def learn_kinds(
             F.cross_entropy(judge(pixels), kinds[rows], label_smoothing=0.02).backward()
             optimizer.step()
             schedule.step()
-    return judge.requires_grad_(False)
+    return judge.requires_grad_(False).eval()

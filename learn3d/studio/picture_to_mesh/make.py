@@ -90,7 +90,7 @@ def load_model(run: Path | None, which: str = "last") -> Model:
     path = checkpoint.find(run or SMALL_MODEL, which)
     method, config, metadata = checkpoint.load_method(path)
     tensors = checkpoint.load(path)[0]
-    if "output_layer" in tensors:
+    if any(name.startswith(("output_layer", "judge.")) for name in tensors):
         note(f"{path} is of an earlier version; export it again with --others to warn of these")
     categories = len(split_names(config.category))
     try:

@@ -135,7 +135,7 @@ class MatchOptions:
     """Weight of the IoU with the predicted shape; that of the outline is 1."""
     nearness: float = 0.5
     """Weight of the codes' cosine and of the bonus below."""
-    other: float = 0.6
+    other: float = 0.8
     """Probability of other things from which a picture is doubted."""
     kind: float = 0.2
     """Weight of the logarithm of their category's probability, beside the cosine."""
