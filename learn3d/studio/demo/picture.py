@@ -100,14 +100,16 @@ def make_meshes(
                 f"Is this the object? {outline.doubt.capitalize()}. If not, drag a box around it."
             )
             send({"doubt": doubt, "tool": "box"})
-        options = {
-            "progress": lambda stage, part: send({"progress": stage, "part": part}),
-            "category": category,
-            "smooth": smooth,
-            "guesses": GUESSES,
-        }
         made = {
-            label: reconstruct_guesses(model, picture.colors, outline.mask, **options)
+            label: reconstruct_guesses(
+                model,
+                picture.colors,
+                outline.mask,
+                category=category,
+                smooth=smooth,
+                guesses=GUESSES,
+                progress=lambda stage, part: send({"progress": stage, "part": part}),
+            )
             for label, model in models.items()
         }
         send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
@@ -123,9 +125,13 @@ def _message(label: str, made: Reconstruction) -> dict[str, Any]:
         raise ValueError(
             f"The model {label} makes an empty shape of this picture. Try another picture."
         )
-    glb = _base64(mesh_bytes(made.surface, "glb", "object"))
-    names = {"label": label, "kind": made.kind, "doubt": made.warning}
-    return names | {"glb": glb, "camera": _camera(made)}
+    return {
+        "label": label,
+        "kind": made.kind,
+        "doubt": made.warning,
+        "glb": _base64(mesh_bytes(made.surface, "glb", "object")),
+        "camera": _camera(made),
+    }
 
 
 def _camera(made: Reconstruction) -> dict[str, Any]:

@@ -103,9 +103,9 @@ def _seen(
         placed = view.place(points[None])
         x, y, z = camera.transform(placed)[0].unbind(1)
         grid = torch.stack([x, -y], 1)[None, None]
-        within = {"padding_mode": "border", "align_corners": False}
         found, depth, trusted = (
-            F.grid_sample(v[None], grid, **within)[0, :, 0] for v in (pixels, depth_map, reliable)
+            F.grid_sample(v[None], grid, padding_mode="border", align_corners=False)[0, :, 0]
+            for v in (pixels, depth_map, reliable)
         )
         to_eye = F.normalize(camera.eye[0].float() - placed[0], dim=1)
         slant = (((normals * to_eye).sum(1) - options.grazing) / (0.6 - options.grazing)).clamp(

@@ -31,15 +31,6 @@ AZIMUTHS = 24  # azimuth cells from -180 degrees on, whose centres are tried
 TARGET_SIZE = 256  # side of a target in pixels
 # Units of the parts of a view as variables: a step moves the outline about equally far for each.
 _SCALES = (60.0, 60.0, 1.0, 1.0)
-#: Options of torch's function `adam`. Its class Adam would import torch._dynamo, which takes a second.
-_ADAM = {
-    "beta1": 0.9,
-    "beta2": 0.999,
-    "eps": 1e-8,
-    "weight_decay": 0.0,
-    "amsgrad": False,
-    "maximize": False,
-}
 
 Shapes = Tensor | Sequence[Tensor]
 # called with the name of each stage and the share (0 .. 1) that is done
@@ -229,11 +220,21 @@ def descend(
         for value, gradient, (mean, square), rate in zip(
             variables, gradients, moments, rates, strict=True
         ):
-            now = {
-                "state_steps": [torch.tensor(float(step))],
-                "lr": rate * (1 - (1 - last) * step / steps),
-            }
-            adam([value], [gradient], [mean], [square], [], **now, **_ADAM)
+            adam(  # the class Adam would import torch._dynamo, which takes a second
+                [value],
+                [gradient],
+                [mean],
+                [square],
+                [],
+                [torch.tensor(float(step))],
+                lr=rate * (1 - (1 - last) * step / steps),
+                beta1=0.9,
+                beta2=0.999,
+                eps=1e-8,
+                weight_decay=0.0,
+                amsgrad=False,
+                maximize=False,
+            )
 
 
 class Fit(NamedTuple):
