@@ -106,6 +106,9 @@ def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
     )
     made = Reconstruction(Surface(vertices, torch.zeros(0, 3)), None, 40.0, view=view)
     camera = pictures._camera(made)
+    yaw, pitch = camera["yaw"], camera["pitch"]
+    towards = np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)
+    assert np.allclose(camera["axes"][2], towards, atol=1e-6), "the page turns it from there"
     points = vertices.numpy() @ mesh_to_object() @ np.transpose(camera["axes"])
     near = camera["focus"] / (camera["distance"] - points[:, 2])
     x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
