@@ -164,7 +164,7 @@ def reconstruct_guesses(
     outline = target.outline()
     if smooth:
         surface, view = inflate(target, options.smooth)
-        iou = float(view.ious(surface.vertices[None], surface.faces, outline))
+        iou = float(view.ious(surface.vertices, surface.faces, outline))
         yield Reconstruction(surface, stored, 0.0, iou, view=view)
         return
     if not refined or not isinstance(method, MeshMethod):

@@ -249,7 +249,7 @@ def bend_best(
             log_distance=view.log_distance + math.log(size), shift=size * view.shift
         )
         vertices = size * vertices
-        iou = float(view.ious(vertices[None], faces, target.outline()))
+        iou = float(view.ious(vertices, faces, target.outline()))
         made.append((Fit(vertices, faces, view, iou), found.kinds[row]))
     return made
 
@@ -305,10 +305,7 @@ def compare_lines(found: Candidates, target: Target, options: MatchOptions) -> T
     lines = _lines_of(target, options)
     near_lines = _near(lines, options)
     normals = nmr.render_normals(
-        found.views.place(found.shapes),
-        found.faces,
-        found.views.cameras(),
-        image_size=options.ranked_size,
+        found.shapes, found.faces, found.views.cameras(), image_size=options.ranked_size
     ).numpy()
     down, across = (np.abs(np.diff(normals, axis=axis, append=0)).sum(3) for axis in (1, 2))
     apart = [

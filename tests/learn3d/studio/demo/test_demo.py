@@ -111,7 +111,7 @@ def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
     assert np.allclose(camera["axes"][2], towards, atol=1e-6), "the page turns it from there"
     points = vertices.numpy() @ mesh_to_object() @ np.transpose(camera["axes"])
     near = camera["focus"] / (camera["distance"] - points[:, 2])
-    x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
+    x, y, _ = view.cameras().transform(vertices)[0].unbind(1)
     for axis, wanted in enumerate((x, y)):
         assert np.allclose(2 * near * (points[:, axis] + camera["shift"][axis]), wanted, atol=1e-4)
 
