@@ -32,7 +32,6 @@ def color_mesh(
     view: View,
     target: Target,
     mirror: Tensor | None = None,
-    fine: bool = False,
     options: ColorOptions = DEFAULTS.color,
 ) -> Surface:
     """A surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if these are
@@ -42,8 +41,7 @@ def color_mesh(
     divided, so that the vertices show the picture. view: the picture's camera. mirror: float32
     [3, 3], the reflection that maps the shape to itself, None without symmetry.
     """
-    if fine:
-        mesh = divide(*mesh, options.coarse)
+    mesh = divide(*mesh, options.coarse)
     look_up_seen = _seen(*mesh, view, target, options)
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
@@ -59,13 +57,11 @@ def color_mesh(
     vertices, faces = mesh
     normals = nmr.vertex_normals(*mesh)
     colors = _spread(*look_up(vertices, normals), *mesh, normals, options)
-    if fine:
-        with_colors, faces = divide(torch.cat([vertices, colors], 1), faces, options.fine)
-        vertices, plain = with_colors.split(3, 1)
-        found, reliable = look_up(vertices, nmr.vertex_normals(vertices, faces))
-        share = (reliable.square() / (reliable.square() + options.sure))[:, None]
-        colors = (share * found + (1 - share) * plain).clamp(0, 1)
-    return Surface(vertices, faces, colors)
+    with_colors, faces = divide(torch.cat([vertices, colors], 1), faces, options.fine)
+    vertices, plain = with_colors.split(3, 1)
+    found, reliable = look_up(vertices, nmr.vertex_normals(vertices, faces))
+    share = (reliable.square() / (reliable.square() + options.sure))[:, None]
+    return Surface(vertices, faces, (share * found + (1 - share) * plain).clamp(0, 1))
 
 
 def clash(

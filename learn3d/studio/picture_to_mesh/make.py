@@ -176,27 +176,21 @@ def reconstruct_guesses(
     progress("camera", 0.0)
     predicted = predict(method, image, outline, options=options.fit)
     if model.templates is None:
-        kind, warning = (
-            (category, None) if category else recognize(model, model.chances(image), options.match)
-        )
-        fitted = fit(method, predicted, outline, progress, options.fit)
-        mesh = outer_surface(fitted.vertices, fitted.faces)
-        progress("colours", 0.9)
         mirror = method.generator.reflection
-        surface = color_mesh(mesh, fitted.view, target, mirror, options=options.color)
-        azimuth_deg = float(fitted.view.azimuth_deg)
-        yield Reconstruction(surface, stored, azimuth_deg, fitted.iou, kind, warning, fitted.view)
-        return
-    photo = colors, mask
-    matched = match_templates(model, predicted, photo, category, guesses, progress, options)
-    for fitted, kind, warning in matched:
+        kind, warning = recognize(model, model.chances(image, category), options.match)
+        fitted = fit(method, predicted, outline, progress, options.fit)
+        vertices, faces = outer_surface(fitted.vertices, fitted.faces)
+        fitted = fitted._replace(vertices=vertices, faces=faces)
+        made = [(fitted, category or kind, warning)]
+    else:
+        mirror, photo = MIRROR, (colors, mask)
+        made = match_templates(model, predicted, photo, category, guesses, progress, options)
+    for (vertices, faces, view, iou), kind, warning in made:
         progress("colours", 0.9)
-        mesh, view = (fitted.vertices, fitted.faces), fitted.view
-        surface = color_mesh(mesh, view, target, MIRROR, fine=True, options=options.color)
+        surface = color_mesh((vertices, faces), view, target, mirror, options.color)
         if surface.colors.mean(1).quantile(options.cut.black) < options.color.ink:
             surface = surface._replace(colors=(surface.colors + 1) / 2)
-        azimuth_deg = float(view.azimuth_deg)
-        yield Reconstruction(surface, stored, azimuth_deg, fitted.iou, kind, warning, view)
+        yield Reconstruction(surface, stored, float(view.azimuth_deg), iou, kind, warning, view)
 
 
 @torch.no_grad()

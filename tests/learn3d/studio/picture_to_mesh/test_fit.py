@@ -185,7 +185,7 @@ def test_the_line_around_a_drawing_stays_where_it_is_seen() -> None:
     pixels = seen(vertices, faces, (0.9, 0.1, 0.1), view).pixels
     line = distance_transform_edt(pixels[3] > 0.5) < 12
     pixels[:3, torch.from_numpy(line)] = 0
-    surface = color_mesh((vertices, faces), view, Target(pixels), fine=True)
+    surface = color_mesh((vertices, faces), view, Target(pixels))
     red, (x, y, z) = surface.colors[:, 0], surface.vertices.T
     back, front = z > 0.09, z < -0.09
     assert red[back].min() > 0.6, "hidden parts have no line"
