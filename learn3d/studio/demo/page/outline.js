@@ -80,7 +80,7 @@ export class Stage {
     this.#tool = tool;
     this.canvas.classList.toggle("tool", Boolean(tool));
     this.hint.textContent = `${this.#found}${HINTS[tool] || HINT}`;
-    for (const button of this.buttons) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
+    for (const button of this.buttons) button.ariaPressed = button.dataset.tool === tool;
   }
 
   /** The picture with the mask as transparency, as the page and `learn3d reconstruct` read it. */

@@ -6,7 +6,7 @@ import { Viewer } from "./viewer.js";
 
 const $ = (id) => document.getElementById(id);
 const STAGES = {
-  camera: "Finding the camera …", shape: "Finding the shape …", stretch: "Stretching the shape …",
+  camera: "Finding the camera …", shape: "Finding the shape …",
   surface: "Bending the shape to the outline …", colours: "Adding the colours …",
 };
 const READY = "Drag to turn it. Scroll, or pinch with two fingers, to zoom.";
@@ -23,7 +23,7 @@ const stage = new Stage($("picture"), $("hint"), [...document.querySelectorAll("
 });
 
 function press(button, on) {
-  button.setAttribute("aria-pressed", String(Boolean(on)));
+  button.ariaPressed = Boolean(on);
 }
 
 function makeButton(text, act, into) {
@@ -301,7 +301,7 @@ fetch("about").then((response) => response.json()).then((about) => {
   $("smooth").onclick = setSmooth;
   $("kinds").append($("smooth"));
   showKind();
-  $("trained").textContent = about.kinds.length > 1 ? `${about.kinds.slice(0, -1).join(", ")} or ${about.kinds.at(-1)}` : about.kinds[0];
+  $("trained").textContent = new Intl.ListFormat("en-GB", { type: "disjunction" }).format(about.kinds);
   for (const example of about.examples) {
     const image = Object.assign(document.createElement("img"), { src: `examples/${example}.png`, alt: example });
     const button = makeButton("", () => take(image.src, example), $("examples"));
