@@ -251,8 +251,8 @@ class Gate:
     """
 
     def __init__(self, app: ASGIApp, host: str) -> None:
-        machine = socket.gethostname()
-        self._app, self._names = app, {host, "localhost", machine, f"{machine}.local"}
+        machine = socket.gethostname().lower()  # as browsers write it
+        self._app, self._names = app, {host.lower(), "localhost", machine, f"{machine}.local"}
         self._pictures: Counter[str] = Counter()  # pictures in work or in the queue by address
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
