@@ -87,7 +87,8 @@ def _cut_out(
         try:
             mask = _ask_rembg(colors, box)
             return mask, f"by rembg ({REMBG})", _disagreement(colors, mask, box, options)
-        except Exception as error:  # weights that cannot be loaded, a version without this network
+        # weights that cannot be loaded, a version without this network, no onnxruntime
+        except (Exception, SystemExit) as error:
             failed = f", as rembg fails ({error})"
     mask, sureness = cut_out(colors, box, options)
     doubt = "the network is not sure of its outline" if sureness < options.sure else None

@@ -215,7 +215,7 @@ def test_a_part_of_what_may_be_a_larger_thing_is_less_sure(monkeypatch) -> None:
 class Rembg:
     """A stand-in for the package: everything red is the object."""
 
-    failure: Exception | None = None
+    failure: BaseException | None = None
     sessions: list[str]
 
     def __init__(self) -> None:
@@ -258,7 +258,10 @@ def test_rembg_is_used_if_installed_and_says_so(rembg, room, capsys) -> None:
 
 
 @needs_opencv
-@pytest.mark.parametrize("failure", [OSError("no route to host"), RuntimeError("odd weights")])
+@pytest.mark.parametrize(
+    "failure",
+    [OSError("no route to host"), RuntimeError("odd weights"), SystemExit("no onnxruntime")],
+)
 @pytest.mark.parametrize("box", [None, (114, 136, 192, 130)])
 def test_the_packages_network_does_what_rembg_cannot(rembg, room, failure, box) -> None:
     colors, inside = room
