@@ -117,7 +117,9 @@ def known_codes(
     of_kinds = (codes[classes == kind].numpy() for kind in range(dataset.num_classes))
     kinds = torch.stack(
         [
-            torch.from_numpy(kmeans2(c, count, minit="points", rng=np.random.default_rng(0))[0])
+            torch.from_numpy(
+                kmeans2(c, np.random.default_rng(0).choice(c, count, False), minit="matrix")[0]
+            )
             for c in of_kinds
         ]
     )
