@@ -105,7 +105,7 @@ def make_meshes(
                 model,
                 picture.colors,
                 outline.mask,
-                category=category,
+                category=category if category in model.categories else None,
                 smooth=smooth,
                 guesses=GUESSES,
                 progress=lambda stage, part: send({"progress": stage, "part": part}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import io
 import socket
 import time
@@ -96,6 +97,17 @@ def test_a_doubtful_outline_is_said_and_gets_its_mesh(finished_run) -> None:
     asked = "Is this the object? Its outline touches the border of the picture."
     assert doubt == {"doubt": f"{asked} If not, drag a box around it.", "tool": "box"}
     assert [step["part"] for step in steps] == [0.0, 0.3, 0.7, 0.9] and last["meshes"]
+
+
+def test_a_kind_is_told_to_the_models_that_know_it(finished_run) -> None:
+    model = load_model(finished_run)
+    other = model._replace(config=dataclasses.replace(model.config, category="car"))
+    colors = np.full((100, 120, 3), 200, np.uint8)
+    colors[30:70, 30:90] = (150, 30, 30)
+    picture = pictures.Picture(colors, np.full((100, 120), 255, np.uint8))
+    sent: list[dict] = []
+    pictures.make_meshes({"a": model, "b": other}, picture, sent.append, category="car")
+    assert [made["kind"] for made in sent[-1]["meshes"]] == [None, "car"]
 
 
 def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
