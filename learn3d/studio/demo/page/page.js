@@ -14,6 +14,7 @@ const FRAMES = 36, FRAME_SIDE = 320, FRAME_TIME = 8; // of a turntable; the time
 const THUMBNAIL = 64; // pixels
 
 let side = 512, current = null, views = [];
+let taken = 0; // pictures; one that is read faster than an earlier one stays
 let requests = []; // what was sent for this picture: the first one, then a correction each
 let kind = null, smooth = false; // what the visitor says about the object
 
@@ -36,12 +37,9 @@ function makeButton(text, act, into) {
 
 async function take(source, title) {
   cancel();
-  let picture;
-  try {
-    picture = await readPicture(source, title, side);
-  } catch {
-    return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
-  }
+  const mine = ++taken, picture = await readPicture(source, title, side).catch(() => null);
+  if (mine !== taken) return;
+  if (!picture) return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
   if (stage.picture) [kind, smooth] = [null, false];
   document.body.classList.add("given");
   $("invitation").hidden = true;
