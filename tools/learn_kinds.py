@@ -93,13 +93,13 @@ def draw_styled(category: str, rng: np.random.Generator, plain: bool) -> Picture
     elevation = 0.0 if level else rng.choice([rng.uniform(-5, 50), 80.0], p=[0.9, 0.1])
     angles = (torch.tensor([float(value)]) for value in (azimuth, elevation))
     view = frame_view(vertices, *angles)
-    placed, camera = view.place(vertices[None])[0], view.cameras()
+    camera = view.cameras()
     style = rng.choice(["rendering", "flat", "ink", "gaps"], p=shares)
     colors, lights = natural_look(vertices.numpy(), mesh.faces, rng)
     if style != "rendering":
         lights = studio_lights((0.3, 1.0, 0.2), rng.uniform(0.75, 1.0))
-    (rgb,), (alpha,) = photograph(placed, faces, colors, camera, image_size=192, lights=lights)
-    normals = nmr.render_normals(placed[None], faces, camera, image_size=192)[0].numpy()
+    (rgb,), (alpha,) = photograph(vertices, faces, colors, camera, image_size=192, lights=lights)
+    normals = nmr.render_normals(vertices, faces, camera, image_size=192)[0].numpy()
     bend = sum(np.abs(np.diff(normals, axis=axis, append=0)).sum(2) for axis in (0, 1))
     near = ndimage.binary_dilation(bend > 0.6, iterations=int(rng.integers(1, 6)))
     if style in ("flat", "ink"):

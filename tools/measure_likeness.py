@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import tyro
 
-from learn3d.pictures import Surface, draw_around, draw_surface, save_png, tile
+from learn3d.pictures import draw_around, draw_surface, save_png, tile
 from learn3d.studio.picture_to_mesh.fit import frame_target
 from learn3d.studio.picture_to_mesh.make import load_model, reconstruct_picture
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, Options
@@ -25,8 +25,7 @@ PAIRS = 6  # pictures in a row of the sheet
 def draw(photo: Photo, made: Reconstruction, blind: bool) -> list[np.ndarray]:
     """The framed picture (unless blind), the mesh from the picture's camera, and from 60 degrees beside it."""
     pixels = frame_target(photo.colors, photo.mask).pixels[:3].movedim(0, -1)
-    placed = Surface(made.view.place(made.surface.vertices[None])[0], *made.surface[1:])
-    (own,) = draw_surface(placed, [made.view.cameras()], image_size=SIDE)
+    (own,) = draw_surface(made.surface, [made.view.cameras()], image_size=SIDE)
     (beside,) = draw_around(made.surface, [made.azimuth_deg - 60], image_size=SIDE)
     return [*([] if blind else [(255 * pixels).round().byte().numpy()]), own, beside]
 

@@ -91,10 +91,15 @@ def check_mask(mask: np.ndarray, *, cropped: bool = False) -> None:
         )
     if inside.all():
         raise ValueError("its mask is all white: white must be the object, black the background")
-    border = np.concatenate([inside[0], inside[-1], inside[:, 0], inside[:, -1]])
+    border = np.concatenate(border_lines(inside))
     if border.mean() > (max(0.5, inside.mean()) if cropped else 0.5):
         question = "is the object black, or is the background part of the mask?"
         raise ValueError(f"its mask covers {border.mean():.0%} of the border; {question}")
+
+
+def border_lines(image: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The first and the last row, and the first and the last column, of an image [H, W, ...]."""
+    return image[0], image[-1], image[:, 0], image[:, -1]
 
 
 def mask_box(mask: np.ndarray) -> tuple[int, int, int, int]:

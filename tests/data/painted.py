@@ -15,6 +15,5 @@ def seen(
 ) -> Target:
     """The picture of a mesh [V, 3] from a view. `paint`: colours of its faces. `look`: options of `photograph`."""
     look = {"image_size": 256, "lights": nmr.Lights(1.0, 0.0)} | look
-    placed = view.place(vertices[None])[0]
-    (rgb,), alpha = photograph(placed, faces, paint, view.cameras(), **look)
+    (rgb,), alpha = photograph(vertices, faces, paint, view.cameras(), **look)
     return Target(torch.from_numpy(np.concatenate([np.moveaxis(rgb, -1, 0), alpha])) / 255)

@@ -56,7 +56,7 @@ def unpack(content: bytes, width: int, height: int, box: Box | None = None) -> P
     values = np.frombuffer(content, np.uint8)
     rgba = values[: 4 * pixels].reshape(height, width, 4)
     strokes = values[4 * pixels :].reshape(height, width) if len(values) > 4 * pixels else None
-    return Picture(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3].copy(), strokes, box)
+    return Picture(rgba[..., :3], rgba[..., 3], strokes, box)
 
 
 def outline_object(picture: Picture) -> tuple[Outline, str | None]:
@@ -100,14 +100,16 @@ def make_meshes(
                 f"Is this the object? {outline.doubt.capitalize()}. If not, drag a box around it."
             )
             send({"doubt": doubt, "tool": "box"})
-        options = {
-            "progress": lambda stage, part: send({"progress": stage, "part": part}),
-            "category": category,
-            "smooth": smooth,
-            "guesses": GUESSES,
-        }
         made = {
-            label: reconstruct_guesses(model, picture.colors, outline.mask, **options)
+            label: reconstruct_guesses(
+                model,
+                picture.colors,
+                outline.mask,
+                category=category if category in model.categories else None,
+                smooth=smooth,
+                guesses=GUESSES,
+                progress=lambda stage, part: send({"progress": stage, "part": part}),
+            )
             for label, model in models.items()
         }
         send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
@@ -123,23 +125,25 @@ def _message(label: str, made: Reconstruction) -> dict[str, Any]:
         raise ValueError(
             f"The model {label} makes an empty shape of this picture. Try another picture."
         )
-    glb = _base64(mesh_bytes(made.surface, "glb", "object"))
-    names = {"label": label, "kind": made.kind, "doubt": made.warning}
-    return names | {"glb": glb, "camera": _camera(made)}
+    return {
+        "label": label,
+        "kind": made.kind,
+        "doubt": made.warning,
+        "glb": _base64(mesh_bytes(made.surface, "glb", "object")),
+        "camera": _camera(made),
+    }
 
 
 def _camera(made: Reconstruction) -> dict[str, Any]:
     """The picture's camera in the mesh's axes: from where it looks, and if it was fitted, all of it."""
+    yaw = math.radians(made.azimuth_deg + 90)  # azimuth 0 sees the front, which is at x in the mesh
     if made.view is None:
-        angle = np.radians(made.azimuth_deg)
-        x, _, z = np.array([np.sin(angle), 0.0, -np.cos(angle)]) @ mesh_to_object()
-        return {"yaw": float(np.arctan2(x, z)), "pitch": 0.3}
+        return {"yaw": yaw, "pitch": 0.3}
     right, up, forward = made.view.axes()[0].numpy() @ mesh_to_object()
-    x, y, z = map(float, -forward)
     return {
-        "yaw": math.atan2(x, z),
-        "pitch": math.asin(max(-1.0, min(1.0, y))),
-        "axes": [right.tolist(), up.tolist(), [x, y, z]],
+        "yaw": yaw,
+        "pitch": math.radians(float(made.view.elevation_deg)),
+        "axes": [right.tolist(), up.tolist(), (-forward).tolist()],
         "distance": float(made.view.log_distance.exp()),
         "shift": made.view.shift[0].tolist(),
         "focus": 0.5 / math.tan(math.radians(LENS_HALF_FOV_DEG)),

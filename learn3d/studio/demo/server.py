@@ -180,11 +180,10 @@ def _json_line(message: dict) -> bytes:
 def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlette:
     """The page for these models, by their displayed names, served under the name `host`."""
     pictures = {category: example(category) for category in EXAMPLES}
-    kinds = [kind for model in models.values() for kind in model.categories]
+    kinds = dict.fromkeys(kind for model in models.values() for kind in model.categories)
 
     def about(_: Request) -> Response:
-        kinds_once = list(dict.fromkeys(kinds))
-        return JSONResponse({"kinds": kinds_once, "examples": list(pictures), "side": SIDE})
+        return JSONResponse({"kinds": list(kinds), "examples": list(pictures), "side": SIDE})
 
     def show_example(request: Request) -> Response:
         if (png := pictures.get(request.path_params["category"])) is None:
@@ -199,8 +198,7 @@ def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlett
             raise HTTPException(400, f"this is no picture as the page sends it: {error}") from None
         except (asyncio.TimeoutError, ClientDisconnect):
             raise HTTPException(408, "the picture did not arrive in time") from None
-        hints = {"category": category or None, "smooth": bool(smooth)}
-        work = partial(make_meshes, models, picture, **hints)
+        work = partial(make_meshes, models, picture, category=category or None, smooth=bool(smooth))
         address = request.client.host if request.client else ""
         return StreamingResponse(jobs.run(work, address), media_type="application/x-ndjson")
 
@@ -253,8 +251,8 @@ class Gate:
     """
 
     def __init__(self, app: ASGIApp, host: str) -> None:
-        machine = socket.gethostname()
-        self._app, self._names = app, {host, "localhost", machine, f"{machine}.local"}
+        machine = socket.gethostname().lower()  # as browsers write it
+        self._app, self._names = app, {host.lower(), "localhost", machine, f"{machine}.local"}
         self._pictures: Counter[str] = Counter()  # pictures in work or in the queue by address
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -312,18 +310,20 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     errors.format = lambda record: plain(logging.Handler.format(errors, record))
     logging.getLogger("uvicorn").addHandler(errors)
     jobs = JobQueue()
-    limits = {"timeout_graceful_shutdown": 5, "h11_max_incomplete_event_size": 2**14}
-    off = dict.fromkeys(("access_log", "server_header", "proxy_headers"), False)
-    options = {
-        "http": Connection,
-        "ws": "none",
-        "lifespan": "off",
-        "log_config": None,
-        "log_level": "error",
-    }
-    server = uvicorn.Server(
-        uvicorn.Config(application(models, host, jobs), **limits, **options, **off)
+    config = uvicorn.Config(
+        application(models, host, jobs),
+        http=Connection,
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        timeout_graceful_shutdown=5,
+        h11_max_incomplete_event_size=2**14,
     )
+    server = uvicorn.Server(config)
     jobs.closed = lambda: server.should_exit
     name = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     url = f"http://{name}:{listening.getsockname()[1]}/"

@@ -32,18 +32,16 @@ def color_mesh(
     view: View,
     target: Target,
     mirror: Tensor | None = None,
-    fine: bool = False,
     options: ColorOptions = DEFAULTS.color,
 ) -> Surface:
     """A surface with the colours of a picture. Hidden vertices get the colours of their mirror images or, if these are
     hidden, too, those of clearly seen parts at the same height, blended with their neighbours'.
 
-    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3]. view: the picture's
-    camera. mirror: float32 [3, 3], the reflection that maps the shape to itself, None without
-    symmetry. fine: divide long edges, so that the vertices show the picture.
+    mesh: vertices float32 [V, 3] in the object frame, and faces int64 [F, 3], whose long edges are
+    divided, so that the vertices show the picture. view: the picture's camera. mirror: float32
+    [3, 3], the reflection that maps the shape to itself, None without symmetry.
     """
-    if fine:
-        mesh = divide(*mesh, options.coarse)
+    mesh = divide(*mesh, options.coarse)
     look_up_seen = _seen(*mesh, view, target, options)
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
@@ -59,13 +57,11 @@ def color_mesh(
     vertices, faces = mesh
     normals = nmr.vertex_normals(*mesh)
     colors = _spread(*look_up(vertices, normals), *mesh, normals, options)
-    if fine:
-        with_colors, faces = divide(torch.cat([vertices, colors], 1), faces, options.fine)
-        vertices, plain = with_colors.split(3, 1)
-        found, reliable = look_up(vertices, nmr.vertex_normals(vertices, faces))
-        share = (reliable.square() / (reliable.square() + options.sure))[:, None]
-        colors = (share * found + (1 - share) * plain).clamp(0, 1)
-    return Surface(vertices, faces, colors)
+    with_colors, faces = divide(torch.cat([vertices, colors], 1), faces, options.fine)
+    vertices, plain = with_colors.split(3, 1)
+    found, reliable = look_up(vertices, nmr.vertex_normals(vertices, faces))
+    share = (reliable.square() / (reliable.square() + options.sure))[:, None]
+    return Surface(vertices, faces, (share * found + (1 - share) * plain).clamp(0, 1))
 
 
 def clash(
@@ -90,24 +86,23 @@ def _seen(
     vertices: Tensor, faces: Tensor, view: View, target: Target, options: ColorOptions
 ) -> LookUp:
     """The colours of a picture at the points of a surface that it shows."""
-    camera, size = view.cameras(), DEPTH_SIZE
+    camera = view.cameras()
     depth_map = nmr.render_depth(
-        view.place(vertices[None]), faces, camera, image_size=size, anti_aliasing=False
+        vertices, faces, camera, image_size=DEPTH_SIZE, anti_aliasing=False
     )
-    pixels, inside = target.pixels[:3], (target.pixels[3:] > 0.5).float()
-    widths = (1, options.border)
-    reliable = sum(1 - F.max_pool2d(1 - inside, 2 * width + 1, 1, width) for width in widths) / 2
+    pixels, outside = target.pixels[:3], (target.pixels[3:] <= 0.5).float()
+    near = [F.max_pool2d(outside, 2 * width + 1, 1, width) for width in (1, options.border)]
+    reliable = 1 - sum(near) / 2
     reliable[:, torch.from_numpy(_contour(target, options))] *= options.drawn
 
     def look_up(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        placed = view.place(points[None])
-        x, y, z = camera.transform(placed)[0].unbind(1)
+        x, y, z = camera.transform(points)[0].unbind(1)
         grid = torch.stack([x, -y], 1)[None, None]
-        within = {"padding_mode": "border", "align_corners": False}
         found, depth, trusted = (
-            F.grid_sample(v[None], grid, **within)[0, :, 0] for v in (pixels, depth_map, reliable)
+            F.grid_sample(v[None], grid, padding_mode="border", align_corners=False)[0, :, 0]
+            for v in (pixels, depth_map, reliable)
         )
-        to_eye = F.normalize(camera.eye[0].float() - placed[0], dim=1)
+        to_eye = F.normalize(camera.eye - points, dim=1)
         slant = (((normals * to_eye).sum(1) - options.grazing) / (0.6 - options.grazing)).clamp(
             0, 1
         )

@@ -9,9 +9,9 @@ from PIL import Image
 from scipy import ndimage
 from scipy.special import expit
 
-from learn3d.data.masks import keep_object
+from learn3d.data.masks import border_lines, keep_object
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, CutOptions
-from learn3d.studio.picture_to_mesh.outline_network import find_object, place_view
+from learn3d.studio.picture_to_mesh.outline_network import Part, find_object, place_view
 from learn3d.terminal import note
 
 KEEP, OBJECT, BACKGROUND, OPEN = range(4)  # labels of pixels in strokes
@@ -35,8 +35,8 @@ def find_outline(
 
     A thin frame around the picture is left out. With a box, or if the background is not plain,
     rembg finds the object if it is installed, or else `cut_out` does. On a plain background the
-    object is everything that differs from the border's colour. Raises ValueError as `cut_out`
-    does.
+    object is everything that differs from the border's colour. Raises ValueError as `check_box`
+    and `cut_out` do.
     """
     if box is not None:
         check_box(box, *colors.shape[1::-1])
@@ -60,25 +60,22 @@ def find_outline(
 
 def peel_frame(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> tuple[slice, slice]:
     """Rows and columns within a frame of one colour around a plain background; all if there is no such frame."""
+    whole = slice(None), slice(None)
     different = np.abs(colors.astype(int) - colors[0, 0]).max(2) > 255 * options.even
-    inner = []
-    for axis in (1, 0):
-        lines = np.flatnonzero(different.mean(axis) > 0.5)  # JPEG leaves spots in a frame
-        inner.append(slice(lines[0], lines[-1] + 1) if len(lines) else slice(None))
-    part = colors[tuple(inner)]
-    widest = options.frame * min(different.shape)
-    missing = max(
-        max(each.start or 0, side - (each.stop or side))
-        for each, side in zip(inner, different.shape, strict=True)
-    )
-    if part.shape == colors.shape or missing > widest or not is_plain(part, options):
-        return slice(None), slice(None)
+    # JPEG leaves spots in a frame
+    rows, columns = (np.flatnonzero(different.mean(axis) > 0.5) for axis in (1, 0))
+    if not (len(rows) and len(columns)):
+        return whole
+    inner = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    part = colors[inner]
+    height, width = different.shape
+    widest = max(rows[0], height - inner[0].stop, columns[0], width - inner[1].stop)
+    if not 0 < widest <= options.frame * min(height, width) or not is_plain(part, options):
+        return whole
     background = np.median(part[[0, -1]].reshape(-1, 3), axis=0)
     is_frame = np.abs(background - colors[0, 0]).max() > 255 * options.tolerance
-    object_there = (
-        0 < np.count_nonzero(threshold_mask(part, options)) < part.shape[0] * part.shape[1]
-    )
-    return tuple(inner) if is_frame and object_there else (slice(None), slice(None))
+    object_there = 0 < threshold_mask(part, options).mean() < 255
+    return inner if is_frame and object_there else whole
 
 
 def _cut_out(
@@ -90,7 +87,8 @@ def _cut_out(
         try:
             mask = _ask_rembg(colors, box)
             return mask, f"by rembg ({REMBG})", _disagreement(colors, mask, box, options)
-        except Exception as error:  # weights that cannot be loaded, a version without this network
+        # weights that cannot be loaded, a version without this network, no onnxruntime
+        except (Exception, SystemExit) as error:
             failed = f", as rembg fails ({error})"
     mask, sureness = cut_out(colors, box, options)
     doubt = "the network is not sure of its outline" if sureness < options.sure else None
@@ -101,19 +99,22 @@ def _disagreement(
     colors: np.ndarray, mask: np.ndarray, box: Box | None, options: CutOptions
 ) -> str | None:
     """A doubt if the package's network sees another object than rembg."""
-    (left, top, right, bottom), logits = find_object(colors, box and _corners(box))
-    size = right - left, bottom - top
-    seen = np.asarray(Image.fromarray(logits).resize(size, Image.Resampling.BILINEAR)) > 0
-    found = mask[top:bottom, left:right] > 127
+    view, logits = find_object(colors, box and _corners(box))
+    found = Image.fromarray(mask).resize(logits.shape, Image.Resampling.BILINEAR, view)
+    seen, found = logits > 0, np.asarray(found) > 127
     both, either = np.count_nonzero(seen & found), np.count_nonzero(seen | found)
     return "two networks see different outlines" if both < options.agreed * either else None
 
 
 def _box_doubt(mask: np.ndarray, box: Box, options: CutOptions) -> str | None:
     """A doubt if the object is much smaller than its box."""
-    rows, columns = (np.count_nonzero((mask > 127).any(axis)) for axis in (1, 0))
-    small = rows * columns < options.fills * box[2] * box[3]
+    small = _extent(mask > 127) < options.fills * box[2] * box[3]
     return "its outline fills little of the box" if small else None
+
+
+def _extent(inside: np.ndarray) -> int:
+    """The number of rows that a mask, bool [H, W], touches, times that of columns."""
+    return np.count_nonzero(inside.any(axis=0)) * np.count_nonzero(inside.any(axis=1))
 
 
 def _corners(box: Box) -> Box:
@@ -126,15 +127,10 @@ def find_doubt(mask: np.ndarray, most: int = 1, options: CutOptions = DEFAULTS.c
 
     most: sides of the picture that an object may touch.
     """
-    height, width = mask.shape
-    scale = min(1.0, options.side / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    inside = np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX)) > 127
-    sides = sum(
-        line.mean() > options.touched
-        for line in (inside[0], inside[-1], inside[:, 0], inside[:, -1])
-    )
-    if sides > most:
+    small = Image.fromarray(mask)
+    small.thumbnail((options.side, options.side), Image.Resampling.BOX)
+    inside = np.asarray(small) > 127
+    if sum(line.mean() > options.touched for line in border_lines(inside)) > most:
         return "its outline touches the border of the picture"
     length = np.count_nonzero(inside & ~ndimage.binary_erosion(inside))
     return (
@@ -156,20 +152,22 @@ def _ask_rembg(colors: np.ndarray, box: Box | None) -> np.ndarray:
     import rembg
 
     height, width = colors.shape[:2]
-    left, top, right, bottom = place_view(_corners(box or (0, 0, width, height)), width, height)
-    part = Image.fromarray(colors[top:bottom, left:right])
+    view = place_view(_corners(box or (0, 0, width, height)), width, height)
+    part = Image.fromarray(colors).crop(view)
     found = rembg.remove(part, session=_rembg_session(), only_mask=True)
-    mask = np.zeros((height, width), np.uint8)
+    return _in_picture(found, view, colors, box)
+
+
+def _in_picture(found: Image.Image, view: Part, colors: np.ndarray, box: Box | None) -> np.ndarray:
+    """The mask uint8 [H, W], 0 or 255, of a picture, from one of a view at any scale; 0 outside the box."""
+    left, top, right, bottom = view
+    found = found.resize((right - left, bottom - top), Image.Resampling.BILINEAR)
+    mask = np.zeros(colors.shape[:2], np.uint8)
     mask[top:bottom, left:right] = 255 * (np.asarray(found) > 127)
-    return mask if box is None else _within(mask, box)
-
-
-def _within(mask: np.ndarray, box: Box) -> np.ndarray:
-    """The mask, 0 outside the box."""
-    left, top, right, bottom = _corners(box)
-    kept = np.zeros_like(mask)
-    kept[top:bottom, left:right] = mask[top:bottom, left:right]
-    return kept
+    if box is not None:
+        x, y, width, height = box
+        mask[:y] = mask[y + height :] = mask[:, :x] = mask[:, x + width :] = 0
+    return mask
 
 
 def is_plain(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> bool:
@@ -180,7 +178,7 @@ def is_plain(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> bool:
 
 def _differences(colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Largest difference of a channel from the border's median, 0 .. 255: of all pixels [H, W], of the border [N]."""
-    border = np.concatenate([colors[0], colors[-1], colors[:, 0], colors[:, -1]])
+    border = np.concatenate(border_lines(colors))
     background = np.median(border, axis=0)
     return np.abs(colors - background).max(axis=-1), np.abs(border - background).max(axis=-1)
 
@@ -193,19 +191,20 @@ def threshold_mask(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> np
     but for some with the colour of the background, such as the gaps between the rungs of a chair.
     """
     difference, noise = _differences(colors)
-    found = difference > 255 * options.tolerance
-    inside = ndimage.binary_fill_holes(found)
-    holes, count = ndimage.label(inside & ~found)
-    numbers = np.arange(1, count + 1)
-    plain = (
-        ndimage.mean(
-            difference <= max(options.jpeg_noise, np.percentile(noise, 90)), holes, numbers
-        )
-        > options.plain_hole
-    )
-    share = ndimage.sum(holes > 0, holes, numbers) / max(1, inside.sum())
+    filled, holes, share = _holes(difference > 255 * options.tolerance)
+    alike = difference <= max(options.jpeg_noise, np.percentile(noise, 90))
+    plain = ndimage.mean(alike, holes, np.arange(len(share))) > options.plain_hole
     seen_through = plain & (share > options.holes[0]) & (share < options.holes[1])
-    return 255 * (inside & ~np.isin(holes, numbers[seen_through])).astype(np.uint8)
+    return 255 * (filled & ~seen_through[holes]).astype(np.uint8)
+
+
+def _holes(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A mask, bool [H, W], with its holes filled; their numbers, from 1; their areas over that of the filled mask."""
+    filled = ndimage.binary_fill_holes(inside)
+    holes, _ = ndimage.label(filled & ~inside)
+    share = np.bincount(holes.ravel()) / max(1, np.count_nonzero(filled))
+    share[0] = np.inf  # no hole
+    return filled, holes, share
 
 
 def check_box(box: Box, width: int, height: int) -> None:
@@ -229,16 +228,11 @@ def cut_out(
     colors: uint8 [H, W, 3]. Pixels outside the box are background. A network finds the object
     (`find_object`), and GrabCut decides where it is not certain. The sureness, in 0 .. 1, is the
     soft IoU of the mask and the network's probabilities; without a box it is smaller if the mask
-    may be a part of a larger thing. Raises ValueError without OpenCV, or if the box exceeds or
-    fills the picture.
+    may be a part of a larger thing. Raises ValueError without OpenCV.
     """
-    height, width = colors.shape[:2]
-    if box is not None:
-        check_box(box, width, height)
     view, logits = find_object(colors, box and _corners(box))
     if box is not None and logits.max() < 0:  # the box says that something is there
         logits = logits - np.quantile(logits, 1 - options.boxed)
-    left, top, right, bottom = view
     part = Image.fromarray(colors).crop(view)
     part.thumbnail((options.side, options.side), Image.Resampling.BOX)
     finer = Image.fromarray(logits).resize(part.size, Image.Resampling.BILINEAR)
@@ -248,19 +242,15 @@ def cut_out(
     sureness = np.minimum(chance, inside).sum() / np.maximum(chance, inside).sum()
     if box is None and inside.any():
         sureness /= _growth(inside, inside | (chance > options.possible))
-    larger = Image.fromarray(255 * inside.astype(np.uint8)).resize(
-        (right - left, bottom - top), Image.Resampling.BILINEAR
-    )
-    mask = np.zeros((height, width), np.uint8)
-    mask[top:bottom, left:right] = 255 * (np.asarray(larger) > 127)
-    return mask if box is None else _within(mask, box), float(sureness)
+    found = Image.fromarray(255 * inside.astype(np.uint8))
+    return _in_picture(found, view, colors, box), float(sureness)
 
 
 def _growth(inside: np.ndarray, possible: np.ndarray) -> float:
     """How many times as wide or high as a mask, bool [H, W], the possible pixels are that touch it."""
     regions, _ = ndimage.label(possible)
     larger = np.isin(regions, np.unique(regions[inside]))
-    sides = [[1 + np.ptp(np.flatnonzero(each.any(k))) for k in (0, 1)] for each in (larger, inside)]
+    sides = [[1 + np.ptp(line) for line in np.nonzero(each)] for each in (larger, inside)]
     return float(np.divide(*sides).max())
 
 
@@ -275,27 +265,19 @@ def _parts(inside: np.ndarray, options: CutOptions) -> list[np.ndarray]:
 
 def _only_object(inside: np.ndarray, options: CutOptions) -> np.ndarray:
     """A mask, bool [H, W], without specks and without small holes."""
-    filled = ndimage.binary_fill_holes(inside)
-    holes, _ = ndimage.label(filled & ~inside)
-    small = np.bincount(holes.ravel()) < options.small_hole * max(1, np.count_nonzero(filled))
-    small[0] = False
-    return keep_object(255 * (inside | small[holes]).astype(np.uint8))[0] > 127
+    _, holes, share = _holes(inside)
+    filled = inside | (share < options.small_hole)[holes]
+    return keep_object(255 * filled.astype(np.uint8))[0] > 127
 
 
 def _without_frame(colors: np.ndarray, mask: np.ndarray, options: CutOptions) -> np.ndarray:
     """The mask uint8 [H, W], or another part of it if the largest is an upright rectangle and less probable."""
     parts = _parts(mask > 127, options)
-    if len(parts) < 2 or not _is_rectangle(parts[0], options):
+    if len(parts) < 2 or np.count_nonzero(parts[0]) <= options.rectangle * _extent(parts[0]):
         return mask
     (left, top, right, bottom), _ = find_object(colors)
     best = max(parts, key=lambda part: np.count_nonzero(part[top:bottom, left:right]))
     return mask if best is parts[0] else 255 * best.astype(np.uint8)
-
-
-def _is_rectangle(inside: np.ndarray, options: CutOptions) -> bool:
-    """Whether a mask, bool [H, W], fills its box."""
-    extent = np.count_nonzero(inside.any(axis=0)) * np.count_nonzero(inside.any(axis=1))
-    return np.count_nonzero(inside) > options.rectangle * extent
 
 
 def correct(
@@ -309,13 +291,12 @@ def correct(
     Each pixel of the strokes is KEEP (as in the mask), OBJECT, BACKGROUND or OPEN (GrabCut
     decides). colors: uint8 [H, W, 3]. Raises ValueError without OpenCV.
     """
-    inside = np.where(strokes == OBJECT, True, (mask > 127) & (strokes != BACKGROUND))
+    inside = (strokes == OBJECT) | (mask > 127) & (strokes != BACKGROUND)
     unsure = strokes == OPEN
     if unsure.any():
-        rows, columns = (np.flatnonzero(unsure.any(axis=axis)) for axis in (1, 0))
         part = tuple(
-            slice(max(0, line[0] - options.around), line[-1] + 1 + options.around)
-            for line in (rows, columns)
+            slice(max(0, line.min() - options.around), line.max() + 1 + options.around)
+            for line in np.nonzero(unsure)
         )
         inside[part] = _grab_cut(colors[part], inside[part], unsure[part], options)
     return 255 * inside.astype(np.uint8)
@@ -336,13 +317,5 @@ def _grab_cut(
         return inside
     labels = inside + np.uint8(2) * unsure  # GC_BGD, GC_FGD, GC_PR_BGD, GC_PR_FGD
     cv2.setRNGSeed(0)
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(
-        np.ascontiguousarray(colors[..., ::-1]),
-        labels,
-        None,
-        *models,
-        options.rounds,
-        cv2.GC_INIT_WITH_MASK,
-    )
+    cv2.grabCut(colors, labels, None, None, None, options.rounds, cv2.GC_INIT_WITH_MASK)
     return labels % 2 == 1

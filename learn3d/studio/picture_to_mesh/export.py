@@ -5,7 +5,6 @@ from pathlib import Path
 
 from torch import Tensor
 
-from learn3d.methods.mesh_method import MeshMethod
 from learn3d.methods.multi_view import ManyViewsSettings
 from learn3d.methods.pose_invariant import PoseInvariantSettings
 from learn3d.runs import checkpoint
@@ -45,7 +44,7 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         note(
             f"note: {config.data} is missing, so reconstruction with this file cannot warn of unknown objects"
         )
-    elif isinstance(method, MeshMethod):
+    else:
         dataset = checkpoint.load_data(config, "train")
         if others is not None:
             note(f"learning other things ({len(others)} pictures) takes some minutes")

@@ -141,9 +141,13 @@ def known_codes(
         CENTRES // dataset.num_classes, int(classes.bincount(minlength=dataset.num_classes).min())
     )
     of_kinds = (codes[classes == kind].numpy() for kind in range(dataset.num_classes))
-    options = {"k": count, "minit": "points"}
     kinds = torch.stack(
-        [torch.from_numpy(kmeans2(c, **options, rng=np.random.default_rng(0))[0]) for c in of_kinds]
+        [
+            torch.from_numpy(
+                kmeans2(c, np.random.default_rng(0).choice(c, count, False), minit="matrix")[0]
+            )
+            for c in of_kinds
+        ]
     )
     if others is None:
         return KnownCodes(kinds)

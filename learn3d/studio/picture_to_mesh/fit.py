@@ -31,15 +31,6 @@ AZIMUTHS = 24  # azimuth cells from -180 degrees on, whose centres are tried
 TARGET_SIZE = 256  # side of a target in pixels
 # Units of the parts of a view as variables: a step moves the outline about equally far for each.
 _SCALES = (60.0, 60.0, 1.0, 1.0)
-#: Options of torch's function `adam`. Its class Adam would import torch._dynamo, which takes a second.
-_ADAM = {
-    "beta1": 0.9,
-    "beta2": 0.999,
-    "eps": 1e-8,
-    "weight_decay": 0.0,
-    "amsgrad": False,
-    "maximize": False,
-}
 
 Shapes = Tensor | Sequence[Tensor]
 # called with the name of each stage and the share (0 .. 1) that is done
@@ -81,32 +72,16 @@ class View(NamedTuple):
         cos, sin = r.cos()[:, None], r.sin()[:, None]
         return torch.stack([cos * right - sin * up, cos * up + sin * right, forward], 1)
 
-    def cameras(self) -> nmr.LookAt:
-        """The cameras, which look at the origin; `place` shifts shapes for them."""
-        right = self._replace(roll_deg=torch.zeros_like(self.roll_deg)).axes()[:, 0]
-        roll, elevation = (
-            torch.deg2rad(each)[:, None] for each in (self.roll_deg, self.elevation_deg)
-        )
-        # across the line of sight, the vertical axis is shorter by the cosine of the elevation
-        up = roll.cos() * torch.tensor([0.0, 1.0, 0.0]) + roll.sin() * elevation.cos() * right
-        return nmr.LookAt.from_angles(
-            self.log_distance.exp(),
-            self.elevation_deg,
-            self.azimuth_deg,
-            up=up,
-            half_fov_deg=LENS_HALF_FOV_DEG,
-        )
-
-    def place(self, vertices: Shapes) -> Shapes:
-        """Vertices [N, V, 3] or N tensors [V_n, 3], moved by `shift`."""
-        moves = (self.shift[:, :, None] * self.axes()[:, :2]).sum(1)
-        if isinstance(vertices, Tensor):
-            return vertices + moves[:, None]
-        return [shape + move for shape, move in zip(vertices, moves, strict=True)]
+    def cameras(self) -> nmr.Look:
+        """The cameras, shifted to the left and down where the object is shifted to the right and up."""
+        axes = self.axes()
+        origin = torch.cat([self.shift, self.log_distance.exp()[:, None]], 1)  # along their axes
+        eye = -(origin[:, :, None] * axes).sum(1)
+        return nmr.Look(eye, axes[:, 2], axes[:, 1], LENS_HALF_FOV_DEG)
 
     def silhouettes(self, vertices: Shapes, faces: Shapes, size: int = MASK_SIZE) -> Tensor:
-        """Silhouettes float32 [N, S, S] of shapes [N, V, 3], [1, V, 3] or N tensors [V_n, 3]."""
-        return nmr.render_silhouette(self.place(vertices), faces, self.cameras(), image_size=size)
+        """Silhouettes float32 [N, S, S] of shapes [N, V, 3] or N tensors [V_n, 3], or of one [V, 3]."""
+        return nmr.render_silhouette(vertices, faces, self.cameras(), image_size=size)
 
     def ious(self, vertices: Shapes, faces: Shapes, outline: Tensor) -> Tensor:
         """Soft IoU [N] of an outline [S, S] and the `silhouettes` of shapes."""
@@ -160,19 +135,19 @@ def find_view(
     azimuths = -180 + (torch.arange(AZIMUTHS) + 0.5) * (360 / AZIMUTHS)
     grid = torch.cartesian_prod(azimuths, torch.tensor(options.elevations_deg))
     view = frame_view(vertices, grid[:, 0], grid[:, 1], roll_deg)
-    scores = view.ious(vertices[None], faces, outline) + believed(view.azimuth_deg)
+    scores = view.ious(vertices, faces, outline) + believed(view.azimuth_deg)
     chosen = []
     for row in scores.argsort(descending=True).tolist():
         if all(wrap_deg(grid[row, 0] - grid[other, 0]).abs() > 20 for other in chosen):
             chosen.append(row)
     starts = view.select(torch.tensor(chosen[: options.starts]))
     view = minimize(
-        lambda view: -view.ious(vertices[None], faces, outline).sum(),
+        lambda view: -view.ious(vertices, faces, outline).sum(),
         starts,
         options.steps,
         (0.03,),
     )
-    ious = view.ious(vertices[None], faces, outline)
+    ious = view.ious(vertices, faces, outline)
     best = (ious + believed(view.azimuth_deg)).argmax()[None]
     return view.select(best), float(ious[best])
 
@@ -229,11 +204,21 @@ def descend(
         for value, gradient, (mean, square), rate in zip(
             variables, gradients, moments, rates, strict=True
         ):
-            now = {
-                "state_steps": [torch.tensor(float(step))],
-                "lr": rate * (1 - (1 - last) * step / steps),
-            }
-            adam([value], [gradient], [mean], [square], [], **now, **_ADAM)
+            adam(  # the class Adam would import torch._dynamo, which takes a second
+                [value],
+                [gradient],
+                [mean],
+                [square],
+                [],
+                [torch.tensor(float(step))],
+                lr=rate * (1 - (1 - last) * step / steps),
+                beta1=0.9,
+                beta2=0.999,
+                eps=1e-8,
+                weight_decay=0.0,
+                amsgrad=False,
+                maximize=False,
+            )
 
 
 class Fit(NamedTuple):

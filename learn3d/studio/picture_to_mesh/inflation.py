@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy import ndimage
-from scipy.sparse import coo_array, diags_array
+from scipy.sparse import diags_array, kronsum
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
@@ -42,7 +42,7 @@ def inflate(target: Target, options: SmoothOptions = DEFAULTS.smooth) -> tuple[S
     zero = torch.zeros(1)  # the grid is the picture, whatever thin parts smoothing has removed
     distance = zero + 0.5 / math.tan(math.radians(LENS_HALF_FOV_DEG))
     view = View(zero, zero, distance.log(), torch.zeros(1, 2), zero)
-    x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
+    x, y, _ = view.cameras().transform(vertices)[0].unbind(1)
     image = _spread(target, options.edge)
     size = image.shape[0]
     column, row = ((value * size).long().clamp(0, size - 1) for value in ((1 + x) / 2, (1 - y) / 2))
@@ -50,23 +50,13 @@ def inflate(target: Target, options: SmoothOptions = DEFAULTS.smooth) -> tuple[S
 
 
 def _solve(inside: np.ndarray) -> np.ndarray:
-    """u [H, W] with Laplace(u) = -4 in a mask, bool [H, W], and 0 elsewhere. The border of the array is outside."""
-    padded = np.pad(inside, 1)
-    count = int(padded.sum())
-    number = np.full(padded.shape, -1)
-    number[padded] = np.arange(count)
-    rows, columns = [], []
-    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        near = np.roll(number, step, axis)[padded]
-        rows.append(np.flatnonzero(near >= 0))
-        columns.append(near[near >= 0])
-    pairs = np.concatenate(rows), np.concatenate(columns)
-    system = diags_array(np.full(count, 4.0)) - coo_array(
-        (np.ones(len(pairs[0])), pairs), (count, count)
-    )
-    solved = np.zeros(padded.shape)
-    solved[padded] = spsolve(system.tocsc(), np.full(count, 4.0))
-    return solved[1:-1, 1:-1]
+    """u [S, S] with Laplace(u) = -4 in a mask, bool [S, S], and 0 elsewhere. The border of the array is outside."""
+    line = diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=inside.shape)
+    rows = np.flatnonzero(inside)
+    laplacian = kronsum(line, line, "csr")[rows][:, rows]
+    solved = np.zeros(inside.shape)
+    solved[inside] = spsolve(laplacian, np.full(len(rows), -4.0))
+    return solved
 
 
 def _spread(target: Target, edge: int) -> Tensor:

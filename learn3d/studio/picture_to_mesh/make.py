@@ -164,7 +164,7 @@ def reconstruct_guesses(
     outline = target.outline()
     if smooth:
         surface, view = inflate(target, options.smooth)
-        iou = float(view.ious(surface.vertices[None], surface.faces, outline))
+        iou = float(view.ious(surface.vertices, surface.faces, outline))
         yield Reconstruction(surface, stored, 0.0, iou, view=view)
         return
     if not refined or not isinstance(method, MeshMethod):
@@ -176,27 +176,21 @@ def reconstruct_guesses(
     progress("camera", 0.0)
     predicted = predict(method, image, outline, options=options.fit)
     if model.templates is None:
-        kind, warning = (
-            (category, None) if category else recognize(model, model.chances(image), options.match)
-        )
-        fitted = fit(method, predicted, outline, progress, options.fit)
-        mesh = outer_surface(fitted.vertices, fitted.faces)
-        progress("colours", 0.9)
         mirror = method.generator.reflection
-        surface = color_mesh(mesh, fitted.view, target, mirror, options=options.color)
-        azimuth_deg = float(fitted.view.azimuth_deg)
-        yield Reconstruction(surface, stored, azimuth_deg, fitted.iou, kind, warning, fitted.view)
-        return
-    photo = colors, mask
-    matched = match_templates(model, predicted, photo, category, guesses, progress, options)
-    for fitted, kind, warning in matched:
+        kind, warning = recognize(model, model.chances(image, category), options.match)
+        fitted = fit(method, predicted, outline, progress, options.fit)
+        vertices, faces = outer_surface(fitted.vertices, fitted.faces)
+        fitted = fitted._replace(vertices=vertices, faces=faces)
+        made = [(fitted, category or kind, warning)]
+    else:
+        mirror, photo = MIRROR, (colors, mask)
+        made = match_templates(model, predicted, photo, category, guesses, progress, options)
+    for (vertices, faces, view, iou), kind, warning in made:
         progress("colours", 0.9)
-        mesh, view = (fitted.vertices, fitted.faces), fitted.view
-        surface = color_mesh(mesh, view, target, MIRROR, fine=True, options=options.color)
+        surface = color_mesh((vertices, faces), view, target, mirror, options.color)
         if surface.colors.mean(1).quantile(options.cut.black) < options.color.ink:
             surface = surface._replace(colors=(surface.colors + 1) / 2)
-        azimuth_deg = float(view.azimuth_deg)
-        yield Reconstruction(surface, stored, azimuth_deg, fitted.iou, kind, warning, view)
+        yield Reconstruction(surface, stored, float(view.azimuth_deg), iou, kind, warning, view)
 
 
 @torch.no_grad()
@@ -222,12 +216,8 @@ def match_templates(
     likely, warning = recognize(model, chances, options.match)
 
     def find(
-        predicted: Prediction, chances: Tensor, level: bool = False, few: bool = False
+        predicted: Prediction, chances: Tensor, match: MatchOptions, level: bool = False
     ) -> Candidates:
-        match = options.match
-        if few:
-            fewer = {"candidates": match.candidates // 3, "kept": match.kept // 2}
-            match = dataclasses.replace(match, **fewer)
         known = model.templates, model.categories
         bonus = chances[:-1] / chances[:-1].sum().clamp(min=1e-6)
         if category is None:
@@ -235,20 +225,21 @@ def match_templates(
         bonus = match.kind * bonus.log()  # -inf for all others than a known category
         return find_candidates(*known, predicted, outline, bonus, level, match)
 
-    found = find(predicted, chances)
+    match = options.match
+    found = find(predicted, chances, match)
     best = float(found.views.ious(found.shapes, found.faces, outline).max())
-    if warning or best < options.match.poor:
+    if warning or best < match.poor:
         progress("camera", 0.5)
-        more = [found, find(predicted, chances, level=True, few=True)]
-        for roll_deg in _familiar_rolls(model, predicted, photo, category, options.match):
-            turned = torch.from_numpy(model.prepare(*_turn(*photo, roll_deg)))
+        few = dataclasses.replace(match, candidates=match.candidates // 3, kept=match.kept // 2)
+        more = [found, find(predicted, chances, few, level=True)]
+        for roll_deg, turned in _familiar_rolls(model, predicted, photo, category, match):
             rolled = predict(model.method, turned, outline, roll_deg, options.fit)
-            tried = find(rolled, model.chances(turned, category), few=True)
-            more.append(tried._replace(prior=tried.prior - options.match.rolled))
+            tried = find(rolled, model.chances(turned, category), few)
+            more.append(tried._replace(prior=tried.prior - match.rolled))
         found = join(more)
-        found = found._replace(prior=options.match.doubted * found.prior)
+        found = found._replace(prior=match.doubted * found.prior)
     progress("surface", 0.7)
-    bent = bend_best(found, target, guesses, options.match)
+    bent = bend_best(found, target, guesses, match)
     also = f"this may also be of the kind {likely}: tell its kind" if likely else None
     return [(fitted, kind, warning or (also if kind != likely else None)) for fitted, kind in bent]
 
@@ -259,8 +250,11 @@ def _familiar_rolls(
     photo: tuple[np.ndarray, np.ndarray],
     category: str | None,
     options: MatchOptions,
-) -> list[float]:
-    """The angles of the camera about its axis at which a picture is more like something that flies, the best first."""
+) -> list[tuple[float, Tensor]]:
+    """Angles of the camera about its axis at which a picture is more like something that flies, the best first.
+
+    Each comes with the stored image uint8 [4, S, S] of the picture, turned back by it.
+    """
     flies = torch.tensor([name in options.flying for name in model.categories])
     if model.known_codes is None or not flies.any():
         return []
@@ -268,20 +262,15 @@ def _familiar_rolls(
     def distance(code: Tensor) -> float:
         return float(model.known_codes.distances(code)[flies].min())
 
-    order = []
+    order, image = [], Image.fromarray(np.dstack(photo))
     for roll_deg in options.rolls_deg:
-        turned = torch.from_numpy(model.prepare(*_turn(*photo, roll_deg)))
-        if model.chances(turned, category)[:-1][flies].sum() > options.flies:
-            order.append((distance(model.method.encode(turned[None])[0]), roll_deg))
+        turned = np.asarray(image.rotate(-roll_deg, Image.Resampling.BILINEAR, expand=True))
+        stored = torch.from_numpy(model.prepare(turned[..., :3], turned[..., 3]))
+        if model.chances(stored, category)[:-1][flies].sum() > options.flies:
+            order.append((distance(model.method.encode(stored[None])[0]), roll_deg, stored))
     upright = distance(predicted.code[0])
-    return [roll for apart, roll in sorted(order) if apart < upright][: options.retries]
-
-
-def _turn(colors: np.ndarray, mask: np.ndarray, roll_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """A picture and its mask, turned clockwise: upright again if the camera was turned by this angle."""
-    image = Image.fromarray(np.dstack([colors, mask]))
-    turned = np.asarray(image.rotate(-roll_deg, Image.Resampling.BILINEAR, expand=True))
-    return np.ascontiguousarray(turned[..., :3]), turned[..., 3]
+    familiar = [(roll_deg, stored) for apart, roll_deg, stored in sorted(order) if apart < upright]
+    return familiar[: options.retries]
 
 
 def check_category(model: Model, category: str) -> None:
@@ -303,9 +292,8 @@ def recognize(
     if model.known_codes is None:
         return None, None
     kinds = model.categories
-    *of_kinds, other = chances.tolist()
-    kind = kinds[int(np.argmax(of_kinds))] if len(kinds) > 1 else None
-    if other < options.other:
+    kind = kinds[int(chances[:-1].argmax())] if len(kinds) > 1 else None
+    if chances[-1] < options.other:
         return kind, None
     known = ", ".join(kinds)
     return kind, f"this may be none of {known}: tell its kind, or ask for a smooth shape instead"
@@ -322,7 +310,6 @@ def input_azimuth_deg(
     """
     if not len(surface.faces):
         return 0.0
-    size = MASK_SIZE, MASK_SIZE
-    share = F.adaptive_avg_pool2d(torch.from_numpy(mask)[None, None].float() / 255, size)
+    share = F.adaptive_avg_pool2d(torch.from_numpy(mask)[None, None].float() / 255, MASK_SIZE)
     target = centre(share)[0, 0]
     return float(find_view(surface.vertices, surface.faces, target, probabilities)[0].azimuth_deg)

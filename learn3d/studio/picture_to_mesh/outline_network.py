@@ -75,15 +75,12 @@ def find_object(colors: np.ndarray, box: Place | None = None) -> tuple[Part, np.
     picture first, and then at the surroundings of the object that it saw.
     """
     height, width = colors.shape[:2]
-    if box is not None:
-        view = place_view(box, width, height)
-        return view, _look(colors, view, box)
     whole = 0, 0, width, height
-    view = place_view(_place(_look(colors, whole), whole), width, height)
-    return view, _look(colors, view)
+    view = place_view(box or _place(_look(colors, whole), width, height), width, height)
+    return view, _look(colors, view, box)
 
 
-def place_view(place: Place, width: float, height: float) -> Part:
+def place_view(place: Place, width: int, height: int) -> Part:
     """The part of a picture that the network sees: the object's place and `MARGIN` around it, within the picture."""
     left, top, right, bottom = place
     wide, high = (1 + 2 * MARGIN) * (right - left), (1 + 2 * MARGIN) * (bottom - top)
@@ -92,25 +89,19 @@ def place_view(place: Place, width: float, height: float) -> Part:
     return (
         max(0, math.floor(x - wide)),
         max(0, math.floor(y - high)),
-        min(math.ceil(width), math.ceil(x + wide)),
-        min(math.ceil(height), math.ceil(y + high)),
+        min(width, math.ceil(x + wide)),
+        min(height, math.ceil(y + high)),
     )
 
 
-def _place(logits: np.ndarray, view: Part) -> Place:
-    """The box of the object in a view: of the regions above half of the largest probability, the one with most."""
+def _place(logits: np.ndarray, width: int, height: int) -> Place:
+    """The box of the object in a picture: of the regions above half of the largest probability, the one with most."""
     inside = expit(logits)
     regions, count = ndimage.label(inside > min(0.5, inside.max() / 2))
     best = np.argmax(ndimage.sum(inside, regions, np.arange(1, count + 1)))
     rows, columns = ndimage.find_objects(regions)[best]
-    left, top, right, bottom = view
-    x, y = (right - left) / VIEW, (bottom - top) / VIEW
-    return (
-        left + x * columns.start,
-        top + y * rows.start,
-        left + x * columns.stop,
-        top + y * rows.stop,
-    )
+    x, y = width / VIEW, height / VIEW
+    return x * columns.start, y * rows.start, x * columns.stop, y * rows.stop
 
 
 @torch.no_grad()
@@ -120,14 +111,12 @@ def _look(colors: np.ndarray, view: Part, box: Place | None = None) -> np.ndarra
     They are the mean over several sizes and over mirror images.
     """
     left, top, right, bottom = view
-    part, answers = Image.fromarray(colors[top:bottom, left:right]), []
+    box = box or view
+    part, answers = Image.fromarray(colors).crop(view), []
     for side in SIDES:
-        allowed = np.ones((side, side), bool)
-        if box is not None:
-            columns = left + (np.arange(side) + 0.5) * (right - left) / side
-            rows = top + (np.arange(side) + 0.5) * (bottom - top) / side
-            allowed = ((rows > box[1]) & (rows < box[3]))[:, None]
-            allowed = allowed & (columns > box[0]) & (columns < box[2])
+        columns = left + (np.arange(side) + 0.5) * (right - left) / side
+        rows = top + (np.arange(side)[:, None] + 0.5) * (bottom - top) / side
+        allowed = (columns > box[0]) & (columns < box[2]) & (rows > box[1]) & (rows < box[3])
         seen = np.float32(part.resize((side, side), Image.Resampling.BOX)) / 255
         picture = torch.from_numpy(np.dstack([seen, allowed.astype(np.float32)])).movedim(-1, 0)
         logits = load_outline_network()(torch.stack([picture, picture.flip(-1)]))

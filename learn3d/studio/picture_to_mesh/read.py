@@ -80,19 +80,16 @@ def _is_black(colors: np.ndarray, mask: np.ndarray, options: CutOptions) -> bool
 
 def _reduce(colors: np.ndarray, box: Box | None, side: int) -> tuple[np.ndarray, Box | None]:
     """A picture and a box in it, reduced until its longer side has at most `side` pixels."""
-    height, width = colors.shape[:2]
+    image = Image.fromarray(colors)
     if box is not None:
-        check_box(box, width, height)
-    scale = min(1.0, side / max(height, width))
-    if scale == 1:
-        return colors, box
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    colors = np.asarray(Image.fromarray(colors).resize(size, Image.Resampling.BOX))
+        check_box(box, *image.size)
+    image.thumbnail((side, side), Image.Resampling.BOX)
     if box is not None:
+        scale = max(image.size) / max(colors.shape[:2])
         left, top = (int(scale * each) for each in box[:2])
         wide, high = (max(2, round(scale * each)) for each in box[2:])
-        box = left, top, min(wide, size[0] - left), min(high, size[1] - top)
-    return colors, box
+        box = left, top, min(wide, image.width - left), min(high, image.height - top)
+    return np.asarray(image), box
 
 
 def prepare_image(
@@ -117,11 +114,9 @@ def prepare_image(
     if LAYOUTS[layout].stretched:
         height, width = mask.shape
         left, top, right, bottom = mask_box(mask) if crop else (0, 0, width, height)
-        box = np.array([[left, top, right - left, bottom - top]])
-        planes = (colors, np.repeat(mask[..., None], 3, axis=2))
-        cut, cut_mask = (
-            Crops.from_images([np.ascontiguousarray(p)], box, size).cut()[0] for p in planes
-        )
+        box = left, top, right - left, bottom - top
+        images = colors, np.repeat(mask[..., None], 3, axis=2)
+        cut, cut_mask = Crops.from_images(images, np.array([box, box]), size).cut()
         return np.concatenate([cut, cut_mask[:1]])
     object_size = max(object_size, _MIN_OBJECT_SIZE) if crop else None
     return frame(colors, mask, size, object_size=object_size, inverted=LAYOUTS[layout].inverted)
@@ -138,15 +133,14 @@ def fill_drawing(
     if not _is_black(colors, mask, options):
         return colors, mask
     inside = mask > 127
-    left, top, right, bottom = mask_box(mask)
-    gap = math.ceil(options.gap * max(right - left, bottom - top))
-    padded = np.pad(inside, gap + 1)
-    near = ndimage.distance_transform_edt(~padded) <= gap
-    closed = padded | (ndimage.distance_transform_edt(near) > gap)
+    gap = math.ceil(options.gap * (1 + max(map(np.ptp, np.nonzero(inside)))))
+    margin = gap + 1
+    near = ndimage.distance_transform_edt(~np.pad(inside, margin)) <= gap
+    closed = ndimage.distance_transform_edt(near) > gap
     solid = ndimage.binary_fill_holes(closed)
     if inside.sum() > options.drawn * solid.sum():  # a silhouette, whose holes are seen through
         solid = closed
-    solid = solid[gap + 1 : -gap - 1, gap + 1 : -gap - 1]
+    solid = solid[margin:-margin, margin:-margin]
     alpha = mask[..., None] / 255
     on_white = (alpha * colors + 255 * (1 - alpha)).round().astype(np.uint8)
     return on_white, np.where(solid, np.uint8(255), mask)

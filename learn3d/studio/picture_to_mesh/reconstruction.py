@@ -69,8 +69,18 @@ def reconstruct_files(
         except (ValueError, OSError) as error:
             faults.append(error)
             continue
-        options = {"refined": refined, "category": category, "smooth": smooth, "guesses": guesses}
-        made = list(reconstruct_guesses(model, photo.colors, photo.mask, crop=crop, **options))
+        made = list(
+            reconstruct_guesses(
+                model,
+                photo.colors,
+                photo.mask,
+                crop=crop,
+                refined=refined,
+                category=category,
+                smooth=smooth,
+                guesses=guesses,
+            )
+        )
         for doubt in filter(None, (photo.doubt, made[0].warning)):
             note(f"warning: {name}: {doubt}")
         if made[0].kind:

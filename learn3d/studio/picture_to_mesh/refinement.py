@@ -33,10 +33,6 @@ def refine(
             "only meshes can be fitted to masks, and this run predicts voxels; leave out --refine"
         )
 
-    def decode(codes: Tensor) -> Tensor:
-        with method.autocast():
-            return method.generator(codes.to(method.device, non_blocking=True)).float().cpu()
-
     def fitted(
         start: Tensor, shape: Callable[[Tensor], Tensor], learning_rate: float, steps: int
     ) -> Tensor:
@@ -45,17 +41,14 @@ def refine(
 
         def loss() -> Tensor:
             vertices = shape(values)
-            silhouettes = nmr.render_silhouette(
-                vertices, method.faces, poses.cameras(), image_size=masks.shape[-1]
-            )
-            apart = nmr.losses.soft_iou_loss(silhouettes, masks)
+            apart = nmr.losses.soft_iou_loss(method.render(vertices, poses), masks)
             return apart + options.smoothness * nmr.losses.smoothness_loss(vertices, method.edges)
 
         descend(loss, [values], [learning_rate], steps, last=1.0)
         return values.detach()
 
-    codes = method.encode(images).cpu()
-    symmetrized = method.generator.symmetrized
+    codes = method.encode(images)
+    decode, symmetrized = method.generator, method.generator.symmetrized
     rate = options.code_rate * float(codes.square().mean().sqrt())
     codes = fitted(codes, decode, rate, options.code_steps)
     vertices = fitted(decode(codes), symmetrized, options.vertex_rate, options.vertex_steps)

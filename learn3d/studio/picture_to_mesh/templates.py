@@ -140,11 +140,9 @@ def template(category: str, number: int, loads: bool = False) -> tuple[Tensor, T
     the outline of a high one.
     """
     shape = numbered_shape(category, SEED, number, loads)
-    vertices = np.asarray(shape.vertices) @ mesh_to_object("y", "z").T
-    faces = np.asarray(shape.faces)[
-        :, ::-1
-    ].copy()  # the reflection of the frame turns them inside out
-    return torch.tensor(vertices, dtype=torch.float32), torch.from_numpy(faces.astype(np.int64))
+    vertices = torch.tensor(shape.vertices @ mesh_to_object("y", "z").T, dtype=torch.float32)
+    # the reflection of the frame turns the faces inside out
+    return vertices, torch.tensor(shape.faces).flip(1)
 
 
 class Candidates(NamedTuple):
@@ -156,10 +154,10 @@ class Candidates(NamedTuple):
     views: View  # the picture's cameras, if it shows them
     prior: Tensor  # float32 [N]: how likely they are, whatever their outlines
 
-    def select(self, rows: Sequence[int]) -> Candidates:
+    def select(self, rows: list[int]) -> Candidates:
         """The candidates `rows`."""
         lists = ([values[row] for row in rows] for values in self[:3])
-        return Candidates(*lists, self.views.select(torch.tensor(rows)), self.prior[list(rows)])
+        return Candidates(*lists, self.views.select(torch.tensor(rows)), self.prior[rows])
 
     def voxels(self) -> Tensor:
         """Their voxels, bool [N, 32, 32, 32]."""
@@ -231,12 +229,15 @@ def bend_best(
     They are ranked by outline, inner lines, and colours that differ between parts that are mirror
     images.
     """
-    scores = likeness(found, target.outline(), options) + found.prior
-    scores -= options.lines * compare_lines(found, target, options)
+
+    def scored(found: Candidates, outline: Tensor) -> Tensor:
+        lines = options.lines * compare_lines(found, target, options)
+        return likeness(found, outline, options) + found.prior - lines
+
+    scores = scored(found, target.outline())
     rows = spread_out(scores, found.voxels(), options.bent, options.alike)
     found = bend(found.select(rows), target.outline(), options)
-    scores = likeness(found, target.outline(options.ranked_size), options) + found.prior
-    scores -= options.lines * compare_lines(found, target, options)
+    scores = scored(found, target.outline(options.ranked_size))
     meshes = list(zip(found.shapes, found.faces, strict=True))
     views = [found.views.select(torch.tensor([row])) for row in range(len(meshes))]
     clashes = [clash(*each, target, MIRROR) for each in zip(meshes, views, strict=True)]
@@ -249,7 +250,7 @@ def bend_best(
             log_distance=view.log_distance + math.log(size), shift=size * view.shift
         )
         vertices = size * vertices
-        iou = float(view.ious(vertices[None], faces, target.outline()))
+        iou = float(view.ious(vertices, faces, target.outline()))
         made.append((Fit(vertices, faces, view, iou), found.kinds[row]))
     return made
 
@@ -305,10 +306,7 @@ def compare_lines(found: Candidates, target: Target, options: MatchOptions) -> T
     lines = _lines_of(target, options)
     near_lines = _near(lines, options)
     normals = nmr.render_normals(
-        found.views.place(found.shapes),
-        found.faces,
-        found.views.cameras(),
-        image_size=options.ranked_size,
+        found.shapes, found.faces, found.views.cameras(), image_size=options.ranked_size
     ).numpy()
     down, across = (np.abs(np.diff(normals, axis=axis, append=0)).sum(3) for axis in (1, 2))
     apart = [

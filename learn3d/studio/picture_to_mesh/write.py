@@ -1,5 +1,6 @@
 """Writes reconstructions: mesh files, turntables, and strips of views."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
@@ -58,45 +59,36 @@ def mesh_bytes(surface: Surface, kind: str, name: str) -> bytes:
     points = surface.vertices.detach().cpu().double().numpy() @ mesh_to_object()
     mesh = trimesh.Trimesh(points, surface.faces.cpu().numpy()[:, ::-1], process=False)
     if len(points):
-        mesh.vertex_normals = _unit_normals(mesh)
+        normals = np.array(mesh.vertex_normals)
+        normals[~normals.any(axis=1)] = (0, 1, 0)  # at vertices whose faces have no area
+        mesh.vertex_normals = normals
     if surface.colors is not None:
         colors = surface.colors.detach().cpu().clamp(0, 1)
         colors = colors**2.2 if kind == "glb" else colors  # colours of vertices in a GLB are linear
         mesh.visual.vertex_colors = (colors * 255).round().to(torch.uint8).numpy()
     if kind == "glb":
-        options = {"include_normals": True, "tree_postprocessor": _finish}
-        return trimesh.Scene({name: mesh}).export(file_type=kind, **options)
+        return trimesh.Scene({name: mesh}).export(
+            file_type=kind, include_normals=True, tree_postprocessor=_finish
+        )
     if kind == "obj":
         return mesh.export(file_type=kind, include_normals=True, header=PROGRAM).encode()
     content = mesh.export(file_type=kind, vertex_normal=True)
-    head, found, body = content.partition(b"end_header")
-    lines = [line for line in head.split(b"\n") if not line.startswith(b"comment")]
-    return b"\n".join([*lines[:2], b"comment " + PROGRAM.encode(), *lines[2:]]) + found + body
-
-
-def _unit_normals(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Normals of length 1, also at vertices whose faces have no area."""
-    normals = np.array(mesh.vertex_normals)
-    normals[np.linalg.norm(normals, axis=1) < 0.5] = (0, 1, 0)
-    return normals
+    return re.sub(b"comment .*", f"comment {PROGRAM}".encode(), content, count=1)
 
 
 def _finish(tree: dict) -> None:
     """Give the meshes of a glTF tree a matt, double-sided material, and name the program."""
     tree["asset"]["generator"] = PROGRAM
     matt = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    meshes = tree.get("meshes", ())  # an empty shape has none
-    if meshes:
+    for mesh in tree.get("meshes", ()):  # an empty shape has none, any other one
         tree["materials"] = [{"pbrMetallicRoughness": matt, "doubleSided": True}]
-    accessors = list(tree.get("accessors", ()))
-    for primitive in (each for mesh in meshes for each in mesh["primitives"]):
+        (primitive,) = mesh["primitives"]
         primitive["material"] = 0
-        views = [
-            (primitive["indices"], 34963),
-            *((k, 34962) for k in primitive["attributes"].values()),
-        ]
-        for number, target in views:  # the numbers of glTF for indices and for vertices
-            tree["bufferViews"][accessors[number]["bufferView"]]["target"] = target
+        views = tree["bufferViews"]
+        for view in views:
+            view["target"] = 34962  # glTF's number for vertices
+        indices = tree["accessors"][primitive["indices"]]
+        views[indices["bufferView"]]["target"] = 34963  # and for their numbers
 
 
 def save(

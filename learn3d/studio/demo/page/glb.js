@@ -1,25 +1,23 @@
 // Mesh files: reads the GLB of the server, writes OBJ.
 
-/** Positions, normals, colours (sRGB, 0 .. 255) and corners of the only mesh of a GLB file. */
+/** Positions, normals, colours (sRGB, 0 .. 255) and corners of the mesh of a GLB file as the server writes it. */
 export function readGlb(buffer) {
   const size = new DataView(buffer).getUint32(12, true);
   const tree = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 20, size)));
-  const kinds = { 5121: Uint8Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
-  const widths = { SCALAR: 1, VEC2: 2, VEC3: 3, VEC4: 4 };
+  const kinds = { 5121: Uint8Array, 5125: Uint32Array, 5126: Float32Array };
   const read = (number) => {
-    const accessor = tree.accessors[number], view = tree.bufferViews[accessor.bufferView];
-    const start = 28 + size + (view.byteOffset || 0) + (accessor.byteOffset || 0), kind = kinds[accessor.componentType];
-    const width = widths[accessor.type], count = accessor.count * width;
-    return { values: new kind(buffer.slice(start, start + count * kind.BYTES_PER_ELEMENT)), width };
+    const { bufferView, componentType } = tree.accessors[number], { byteOffset = 0, byteLength } = tree.bufferViews[bufferView];
+    const start = 28 + size + byteOffset;
+    return new kinds[componentType](buffer.slice(start, start + byteLength));
   };
-  const primitive = tree.meshes[0].primitives[0], given = primitive.attributes;
-  const points = read(given.POSITION).values, colors = new Float32Array(points.length).fill(170);
-  if (given.COLOR_0 !== undefined) {
-    const { values, width } = read(given.COLOR_0), most = { 1: 255, 2: 65535, 4: 1 }[values.BYTES_PER_ELEMENT];
+  const { attributes, indices } = tree.meshes[0].primitives[0];
+  const points = read(attributes.POSITION), colors = new Float32Array(points.length).fill(170);
+  if (attributes.COLOR_0 !== undefined) {
+    const rgba = read(attributes.COLOR_0);
     for (let v = 0; v < points.length / 3; v++)
-      for (let c = 0; c < 3; c++) colors[3 * v + c] = 255 * Math.pow(values[width * v + c] / most, 1 / 2.2);
+      for (let c = 0; c < 3; c++) colors[3 * v + c] = 255 * Math.pow(rgba[4 * v + c] / 255, 1 / 2.2);
   }
-  return { points, colors, normals: read(given.NORMAL).values, corners: read(primitive.indices).values };
+  return { points, colors, normals: read(attributes.NORMAL), corners: read(indices) };
 }
 
 /** A Wavefront file of a mesh; programs that know colours of vertices find them behind the positions. */

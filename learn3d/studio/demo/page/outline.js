@@ -77,10 +77,11 @@ export class Stage {
   }
 
   choose(tool) {
+    if (tool !== this.#tool) this.#drag = null; // what is drawn belongs to the tool that began it
     this.#tool = tool;
     this.canvas.classList.toggle("tool", Boolean(tool));
     this.hint.textContent = `${this.#found}${HINTS[tool] || HINT}`;
-    for (const button of this.buttons) button.setAttribute("aria-pressed", String(button.dataset.tool === tool));
+    for (const button of this.buttons) button.ariaPressed = button.dataset.tool === tool;
   }
 
   /** The picture with the mask as transparency, as the page and `learn3d reconstruct` read it. */
@@ -113,8 +114,11 @@ export class Stage {
     this.#draw();
     if (tool === "box" && Math.min(box[2], box[3]) > LEAST) this.correct({ alpha: given, box });
     if (tool === "box") return;
+    const alpha = this.mask || new Uint8ClampedArray(given.length);
     const strokes = this.#strokes(points, tool === "add" ? OBJECT : BACKGROUND);
-    this.correct({ alpha: this.mask || new Uint8ClampedArray(given.length), strokes });
+    this.correct({ alpha, strokes });
+    // until the server answers, so that a further stroke does not undo this one
+    this.mask = alpha.map((value, i) => ({ [OBJECT]: 255, [BACKGROUND]: 0 })[strokes[i]] ?? value);
   }
 
   /** The label of each pixel after a stroke, see learn3d.studio.picture_to_mesh.cutting. */

@@ -6,7 +6,7 @@ import { Viewer } from "./viewer.js";
 
 const $ = (id) => document.getElementById(id);
 const STAGES = {
-  camera: "Finding the camera …", shape: "Finding the shape …", stretch: "Stretching the shape …",
+  camera: "Finding the camera …", shape: "Finding the shape …",
   surface: "Bending the shape to the outline …", colours: "Adding the colours …",
 };
 const READY = "Drag to turn it. Scroll, or pinch with two fingers, to zoom.";
@@ -14,6 +14,7 @@ const FRAMES = 36, FRAME_SIDE = 320, FRAME_TIME = 8; // of a turntable; the time
 const THUMBNAIL = 64; // pixels
 
 let side = 512, current = null, views = [];
+let taken = 0; // pictures; one that is read faster than an earlier one stays
 let requests = []; // what was sent for this picture: the first one, then a correction each
 let kind = null, smooth = false; // what the visitor says about the object
 
@@ -23,7 +24,7 @@ const stage = new Stage($("picture"), $("hint"), [...document.querySelectorAll("
 });
 
 function press(button, on) {
-  button.setAttribute("aria-pressed", String(Boolean(on)));
+  button.ariaPressed = Boolean(on);
 }
 
 function makeButton(text, act, into) {
@@ -36,12 +37,9 @@ function makeButton(text, act, into) {
 
 async function take(source, title) {
   cancel();
-  let picture;
-  try {
-    picture = await readPicture(source, title, side);
-  } catch {
-    return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
-  }
+  const mine = ++taken, picture = await readPicture(source, title, side).catch(() => null);
+  if (mine !== taken) return;
+  if (!picture) return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
   if (stage.picture) [kind, smooth] = [null, false];
   document.body.classList.add("given");
   $("invitation").hidden = true;
@@ -301,7 +299,7 @@ fetch("about").then((response) => response.json()).then((about) => {
   $("smooth").onclick = setSmooth;
   $("kinds").append($("smooth"));
   showKind();
-  $("trained").textContent = about.kinds.length > 1 ? `${about.kinds.slice(0, -1).join(", ")} or ${about.kinds.at(-1)}` : about.kinds[0];
+  $("trained").textContent = new Intl.ListFormat("en-GB", { type: "disjunction" }).format(about.kinds);
   for (const example of about.examples) {
     const image = Object.assign(document.createElement("img"), { src: `examples/${example}.png`, alt: example });
     const button = makeButton("", () => take(image.src, example), $("examples"));

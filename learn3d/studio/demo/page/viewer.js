@@ -19,9 +19,7 @@ export class Viewer {
     this.still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.show(mesh, camera);
     this.reset();
-    canvas.tabIndex = 0;
-    canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", "The mesh; arrow keys turn it, + and - zoom, 0 resets the view");
+    Object.assign(canvas, { tabIndex: 0, role: "img", ariaLabel: "The mesh; arrow keys turn it, + and - zoom, 0 resets the view" });
     this.#listen();
     const step = (time) => {
       if (!canvas.isConnected) return; // another page is shown

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import io
 import socket
 import time
@@ -98,6 +99,17 @@ def test_a_doubtful_outline_is_said_and_gets_its_mesh(finished_run) -> None:
     assert [step["part"] for step in steps] == [0.0, 0.3, 0.7, 0.9] and last["meshes"]
 
 
+def test_a_kind_is_told_to_the_models_that_know_it(finished_run) -> None:
+    model = load_model(finished_run)
+    other = model._replace(config=dataclasses.replace(model.config, category="car"))
+    colors = np.full((100, 120, 3), 200, np.uint8)
+    colors[30:70, 30:90] = (150, 30, 30)
+    picture = pictures.Picture(colors, np.full((100, 120), 255, np.uint8))
+    sent: list[dict] = []
+    pictures.make_meshes({"a": model, "b": other}, picture, sent.append, category="car")
+    assert [made["kind"] for made in sent[-1]["meshes"]] == [None, "car"]
+
+
 def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
     """A point of the mesh is seen where the camera of the fit sees the same point of the object."""
     vertices = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) / 4
@@ -106,9 +118,12 @@ def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
     )
     made = Reconstruction(Surface(vertices, torch.zeros(0, 3)), None, 40.0, view=view)
     camera = pictures._camera(made)
+    yaw, pitch = camera["yaw"], camera["pitch"]
+    towards = np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)
+    assert np.allclose(camera["axes"][2], towards, atol=1e-6), "the page turns it from there"
     points = vertices.numpy() @ mesh_to_object() @ np.transpose(camera["axes"])
     near = camera["focus"] / (camera["distance"] - points[:, 2])
-    x, y, _ = view.cameras().transform(view.place(vertices[None]))[0].unbind(1)
+    x, y, _ = view.cameras().transform(vertices)[0].unbind(1)
     for axis, wanted in enumerate((x, y)):
         assert np.allclose(2 * near * (points[:, axis] + camera["shift"][axis]), wanted, atol=1e-4)
 

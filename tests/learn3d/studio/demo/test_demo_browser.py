@@ -264,6 +264,11 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(single, visit, tmp_path) 
     assert part(above) < plain + 0.01
     answered(tab, press(tab, "Undo"))
     assert part(above) > plain + 0.02, "as before the last stroke"
+    press(tab, "Add")()
+    # the second stroke does not wait for the answer to the first
+    drag(tab, tab.locator("#picture"), (0.6, 0.2), (0.65, 0.2))
+    correct("Add", (0.75, 0.2), (0.8, 0.2))
+    assert part(slice(180, 195)) > 0.03 and part(slice(225, 240)) > 0.03, "both count"
     correct("Box", (0.58, 0.2), (0.92, 0.8))
     assert part(left) == 0 and part(right) > 0.3
     answered(tab, press(tab, "Start over"))

@@ -39,6 +39,13 @@ def test_its_own_page_can(client, name) -> None:
     )
 
 
+def test_names_with_capitals_are_its_own_in_lower_case(monkeypatch) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "DESKTOP-AB12")
+    gate = serving.Gate(None, "Server.example")
+    for host in ("desktop-ab12:7860", "desktop-ab12.local:7860", "server.example"):
+        assert gate._refuse(host, f"http://{host}") is None
+
+
 @pytest.mark.parametrize(
     "header",
     [

@@ -40,7 +40,7 @@ def test_the_shape_is_closed_symmetric_and_has_the_outline(name) -> None:
     mirrored = surface.vertices * torch.tensor([1, 1, -1])
     assert torch.cdist(mirrored, surface.vertices).min(1).values.max() < 1 / DEFAULTS.smooth.grid
     wanted = {"line": 0.2, "dots": 0.2}.get(name, 0.9)
-    assert float(view.ious(surface.vertices[None], surface.faces, picture.outline())) > wanted
+    assert float(view.ious(surface.vertices, surface.faces, picture.outline())) > wanted
 
 
 def test_a_disc_becomes_an_ellipsoid_with_the_picture_on_both_sides() -> None:
@@ -63,7 +63,7 @@ def test_thin_parts_are_whole_and_move_nothing() -> None:
     assert mesh.body_count == 1 and float(surface.vertices[:, 1].max()) > 0.3, "an antenna"
     wide, high = (np.ptp(each.vertices[:, :2].numpy(), axis=0) for each in (alone, surface))
     assert high[0] == pytest.approx(wide[0], rel=0.05)
-    place = view.cameras().transform(surface.vertices[None])[0, :, :2]
+    place = view.cameras().transform(surface.vertices)[0, :, :2]
     seen = 2 * surface.vertices[:, :2]
     flat = surface.vertices[:, 2].abs() < 0.01
     torch.testing.assert_close(place[flat], seen[flat], atol=0.01, rtol=0.01)

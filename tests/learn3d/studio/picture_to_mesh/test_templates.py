@@ -122,7 +122,7 @@ def test_a_table_gets_the_slanted_legs_and_the_round_top_of_a_picture() -> None:
     view = frame_view(vertices, torch.tensor([0.0]), torch.tensor([0.0]))
     x, y, z = vertices.unbind(1)
     wanted = torch.stack([x * (1 - 0.6 * y), y - 0.3 * (y > 0.2) * x**2, z], 1)
-    outline = view.silhouettes(wanted[None], faces)[0]
+    outline = view.silhouettes(wanted, faces)[0]
     found = Candidates([vertices], [faces], ["table"], view, torch.zeros(1))
     bent = bend(found, outline, DEFAULTS.match)
     before, after = (
