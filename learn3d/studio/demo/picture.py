@@ -88,13 +88,13 @@ def make_meshes(
     """
     try:
         outline, left_out = outline_object(picture)
-        mask = _base64(np.packbits(outline.mask > 127).tobytes())
-        send({"mask": mask, "how": outline.how, "left_out": left_out})
         try:
             check_mask(outline.mask, cropped=True)
         except ValueError:
             send({"error": "No object was found. Drag a box around it.", "tool": "box"})
             return
+        mask = _base64(np.packbits(outline.mask > 127).tobytes())
+        send({"mask": mask, "how": outline.how, "left_out": left_out})
         if outline.doubt:
             doubt = (
                 f"Is this the object? {outline.doubt.capitalize()}. If not, drag a box around it."

@@ -137,7 +137,7 @@ class MatchOptions:
     """Weight of the codes' cosine and of the bonus below."""
     other: float = 0.8
     """Probability of other things from which a picture is doubted."""
-    kind: float = 0.2
+    kind: float = 0.4
     """Weight of the logarithm of their category's probability, beside the cosine."""
     least: float = 0.01
     """Least probability that counts."""

@@ -17,6 +17,7 @@ let side = 512, current = null, views = [];
 let taken = 0; // pictures; one that is read faster than an earlier one stays
 let requests = []; // what was sent for this picture: the first one, then a correction each
 let kind = null, smooth = false; // what the visitor says about the object
+let shown = null; // what belongs to the meshes on the page, for a correction that is cancelled
 
 const stage = new Stage($("picture"), $("hint"), [...document.querySelectorAll("[data-tool]")], (correction) => {
   requests.push(correction);
@@ -40,6 +41,7 @@ async function take(source, title) {
   const mine = ++taken, picture = await readPicture(source, title, side).catch(() => null);
   if (mine !== taken) return;
   if (!picture) return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
+  shown = null;
   if (stage.picture) [kind, smooth] = [null, false];
   document.body.classList.add("given");
   $("invitation").hidden = true;
@@ -63,6 +65,7 @@ for (const [button, input] of [["choose", "file"], ["photograph", "camera"]]) {
   $(button).onclick = () => $(input).click();
   $(input).onchange = () => { if ($(input).files.length) takeFile($(input).files); $(input).value = ""; };
 }
+$("invitation").onclick = () => $("file").click();
 addEventListener("paste", (event) => { if (event.clipboardData.files.length) takeFile(event.clipboardData.files); });
 addEventListener("dragover", (event) => { event.preventDefault(); $("over").hidden = false; });
 addEventListener("dragleave", (event) => { if (!event.relatedTarget) $("over").hidden = true; });
@@ -72,12 +75,31 @@ addEventListener("drop", (event) => { event.preventDefault(); $("over").hidden =
 
 $("undo").onclick = () => { requests.pop(); send(); };
 $("again").onclick = () => { requests.length = 1; send(); };
-$("cancel").onclick = () => { cancel(); say("Cancelled."); };
+$("cancel").onclick = () => {
+  const back = shown && document.body.classList.contains("waiting");
+  cancel();
+  say(back ? "Cancelled. This is the mesh of before." : "Cancelled.");
+};
 
+/** End the work, and go back to the meshes that were there before it. */
 function cancel() {
   current?.abort();
   busy(false);
-  if (document.body.classList.contains("waiting")) showNothing();
+  if (!document.body.classList.contains("waiting")) return;
+  if (!shown) return showNothing();
+  document.body.classList.remove("waiting");
+  ({ kind, smooth } = shown);
+  requests = [...shown.requests];
+  stage.showMask(...shown.outline);
+  $("doubt").textContent = shown.doubt;
+  $("doubt").hidden = !shown.doubt;
+  $("downloads").hidden = false;
+  showKind();
+  allowUndo();
+}
+
+function allowUndo() {
+  $("undo").disabled = $("again").disabled = requests.length < 2;
 }
 
 /** Say what the object is, or nothing if `which` was said already. */
@@ -124,7 +146,7 @@ async function send() {
   if (strokes) body.set(strokes, 4 * pixels);
   const hints = Object.entries({ box, category: kind, smooth: smooth && 1 }).filter(([, value]) => value);
   const query = new URLSearchParams([["width", width], ["height", height], ...hints]);
-  $("undo").disabled = $("again").disabled = requests.length < 2;
+  allowUndo();
   $("downloads").hidden = $("doubt").hidden = true;
   document.body.classList.add("waiting");
   showKind();
@@ -168,13 +190,18 @@ const unpack = (made) => { const glb = bytes(made.glb); return { ...made, glb, m
 async function handle(message, mine) {
   if (mine.signal.aborted) return;
   if (message.place) say(message.place === 1 ? "You are next …" : `${message.place} are before you …`);
-  if (message.mask) stage.showMask(bytes(message.mask), `Found ${message.how}. ${message.left_out ? `Note: ${message.left_out}. ` : ""}`);
+  if (message.mask) {
+    mine.outline = [bytes(message.mask), `Found ${message.how}. ${message.left_out ? `Note: ${message.left_out}. ` : ""}`];
+    stage.showMask(...mine.outline);
+  }
   if (message.tool) stage.choose(message.tool); // the server asks for a box
   if (message.doubt) addDoubt(message.doubt);
   if (message.progress && !mine.shown) { say(STAGES[message.progress]); busy(0.1 + 0.85 * message.part); }
   if (message.meshes) {
     mine.shown = mine.ended = true;
     present(message.meshes.map(unpack));
+    const doubt = $("doubt").hidden ? "" : $("doubt").textContent;
+    shown = { requests: [...requests], kind, smooth, doubt, outline: mine.outline };
     say("Looking for other guesses …");
     busy(true);
   }
@@ -192,7 +219,7 @@ async function handle(message, mine) {
 // The meshes
 
 function showNothing() {
-  views = [];
+  [views, shown] = [[], null];
   document.body.classList.remove("waiting");
   $("views").innerHTML = '<div class="card view empty"><p class="quiet">The mesh appears here.</p></div>';
 }

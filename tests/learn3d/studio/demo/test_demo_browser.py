@@ -220,6 +220,16 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
     assert [message["meshes"][0]["kind"] for message in said if "meshes" in message] == ["sofa"]
     said = answered(tab, press(tab, "Smooth shape instead"))
     assert [message["meshes"][0]["kind"] for message in said if "meshes" in message] == [None]
+    before = pixels(canvas)
+    press(tab, "It is a car")()
+    press(tab, "Cancel")()
+    assert tab.get_by_text("This is the mesh of before").is_visible()
+    assert np.abs(pixels(canvas) - before).max() < 20
+    assert tab.get_by_role("button", name="Turntable").is_visible()
+    assert tab.locator("#kinds [aria-pressed=true]").all_inner_texts() == ["Smooth shape instead"]
+    if width < 400:
+        tools, mesh = (tab.locator(name).bounding_box() for name in ("#tools", "#views"))
+        assert tools["y"] < mesh["y"], "the tools are below the picture"
     with tab.expect_file_chooser():
         press(tab, "Another picture")()
     assert packaged.errors.read_text() == ""
