@@ -4,7 +4,7 @@ python -m pip install resvg_py
 python tools/learn_kinds.py
 
 It learns from other icon sets than those of draw_strangers.py, and changes `small.safetensors`: the
-same command gives the same file on the same machine. It needs npm, and a core for ten minutes.
+same command gives the same file on the same machine. It needs npm, and a core for half an hour.
 """
 
 import json
