@@ -199,7 +199,11 @@ def threshold_mask(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> np
 
 
 def _holes(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mask, bool [H, W], with its holes filled; their numbers, from 1; their areas over that of the filled mask."""
+    """Fill the holes of a mask, bool [H, W].
+
+    Returns the filled mask; the number of the hole at each pixel, int [H, W], 0 where there is
+    none; and the area of each hole as a share of the filled mask, inf for number 0.
+    """
     filled = ndimage.binary_fill_holes(inside)
     holes, _ = ndimage.label(filled & ~inside)
     share = np.bincount(holes.ravel()) / max(1, np.count_nonzero(filled))

@@ -58,7 +58,7 @@ def reconstruct_files(
     further guesses (see `save`). Raises ValueError if a mask is empty, or if a result would
     replace an input file. A file that cannot be used is an error after all others are done.
     """
-    names = check_files(folder, images, masks)
+    names = check_files(folder, images, masks, guesses)
     model = load_model(run, which)
     if category is not None:
         check_category(model, category)
@@ -85,8 +85,8 @@ def reconstruct_files(
             note(f"warning: {name}: {doubt}")
         if made[0].kind:
             note(f"{name}: category {', '.join(each.kind for each in made)}")
-        names = [name, *(f"{name}-{k}" for k in range(2, len(made) + 1))]
-        paths += save(folder, names, made, model.config.layout, mesh_format)
+        results = _result_names(name, len(made))
+        paths += save(folder, results, made, model.config.layout, mesh_format)
     for error in faults[1:]:
         note(f"error: {error}")
     if faults:
@@ -94,21 +94,34 @@ def reconstruct_files(
     return paths
 
 
-def check_files(folder: Path, images: Sequence[Path], masks: Sequence[Path]) -> list[str]:
-    """Names of the results of images. ValueError if a result would replace a file, or if a mask is missing."""
+def check_files(
+    folder: Path, images: Sequence[Path], masks: Sequence[Path], guesses: int = 1
+) -> list[str]:
+    """Names for the results of images, numbered if two results would have the same name.
+
+    Raises ValueError if a result would replace a file that was given, or if a mask is missing.
+    """
     if masks and len(masks) != len(images):
         raise ValueError(
             f"there are {len(images)} images but {len(masks)} masks; give one mask per image, or none"
         )
+
+    def results() -> list[str]:
+        return [result for name in names for result in _result_names(name, guesses)]
+
     names = [Path(image).stem for image in images]
-    if len(set(names)) < len(names):
+    if len(set(results())) < len(results()):
         names = [f"{number:03}_{name}" for number, name in enumerate(names)]
     given = {Path(path).resolve() for path in (*images, *masks)}
-    if taken := [name for name in names if Path(folder, f"{name}.png").resolve() in given]:
+    if taken := [name for name in results() if Path(folder, f"{name}.png").resolve() in given]:
         raise ValueError(
             f"{taken[0]}.png would replace an image that was given; give another --output"
         )
     return names
+
+
+def _result_names(name: str, guesses: int) -> list[str]:
+    return [name, *(f"{name}-{k}" for k in range(2, guesses + 1))]
 
 
 def reconstruct_dataset(

@@ -78,7 +78,7 @@ $("again").onclick = () => { requests.length = 1; send(); };
 $("cancel").onclick = () => {
   const back = shown && document.body.classList.contains("waiting");
   cancel();
-  say(back ? "Cancelled. This is the mesh of before." : "Cancelled.");
+  say(back ? "Cancelled. This is the previous mesh." : "Cancelled.");
 };
 
 /** End the work, and go back to the meshes that were there before it. */

@@ -223,7 +223,7 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
     before = pixels(canvas)
     press(tab, "It is a car")()
     press(tab, "Cancel")()
-    assert tab.get_by_text("This is the mesh of before").is_visible()
+    assert tab.get_by_text("This is the previous mesh").is_visible()
     assert np.abs(pixels(canvas) - before).max() < 20
     assert tab.get_by_role("button", name="Turntable").is_visible()
     assert tab.locator("#kinds [aria-pressed=true]").all_inner_texts() == ["Smooth shape instead"]

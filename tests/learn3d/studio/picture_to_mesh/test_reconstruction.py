@@ -17,7 +17,11 @@ from learn3d.data.poses import wrap_deg
 from learn3d.pictures import Surface
 from learn3d.studio.picture_to_mesh.make import input_azimuth_deg, load_model, reconstruct
 from learn3d.studio.picture_to_mesh.read import prepare_image, read_picture
-from learn3d.studio.picture_to_mesh.reconstruction import reconstruct_dataset, reconstruct_files
+from learn3d.studio.picture_to_mesh.reconstruction import (
+    check_files,
+    reconstruct_dataset,
+    reconstruct_files,
+)
 from learn3d.studio.picture_to_mesh.write import export_mesh
 from learn3d.studio.shapes import make_shape
 
@@ -117,6 +121,16 @@ def test_results_never_replace_the_images(finished_run, tmp_path) -> None:
     ):
         reconstruct_files(finished_run, tmp_path, [tmp_path / "chair.png"])
     assert (tmp_path / "chair.png").read_bytes() == before
+
+
+def test_guesses_replace_no_file(finished_run, tmp_path) -> None:
+    images = [tmp_path / "in" / name for name in ("a.png", "a-2.png")]
+    assert check_files(tmp_path, images, ()) == ["a", "a-2"]
+    assert check_files(tmp_path, images, (), guesses=2) == ["000_a", "001_a-2"]
+    with pytest.raises(ValueError, match=r"a-2\.png would replace an image that was given"):
+        reconstruct_files(
+            finished_run, tmp_path / "in", [tmp_path / "a.png"], [images[1]], guesses=3
+        )
 
 
 def test_an_empty_shape_is_an_empty_file(tmp_path) -> None:
