@@ -206,40 +206,45 @@ def match_templates(
     """Up to `guesses` bent templates, the best first, each with its category and a warning or None.
 
     photo: colours uint8 [H, W, 3] and mask uint8 [H, W], for which the model has `predicted` code
-    and view. If the best stretched template fits badly, or the picture is like none that the model
-    knows, level cameras, all categories, and cameras that are turned about their axes are tried.
+    and view. Templates of all categories are also tried from level cameras. If the best stretched
+    template fits badly, or the picture is like none that the model knows, predictions count less,
+    and cameras that are turned about their axes are tried.
     """
     progress("shape", 0.3)
     target = frame_target(*photo)
     outline = target.outline()
     chances = model.chances(torch.from_numpy(model.prepare(*photo)), category)
-    likely, warning = recognize(model, chances, options.match)
+    match = options.match
+    likely, warning = recognize(model, chances, match)
 
     def find(
-        predicted: Prediction, chances: Tensor, match: MatchOptions, level: bool = False
+        predicted: Prediction, chances: Tensor, options: Options, level: bool = False
     ) -> Candidates:
         known = model.templates, model.categories
         bonus = chances[:-1] / chances[:-1].sum().clamp(min=1e-6)
         if category is None:
             bonus = bonus.clamp(min=match.least)
         bonus = match.kind * bonus.log()  # -inf for all others than a known category
-        return find_candidates(*known, predicted, outline, bonus, level, match)
+        return find_candidates(*known, predicted, outline, bonus, level, options)
 
-    match = options.match
-    found = find(predicted, chances, match)
+    found = find(predicted, chances, options)
     best = float(found.views.ious(found.shapes, found.faces, outline).max())
+    few = dataclasses.replace(match, candidates=match.candidates // 3, kept=match.kept // 2)
+    few = dataclasses.replace(options, match=few)
+    level = find(predicted, chances, few, level=True)
     if warning or best < match.poor:
         progress("camera", 0.5)
-        few = dataclasses.replace(match, candidates=match.candidates // 3, kept=match.kept // 2)
-        more = [found, find(predicted, chances, few, level=True)]
+        more = [found, level]
         for roll_deg, turned in _familiar_rolls(model, predicted, photo, category, match):
             rolled = predict(model.method, turned, outline, roll_deg, options.fit)
             tried = find(rolled, model.chances(turned, category), few)
             more.append(tried._replace(prior=tried.prior - match.rolled))
         found = join(more)
         found = found._replace(prior=match.doubted * found.prior)
+    else:
+        found = join([found, level.believing(predicted, options.fit)])
     progress("surface", 0.7)
-    bent = bend_best(found, target, guesses, match)
+    bent = bend_best(found, target, guesses, options)
     also = f"this may also be of the kind {likely}: tell its kind" if likely else None
     return [(fitted, kind, warning or (also if kind != likely else None)) for fitted, kind in bent]
 

@@ -40,7 +40,7 @@ from learn3d.studio.picture_to_mesh.fit import (
     minimize,
     soft_ious,
 )
-from learn3d.studio.picture_to_mesh.options import DEFAULTS, MatchOptions
+from learn3d.studio.picture_to_mesh.options import DEFAULTS, FitOptions, MatchOptions, Options
 from learn3d.studio.shapes import CATEGORIES, numbered_shape
 
 SEED = 0  # seed of the data set with the templates; shapes of other seeds are no templates
@@ -159,6 +159,11 @@ class Candidates(NamedTuple):
         lists = ([values[row] for row in rows] for values in self[:3])
         return Candidates(*lists, self.views.select(torch.tensor(rows)), self.prior[rows])
 
+    def believing(self, predicted: Prediction, options: FitOptions) -> Candidates:
+        """The candidates, less likely the less probable their azimuths are."""
+        believed = belief(self.views.azimuth_deg, predicted.azimuths, options.belief)
+        return self._replace(prior=self.prior + believed)
+
     def voxels(self) -> Tensor:
         """Their voxels, bool [N, 32, 32, 32]."""
         return torch.cat([_voxels(*mesh) for mesh in zip(self.shapes, self.faces, strict=True)])
@@ -179,18 +184,18 @@ def find_candidates(
     outline: Tensor,
     bonus: Tensor,
     level: bool = False,
-    options: MatchOptions = DEFAULTS.match,
+    options: Options = DEFAULTS,
 ) -> Candidates:
     """The templates with codes nearest to the predicted one that fit an outline [64, 64] best, stretched.
 
     Three numbers rank a template: the likeness of its outline in the predicted view, its voxel IoU
     with the predicted shape, and the cosine of the two codes with the bonus [N] of its category,
-    see `Templates.nearest`. level: take as many templates of each category, seen at elevation 0
-    from four sides.
+    see `Templates.nearest`. The predicted azimuths count, too, unless level: then as many templates
+    of each category are taken, seen at elevation 0 from four sides.
     """
-    each_alone = torch.eye(len(bonus)).log() + bonus
+    match, each_alone = options.match, torch.eye(len(bonus)).log() + bonus
     groups = [row for row in each_alone if row.isfinite().any()] if level else [bonus]
-    count = options.candidates // len(groups)
+    count = match.candidates // len(groups)
     nearest = [templates.nearest(predicted.code[0], categories, row, count) for row in groups]
     names = [name for each, _ in nearest for name in each]
     nearness = torch.cat([cosines for _, cosines in nearest])
@@ -199,17 +204,14 @@ def find_candidates(
     found = Candidates(shapes, faces, [name for name, _ in names], views, nearness)
     voxels = found.voxels()
     alike = nmr.metrics.voxel_iou(voxels, _voxels(*predicted.shape[:2]).expand_as(voxels))
-    prior = options.voxels * alike.float() + options.nearness * nearness
+    prior = match.voxels * alike.float() + match.nearness * nearness
     found = found._replace(prior=prior)
     if level:
         found = _seen_level(found)
-    scores = likeness(found, outline, options) + found.prior
-    best = scores.topk(min(options.kept, len(scores))).indices.tolist()
-    found = stretch(found.select(best), outline, options)
-    if level:  # an azimuth that was predicted for a doubtful picture says nothing of these cameras
-        return found
-    believed = belief(found.views.azimuth_deg, predicted.azimuths)
-    return found._replace(prior=found.prior + believed)
+    scores = likeness(found, outline, match) + found.prior
+    best = scores.topk(min(match.kept, len(scores))).indices.tolist()
+    found = stretch(found.select(best), outline, match)
+    return found if level else found.believing(predicted, options.fit)
 
 
 def _seen_level(found: Candidates) -> Candidates:
@@ -222,7 +224,7 @@ def _seen_level(found: Candidates) -> Candidates:
 
 @torch.no_grad()
 def bend_best(
-    found: Candidates, target: Target, guesses: int = 1, options: MatchOptions = DEFAULTS.match
+    found: Candidates, target: Target, guesses: int = 1, options: Options = DEFAULTS
 ) -> list[tuple[Fit, str]]:
     """Bend the best of stretched candidates, and rank them: up to `guesses` different ones, the best first, with kinds.
 
@@ -230,20 +232,24 @@ def bend_best(
     images.
     """
 
+    match = options.match
+
     def scored(found: Candidates, outline: Tensor) -> Tensor:
-        lines = options.lines * compare_lines(found, target, options)
-        return likeness(found, outline, options) + found.prior - lines
+        lines = match.lines * compare_lines(found, target, match)
+        return likeness(found, outline, match) + found.prior - lines
 
     scores = scored(found, target.outline())
-    rows = spread_out(scores, found.voxels(), options.bent, options.alike)
-    found = bend(found.select(rows), target.outline(), options)
-    scores = scored(found, target.outline(options.ranked_size))
+    rows = spread_out(scores, found.voxels(), match.bent, match.alike)
+    found = bend(found.select(rows), target.outline(), match)
+    scores = scored(found, target.outline(match.ranked_size))
     meshes = list(zip(found.shapes, found.faces, strict=True))
     views = [found.views.select(torch.tensor([row])) for row in range(len(meshes))]
-    clashes = [clash(*each, target, MIRROR) for each in zip(meshes, views, strict=True)]
-    scores -= options.colors * torch.tensor(clashes)
+    clashes = [
+        clash(*each, target, MIRROR, options.color) for each in zip(meshes, views, strict=True)
+    ]
+    scores -= match.colors * torch.tensor(clashes)
     made = []
-    for row in spread_out(scores, found.voxels(), guesses, options.alike):
+    for row in spread_out(scores, found.voxels(), guesses, match.alike):
         (vertices, faces), view = meshes[row], views[row]
         size = 1 / float(np.ptp(vertices.numpy(), axis=0).max())  # the longest side becomes 1 again
         view = view._replace(
