@@ -112,7 +112,14 @@ def make_meshes(
             )
             for label, model in models.items()
         }
-        send({"meshes": [_message(label, next(guesses)) for label, guesses in made.items()]})
+        first = {label: next(guesses) for label, guesses in made.items()}
+        if empty := [label for label, each in first.items() if not len(each.surface.faces)]:
+            doubt = f"An empty shape was made of this picture by {', '.join(empty)}."
+            if len(empty) == len(first):
+                raise ValueError(f"{doubt} Try another one.")
+            send({"doubt": doubt})
+        shown = (each for each in first.items() if each[0] not in empty)
+        send({"meshes": [_message(*each) for each in shown]})
         for label, guesses in made.items():
             for guess in guesses:
                 send({"guess": _message(label, guess)})
@@ -121,10 +128,6 @@ def make_meshes(
 
 
 def _message(label: str, made: Reconstruction) -> dict[str, Any]:
-    if not len(made.surface.faces):
-        raise ValueError(
-            f"The model {label} makes an empty shape of this picture. Try another picture."
-        )
     return {
         "label": label,
         "kind": made.kind,

@@ -293,11 +293,6 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
 
     Raises ValueError or OSError if a model cannot be loaded or the address is in use.
     """
-    names = [Path(run).resolve().name for run in runs]
-    names = [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
-    models = dict(zip(names, map(load_model, runs), strict=True)) or {
-        "small model": load_model(None)
-    }
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         listening = socket.create_server((host, port), family=family, backlog=VISITORS)
@@ -305,6 +300,11 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
         raise OSError(
             f"cannot open a page at {host}:{port}; give another --port or --host"
         ) from error
+    names = [Path(run).resolve().name for run in runs]
+    names = [f"{name} {i + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+    models = dict(zip(names, map(load_model, runs), strict=True)) or {
+        "small model": load_model(None)
+    }
     errors = logging.StreamHandler()
     # it may contain a visitor's text
     errors.format = lambda record: plain(logging.Handler.format(errors, record))

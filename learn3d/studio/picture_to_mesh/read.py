@@ -89,6 +89,8 @@ def _reduce(colors: np.ndarray, box: Box | None, side: int) -> tuple[np.ndarray,
         left, top = (int(scale * each) for each in box[:2])
         wide, high = (max(2, round(scale * each)) for each in box[2:])
         box = left, top, min(wide, image.width - left), min(high, image.height - top)
+        if box == (0, 0, *image.size):  # nearly the whole picture
+            box = None
     return np.asarray(image), box
 
 

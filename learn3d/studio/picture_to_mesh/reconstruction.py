@@ -31,8 +31,14 @@ def cut_out_pictures(model: Model, folder: Path) -> Tensor:
     files = sorted(folder.rglob("*.png"))
     if not files:
         raise ValueError(f"there is no PNG file in {folder}; give a folder of cut-out pictures")
-    photos = ((colors, keep_object(mask)[0]) for colors, mask in map(read_photo, files))
-    return torch.from_numpy(np.stack([model.prepare(*photo) for photo in photos]))
+    images = []
+    for file in files:
+        colors, mask = read_photo(file)
+        try:
+            images.append(model.prepare(colors, keep_object(mask)[0]))
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
+    return torch.from_numpy(np.stack(images))
 
 
 def reconstruct_files(

@@ -44,7 +44,7 @@ export class Stage {
   #outline = null; // a canvas
   #found = "";
 
-  /** correct({ alpha, strokes, box }) is called for each correction. */
+  /** correct({ alpha, strokes, box, before }) is called for each correction; before: the mask that was shown, or null. */
   constructor(canvas, hint, buttons, correct) {
     Object.assign(this, { canvas, hint, buttons, correct });
     for (const button of buttons) button.onclick = () => this.choose(this.#tool === button.dataset.tool ? null : button.dataset.tool);
@@ -112,11 +112,11 @@ export class Stage {
     const points = this.#drag, box = boxOf(points), { given } = this.picture, tool = this.#tool;
     this.#drag = null;
     this.#draw();
-    if (tool === "box" && Math.min(box[2], box[3]) > LEAST) this.correct({ alpha: given, box });
+    if (tool === "box" && Math.min(box[2], box[3]) > LEAST) this.correct({ alpha: given, box, before: this.mask });
     if (tool === "box") return;
     const alpha = this.mask || new Uint8ClampedArray(given.length);
     const strokes = this.#strokes(points, tool === "add" ? OBJECT : BACKGROUND);
-    this.correct({ alpha, strokes });
+    this.correct({ alpha, strokes, before: this.mask });
     // until the server answers, so that a further stroke does not undo this one
     this.mask = alpha.map((value, i) => ({ [OBJECT]: 255, [BACKGROUND]: 0 })[strokes[i]] ?? value);
   }

@@ -73,13 +73,20 @@ addEventListener("drop", (event) => { event.preventDefault(); $("over").hidden =
 
 // Corrections
 
-$("undo").onclick = () => { requests.pop(); send(); };
-$("again").onclick = () => { requests.length = 1; send(); };
+$("undo").onclick = () => goBack(requests.length - 1);
+$("again").onclick = () => goBack(1);
 $("cancel").onclick = () => {
   const back = shown && document.body.classList.contains("waiting");
   cancel();
   say(back ? "Cancelled. This is the previous mesh." : "Cancelled.");
 };
+
+/** Take back all corrections from the one with this number on. */
+function goBack(number) {
+  stage.mask = requests[number].before; // for a stroke that comes before the answer
+  requests.length = number;
+  send();
+}
 
 /** End the work, and go back to the meshes that were there before it. */
 function cancel() {

@@ -110,6 +110,28 @@ def test_a_kind_is_told_to_the_models_that_know_it(finished_run) -> None:
     assert [made["kind"] for made in sent[-1]["meshes"]] == [None, "car"]
 
 
+def test_an_empty_shape_hides_no_mesh_of_another_model(finished_run, monkeypatch) -> None:
+    model, original = load_model(finished_run), pictures.reconstruct_guesses
+    empty = model._replace(object_size=0.5)
+    nothing = Surface(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64))
+
+    def guess(model, *picture, **options):
+        for made in original(model, *picture, **options):
+            yield made._replace(surface=nothing) if model is empty else made
+
+    monkeypatch.setattr(pictures, "reconstruct_guesses", guess)
+    colors = np.full((100, 120, 3), 200, np.uint8)
+    colors[30:70, 30:90] = (150, 30, 30)
+    picture = pictures.Picture(colors, np.full((100, 120), 255, np.uint8))
+    sent: list[dict] = []
+    pictures.make_meshes({"a": empty, "b": model}, picture, sent.append)
+    assert [made["label"] for made in sent[-1]["meshes"]] == ["b"]
+    doubt = "An empty shape was made of this picture by a."
+    assert sent[-2] == {"doubt": doubt}
+    pictures.make_meshes({"a": empty}, picture, sent.append)
+    assert sent[-1] == {"error": f"{doubt} Try another one."}
+
+
 def test_the_camera_of_a_mesh_is_that_of_its_picture() -> None:
     """A point of the mesh is seen where the camera of the fit sees the same point of the object."""
     vertices = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) / 4

@@ -267,6 +267,10 @@ def test_pictures_of_other_things_teach_what_to_warn_of(
     Image.fromarray(np.concatenate([255 - image[:3], image[3:]]).transpose(1, 2, 0)).save(
         tmp_path / "other.png"
     )
+    Image.new("RGBA", (9, 9)).save(tmp_path / "empty.png")
+    with pytest.raises(ValueError, match=r"empty\.png: .* no pixel above half"):
+        cut_out_pictures(model, tmp_path)
+    (tmp_path / "empty.png").unlink()
     export(finished_run, tmp_path / "small.safetensors", others=cut_out_pictures(model, tmp_path))
     assert "learning other things (1 pictures)" in capsys.readouterr().err
     known = load_model(tmp_path / "small.safetensors").known_codes

@@ -97,6 +97,8 @@ def test_a_large_picture_and_its_box_are_reduced_together(tmp_path) -> None:
     assert photo.colors.shape == (384, 512, 3) == (*photo.mask.shape, 3)
     assert (photo.mask[132:252, 218:336] > 127).mean() > 0.95
     assert (photo.mask > 127).sum() < 1.2 * 128**2
+    whole = read_picture(tmp_path / "large.png", None, (0, 0, 1199, 900))
+    assert (whole.mask > 127).any(), "a box of nearly the whole picture"
     with pytest.raises(ValueError, match="must lie within the 1200x900 pixels"):
         read_picture(tmp_path / "large.png", None, (1000, 0, 300, 300))
 
