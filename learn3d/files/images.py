@@ -28,7 +28,9 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
         try:
             image = Image.open(file, formats=formats)
         except UnidentifiedImageError:
-            raise ValueError("it has another format") from None
+            advice = "save it as one of these, or fetch it again if its download was cut short"
+            fault = f"cannot be read (it has another format); expected {wanted}: {advice}"
+            raise DamagedFile(path, fault) from None
         except Image.DecompressionBombError:  # Pillow's own limit, before the size is known here
             raise DamagedFile(path, f"has too many pixels; {limit}") from None
         pixels = image.width * image.height

@@ -28,6 +28,7 @@ from learn3d.studio.picture_to_mesh.fit import (
     Fit,
     Prediction,
     Report,
+    Target,
     find_view,
     fit,
     frame_target,
@@ -235,7 +236,7 @@ def match_templates(
     if warning or best < match.poor:
         progress("camera", 0.5)
         more = [found, level]
-        for roll_deg, turned in _familiar_rolls(model, predicted, photo, category, match):
+        for roll_deg, turned in _familiar_rolls(model, predicted, target, category, match):
             rolled = predict(model.method, turned, outline, roll_deg, options.fit)
             tried = find(rolled, model.chances(turned, category), few)
             more.append(tried._replace(prior=tried.prior - match.rolled))
@@ -252,7 +253,7 @@ def match_templates(
 def _familiar_rolls(
     model: Model,
     predicted: Prediction,
-    photo: tuple[np.ndarray, np.ndarray],
+    target: Target,
     category: str | None,
     options: MatchOptions,
 ) -> list[tuple[float, Tensor]]:
@@ -267,7 +268,7 @@ def _familiar_rolls(
     def distance(code: Tensor) -> float:
         return float(model.known_codes.distances(code)[flies].min())
 
-    order, image = [], Image.fromarray(np.dstack(photo))
+    order, image = [], Image.fromarray((255 * target.pixels).byte().movedim(0, -1).numpy())
     for roll_deg in options.rolls_deg:
         turned = np.asarray(image.rotate(-roll_deg, Image.Resampling.BILINEAR, expand=True))
         stored = torch.from_numpy(model.prepare(turned[..., :3], turned[..., 3]))
