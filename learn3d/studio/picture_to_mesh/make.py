@@ -36,7 +36,7 @@ from learn3d.studio.picture_to_mesh.fit import (
 )
 from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, MatchOptions, Options
-from learn3d.studio.picture_to_mesh.read import fill_drawing, prepare_image
+from learn3d.studio.picture_to_mesh.read import fill_drawing, is_black, prepare_image
 from learn3d.studio.picture_to_mesh.refinement import refine
 from learn3d.studio.picture_to_mesh.smoothing import outer_surface
 from learn3d.studio.picture_to_mesh.templates import (
@@ -159,6 +159,7 @@ def reconstruct_guesses(
         raise ValueError(f"guesses must be at least 1, got {guesses}")
     if category is not None:
         check_category(model, category)
+    black = is_black(colors, mask, options.cut)
     colors, mask = fill_drawing(colors, mask, options.cut)
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image, target = torch.from_numpy(stored), frame_target(colors, mask)
@@ -189,7 +190,7 @@ def reconstruct_guesses(
     for (vertices, faces, view, iou), kind, warning in made:
         progress("colours", 0.9)
         surface = color_mesh((vertices, faces), view, target, mirror, options.color)
-        if surface.colors.mean(1).quantile(options.cut.black) < options.color.ink:
+        if black:  # grey, as black shows no shape
             surface = surface._replace(colors=(surface.colors + 1) / 2)
         yield Reconstruction(surface, stored, float(view.azimuth_deg), iou, kind, warning, view)
 

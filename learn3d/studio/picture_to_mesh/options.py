@@ -199,10 +199,8 @@ class ColorOptions:
     """Two parts are equal if the sizes of their boxes and their heights differ by less."""
     neighbours: int = 60
     """Clearly seen vertices at a similar height whose median colour a hidden part has."""
-    spreading: float = 1e-2
+    spreading: float = 5e-2
     """Weight of these colours; that of alike neighbours is 0.01."""
-    ink: float = 0.07
-    """Brightness of a mesh that is black as a silhouette; it becomes grey, as black shows no shape."""
     sure: float = 0.02
     """Squared reliability of a colour that counts as much as those of the neighbours."""
 

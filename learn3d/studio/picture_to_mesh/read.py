@@ -70,10 +70,11 @@ def keep_parts(
     colors: np.ndarray, mask: np.ndarray, options: CutOptions = DEFAULTS.cut
 ) -> tuple[np.ndarray, str | None]:
     """Call `keep_object` with a picture's mask; the parts of a black drawing may be farther apart."""
-    return keep_object(mask, options.apart if _is_black(colors, mask, options) else NEAR)
+    return keep_object(mask, options.apart if is_black(colors, mask, options) else NEAR)
 
 
-def _is_black(colors: np.ndarray, mask: np.ndarray, options: CutOptions) -> bool:
+def is_black(colors: np.ndarray, mask: np.ndarray, options: CutOptions = DEFAULTS.cut) -> bool:
+    """Whether a picture uint8 [H, W, 3] with its mask uint8 [H, W] is a black drawing."""
     inside = mask > 127
     return inside.any() and np.quantile(colors[inside].mean(1), options.black) <= options.ink
 
@@ -132,7 +133,7 @@ def fill_drawing(
     colors, mask: uint8 [H, W, 3] and [H, W]. Lines may have small gaps. Pictures other than black
     drawings stay as they are. Returns colours on white, and the mask.
     """
-    if not _is_black(colors, mask, options):
+    if not is_black(colors, mask, options):
         return colors, mask
     inside = mask > 127
     gap = math.ceil(options.gap * (1 + max(map(np.ptp, np.nonzero(inside)))))
