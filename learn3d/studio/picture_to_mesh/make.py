@@ -36,7 +36,7 @@ from learn3d.studio.picture_to_mesh.fit import (
 )
 from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, MatchOptions, Options
-from learn3d.studio.picture_to_mesh.read import fill_drawing, is_black, prepare_image
+from learn3d.studio.picture_to_mesh.read import fill_drawing, is_uncoloured, prepare_image
 from learn3d.studio.picture_to_mesh.refinement import refine
 from learn3d.studio.picture_to_mesh.smoothing import outer_surface
 from learn3d.studio.picture_to_mesh.templates import (
@@ -159,7 +159,7 @@ def reconstruct_guesses(
         raise ValueError(f"guesses must be at least 1, got {guesses}")
     if category is not None:
         check_category(model, category)
-    black = is_black(colors, mask, options.cut)
+    black = is_uncoloured(colors, mask, options.cut)
     colors, mask = fill_drawing(colors, mask, options.cut)
     method, stored = model.method, model.prepare(colors, mask, crop=crop)
     image, target = torch.from_numpy(stored), frame_target(colors, mask)

@@ -66,6 +66,8 @@ class CutOptions:
     """Brightness up to which a pixel of a drawing is black."""
     black: float = 0.7
     """Share of black pixels from which a picture is a black drawing, see `fill_drawing`."""
+    grey: float = 0.95
+    """Share of grey pixels from which a black drawing has no colours."""
     apart: float = 0.12
     """Largest gap between parts of a black drawing, over the length of its largest region."""
     gap: float = 0.04

@@ -70,13 +70,19 @@ def keep_parts(
     colors: np.ndarray, mask: np.ndarray, options: CutOptions = DEFAULTS.cut
 ) -> tuple[np.ndarray, str | None]:
     """Call `keep_object` with a picture's mask; the parts of a black drawing may be farther apart."""
-    return keep_object(mask, options.apart if is_black(colors, mask, options) else NEAR)
+    return keep_object(mask, options.apart if _is_black(colors, mask, options) else NEAR)
 
 
-def is_black(colors: np.ndarray, mask: np.ndarray, options: CutOptions = DEFAULTS.cut) -> bool:
-    """Whether a picture uint8 [H, W, 3] with its mask uint8 [H, W] is a black drawing."""
+def _is_black(colors: np.ndarray, mask: np.ndarray, options: CutOptions) -> bool:
     inside = mask > 127
     return inside.any() and np.quantile(colors[inside].mean(1), options.black) <= options.ink
+
+
+def is_uncoloured(colors: np.ndarray, mask: np.ndarray, options: CutOptions = DEFAULTS.cut) -> bool:
+    """Whether a picture uint8 [H, W, 3] with its mask uint8 [H, W] is a black drawing without colours."""
+    if not _is_black(colors, mask, options):
+        return False
+    return np.quantile(np.ptp(colors[mask > 127], axis=1), options.grey) <= options.ink
 
 
 def _reduce(colors: np.ndarray, box: Box | None, side: int) -> tuple[np.ndarray, Box | None]:
@@ -133,7 +139,7 @@ def fill_drawing(
     colors, mask: uint8 [H, W, 3] and [H, W]. Lines may have small gaps. Pictures other than black
     drawings stay as they are. Returns colours on white, and the mask.
     """
-    if not is_black(colors, mask, options):
+    if not _is_black(colors, mask, options):
         return colors, mask
     inside = mask > 127
     gap = math.ceil(options.gap * (1 + max(map(np.ptp, np.nonzero(inside)))))

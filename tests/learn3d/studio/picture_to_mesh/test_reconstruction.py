@@ -16,7 +16,7 @@ from learn3d.data.crops import Crops
 from learn3d.data.poses import wrap_deg
 from learn3d.pictures import Surface
 from learn3d.studio.picture_to_mesh.make import input_azimuth_deg, load_model, reconstruct
-from learn3d.studio.picture_to_mesh.read import prepare_image, read_picture
+from learn3d.studio.picture_to_mesh.read import is_uncoloured, prepare_image, read_picture
 from learn3d.studio.picture_to_mesh.reconstruction import (
     check_files,
     reconstruct_dataset,
@@ -101,6 +101,14 @@ def test_a_large_picture_and_its_box_are_reduced_together(tmp_path) -> None:
     assert (whole.mask > 127).any(), "a box of nearly the whole picture"
     with pytest.raises(ValueError, match="must lie within the 1200x900 pixels"):
         read_picture(tmp_path / "large.png", None, (1000, 0, 300, 300))
+
+
+def test_a_black_drawing_with_colours_keeps_them() -> None:
+    mask, drawn = np.full((40, 40), 255, np.uint8), np.zeros((40, 40, 3), np.uint8)
+    for color, without in (((255, 255, 255), True), ((40, 60, 200), False)):
+        drawn[:8] = color
+        assert is_uncoloured(drawn, mask) == without
+    assert not is_uncoloured(drawn[:16], mask[:16]), "half of it is not black"
 
 
 def test_a_picture_of_few_pixels_is_said(tmp_path, capsys) -> None:
