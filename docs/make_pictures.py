@@ -199,9 +199,14 @@ PICTURES = {
         ),
     ),
     "results-angles.png": Picture(
-        "python docs/draw_curves.py --output {folder}/angles.png kato-generated=generated",
+        "python docs/draw_curves.py --output {folder}/angles.png kato-generated=generated "
+        "ablation-generated=generated",
         "{folder}/angles.png",
-        ("docs/draw_curves.py", "docs/results/kato-generated.json"),
+        (
+            "docs/draw_curves.py",
+            "docs/results/kato-generated.json",
+            "docs/results/ablation-generated.json",
+        ),
     ),
     "results-tsne.png": Picture(
         f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",

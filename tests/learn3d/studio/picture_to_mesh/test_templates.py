@@ -149,19 +149,16 @@ def test_an_airplane_that_is_turned_in_its_picture_is_found(model: Model, roll_d
 @pytest.mark.parametrize("lines", [False, True])
 def test_the_front_of_a_drawn_car_is_not_its_side(model: Model, lines: bool) -> None:
     """A side view that was predicted fits the outline well, but a level front view fits it better."""
-    roof, width = 70, 80
     image = Image.new("RGBA", (240, 240))
     draw, black, clear = ImageDraw.Draw(image), (0, 0, 0, 255), (0, 0, 0, 0)
-    corners = [(roof, 40), (width, 120), (width, 190), (-width, 190), (-width, 120), (-roof, 40)]
-    draw.polygon([(120 + x, y) for x, y in corners], black)
-    window = [(roof - 6, 56), (width - 20, 112), (20 - width, 112), (6 - roof, 56)]
-    draw.polygon([(120 + x, y) for x, y in window], clear)
+    draw.polygon([(46, 40), (194, 40), (216, 96), (216, 182), (24, 182), (24, 96)], black)
+    draw.polygon([(48, 56), (192, 56), (196, 92), (44, 92)], clear)
     if lines:
-        draw.rectangle((56, 132, 184, 176), clear)
-    for x in (76, 164):
-        draw.ellipse((x - 14, 134, x + 14, 162), black if lines else clear)
-    for x in (132 - width, 108 + width):
-        draw.rectangle((x - 12, 190, x + 12, 214), black)
+        draw.rectangle((40, 108, 200, 168), clear)
+    for x in (64, 176):
+        draw.ellipse((x - 16, 120, x + 16, 152), black if lines else clear)
+    for x in (24, 184):
+        draw.rectangle((x, 182, x + 32, 200), black)
     drawn = np.asarray(image)
     made = reconstruct_picture(model, np.ascontiguousarray(drawn[..., :3]), drawn[..., 3].copy())
     assert made.kind == "car" and made.warning is None
