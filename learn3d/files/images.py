@@ -13,6 +13,7 @@ from learn3d.files.reading import DamagedFile, MissingFile, faults_of, open_file
 # TIFF is not supported: a small file can list millions of strips, for which Pillow makes objects before it decodes.
 RENDERINGS = ("PNG", "JPEG")
 PHOTOGRAPHS = ("PNG", "JPEG", "WEBP", "BMP")
+_SAVE_AGAIN = "Save it as one of these, or fetch it again if its download was cut short"
 
 
 def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image:
@@ -25,14 +26,15 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
     with faults_of(path, wanted), open_file(path, limits.IMAGE_FILE_BYTES, wanted) as file:
         most = limits.IMAGE_PIXELS
         limit = f"the limits are {max_side} a side and {most}: make it smaller"
-        try:
-            image = Image.open(file, formats=formats)
-        except UnidentifiedImageError:
-            advice = "save it as one of these, or fetch it again if its download was cut short"
-            fault = f"cannot be read (it has another format); expected {wanted}: {advice}"
-            raise DamagedFile(path, fault) from None
-        except Image.DecompressionBombError:  # Pillow's own limit, before the size is known here
-            raise DamagedFile(path, f"has too many pixels; {limit}") from None
+        with faults_of(path, wanted, _SAVE_AGAIN):
+            try:
+                image = Image.open(file, formats=formats)
+            except UnidentifiedImageError:
+                raise ValueError("it has another format") from None
+            except (
+                Image.DecompressionBombError
+            ):  # Pillow's own limit, before the size is known here
+                raise DamagedFile(path, f"has too many pixels; {limit}") from None
         pixels = image.width * image.height
         if max(image.size) > max_side or pixels > most:
             raise DamagedFile(path, f"is {image.width}x{image.height} pixels; {limit}")

@@ -160,7 +160,7 @@ class Candidates(NamedTuple):
         return Candidates(*lists, self.views.select(torch.tensor(rows)), self.prior[rows])
 
     def believing(self, predicted: Prediction, options: FitOptions) -> Candidates:
-        """The candidates, less likely the less probable their azimuths are."""
+        """The candidates; the log-probabilities of their azimuths, weighted, are added to `prior`."""
         believed = belief(self.views.azimuth_deg, predicted.azimuths, options.belief)
         return self._replace(prior=self.prior + believed)
 

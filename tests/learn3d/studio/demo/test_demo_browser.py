@@ -281,7 +281,9 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(single, visit, tmp_path) 
     assert part(slice(180, 195)) > 0.03 and part(slice(225, 240)) > 0.03, "both count"
     press(tab, "Undo")()
     correct("Remove", (0.15, 0.2), (0.35, 0.2))
-    assert part(slice(180, 195)) > 0.03 and part(slice(225, 240)) < 0.01, "nor to Undo"
+    assert part(slice(180, 195)) > 0.03 and part(slice(225, 240)) < 0.01, (
+        "the undone stroke stays undone"
+    )
     correct("Box", (0.58, 0.2), (0.92, 0.8))
     assert part(left) == 0 and part(right) > 0.3
     answered(tab, press(tab, "Start over"))
