@@ -26,7 +26,7 @@ learn3d make-dataset --output CARS100 --category car --procedural 100 --augment 
 learn3d make-dataset --layout kato --output GENERATED --category airplane --procedural 2000
 learn3d experiment kato --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Vanilla-AE Proposed --iterations 20000 --seeds 1 --set clamp_to_cube=true validate_every=1000
 
-# Generated airplanes, table 4 (not finished: ablation-generated.json has the validations so far, out of metrics.jsonl)
+# Generated airplanes, table 4 (stopped early: ablation-generated.json has the validations out of metrics.jsonl)
 learn3d experiment ablation --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Proposed "w/o adversarial" "w/o prior" --iterations 20000 --seeds 1 --set clamp_to_cube=true validate_every=1000
 
 # Generated airplanes, shorter (the runs were made with 1,000 steps and continued to 2,000)
