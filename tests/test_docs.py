@@ -20,9 +20,11 @@ import trimesh
 import tyro
 
 from learn3d.commands import main
+from learn3d.config import differences
 from learn3d.data.conventions import LAYOUTS
 from learn3d.methods.optimization import LRSchedule
 from learn3d.presets import PRESETS
+from learn3d.studio.tables.plan import plan_runs
 from learn3d.studio.tables.tables import TABLES
 
 ROOT = Path(__file__).parent.parent
@@ -197,6 +199,22 @@ def test_documented_commands_are_understood(words, monkeypatch):
     with pytest.raises((Understood, SystemExit)) as stop:
         main(*words)
     assert not getattr(stop.value, "code", None)  # --help exits with 0
+
+
+def test_the_commands_of_the_results_do_not_conflict(monkeypatch):
+    """Commands that write into one folder ask for the same runs there."""
+    planned, requests = {}, []
+    monkeypatch.setattr(sys, "argv", ["learn3d"])
+    monkeypatch.setattr(
+        "learn3d.studio.commands.run_experiment", lambda request: requests.append(request) or 0
+    )
+    for line in (ROOT / "docs" / "results" / "commands.sh").read_text().splitlines():
+        if line.startswith("learn3d experiment"):
+            main(*shlex.split(line)[1:])
+            for run in plan_runs(requests.pop()):
+                first = planned.setdefault(run.config.output, run.config)
+                assert not differences(run.config, first), line
+    assert len(planned) > 50
 
 
 def test_every_promise_has_a_test() -> None:

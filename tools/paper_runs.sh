@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Trains what docs/results.md could not yet judge: the paper's methods at the paper's length, on 2,000 generated
-# objects of a category, in the order in which the answers matter. It takes some 32 hours of a core with AMX.
+# objects of a category, in the order in which the answers matter. It takes some 37 hours of a core with AMX.
 #
 #   bash tools/paper_runs.sh WORK --jobs 2 --threads 1       # data sets, runs and reports go into the folder WORK
 #   STEPS=5000 bash tools/paper_runs.sh WORK --jobs 2 --threads 1              # shorter, for a slow machine

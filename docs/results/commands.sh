@@ -1,13 +1,16 @@
 # The commands that made the files of this folder, each with the table of docs/results.md that it fills.
-# Words in capitals are folders. Repeat `make-dataset` for each category. VPL ran with one seed, by a command of its own.
+# Words in capitals are folders. Repeat `make-dataset` for each category.
+# Without `precision` it is bf16 on processors with AMX, as for these files; elsewhere add precision=bf16 to --set.
 
 # On Debian with the components main, contrib and non-free; then, for each category:
 python tools/free_meshes/fetch.py --output models
 
 learn3d make-dataset --output DATA --category airplane --source models/airplane --front z --augment 6
 
-# Table 1
-learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --iterations 2000 --seeds 3 --set clamp_to_cube=true vpl:lambda_discriminator=0.1
+# Table 1: VPL with one seed, then one report
+learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --methods Vanilla-AE Proposed --iterations 2000 --seeds 3 --set clamp_to_cube=true
+learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --methods VPL --iterations 2000 --seeds 1 --set clamp_to_cube=true vpl:lambda_discriminator=0.1
+learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --iterations 2000 --seeds 3 --set clamp_to_cube=true vpl:lambda_discriminator=0.1 --report-only
 
 # Table 1, longer
 learn3d experiment kato --data DATA --output LONG --category airplane,chair,table --methods Vanilla-AE Proposed --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500
@@ -22,16 +25,13 @@ learn3d experiment ablation --data CARS --output CARS_OUTPUT --category car --me
 
 learn3d make-dataset --output CARS100 --category car --procedural 100 --augment 6
 
-# Generated airplanes (the first lines of tools/paper_runs.sh; measured after 4,000 and 10,000 steps, too; fp32 without AMX)
+# Generated airplanes (the first lines of tools/paper_runs.sh). For the shorter lengths give --iterations 1000 first, then
+# 2000, 4000 and 10000, in the same folder, and keep kato.json after each
 learn3d make-dataset --layout kato --output GENERATED --category airplane --procedural 2000
-learn3d experiment kato --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Vanilla-AE Proposed --iterations 20000 --seeds 1 --set clamp_to_cube=true validate_every=1000
+learn3d experiment kato --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Vanilla-AE Proposed --iterations 20000 --seeds 1 --set clamp_to_cube=true validate_every=1000 precision=fp32
 
 # Generated airplanes, table 4 (stopped early: ablation-generated.json has the validations out of metrics.jsonl)
-learn3d experiment ablation --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Proposed "w/o adversarial" "w/o prior" --iterations 20000 --seeds 1 --set clamp_to_cube=true validate_every=1000
-
-# Generated airplanes, shorter (the runs were made with 1,000 steps and continued to 2,000)
-learn3d make-dataset --output GENERATED --category airplane --procedural 2000
-learn3d experiment kato --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Vanilla-AE Proposed --iterations 2000 --seeds 1 --set clamp_to_cube=true validate_every=200
+learn3d experiment ablation --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Proposed "w/o adversarial" "w/o prior" --iterations 20000 --seeds 1 --set clamp_to_cube=true validate_every=1000 precision=fp32
 
 # 100 generated cars
 learn3d experiment kato --data CARS100 --output CARS100_OUTPUT --category car --methods Vanilla-AE Proposed --iterations 2000 --seeds 1 --set clamp_to_cube=true validate_every=500
@@ -50,7 +50,7 @@ learn3d experiment ablation --data DATA --output OUTPUT --category airplane --it
 # Table 4, longer
 learn3d experiment ablation --data DATA --output FP32 --category airplane --methods Proposed "w/o adversarial" --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500 precision=fp32
 
-# Table 4, longer, bf16; airplanes without adversarial loss were left out
+# Table 4, longer, bf16; airplanes without adversarial loss and chairs without prior were left out
 learn3d experiment ablation --data DATA --output LONG --category airplane,chair --methods Proposed "w/o prior" "w/o adversarial" --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=500
 
 # Table 6
@@ -63,17 +63,16 @@ learn3d experiment mmd --data DATA --output LONG --category airplane,chair,table
 learn3d experiment plus --data DATA --output OUTPUT --category airplane,chair,table --methods Proposed Plus --iterations 2000 --seeds 3 --set clamp_to_cube=true
 
 # The mean shape and the nearest training object of each data set
-learn3d make-dataset --output AIRPLANES --category airplane --procedural 2000
-learn3d experiment kato --data AIRPLANES --output AIRPLANES_OUTPUT --category airplane --methods Vanilla-AE Proposed --report-only
-learn3d experiment kato --data CARS --output CARS_OUTPUT --category car --methods Vanilla-AE Proposed --report-only
-learn3d experiment kato --data CARS100 --output CARS100_OUTPUT --category car --methods Vanilla-AE Proposed --report-only
-learn3d experiment kato --data DATA --output OUTPUT --category airplane,chair,table --methods Vanilla-AE Proposed --report-only
-learn3d experiment kato --data DATA --output OUTPUT --category airplane --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data GENERATED --output BASELINES_GENERATED --category airplane --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data CARS --output BASELINES_CARS --category car --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data CARS100 --output BASELINES_CARS100 --category car --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data DATA --output BASELINES_DEBIAN --category airplane,chair,table --methods Vanilla-AE Proposed --report-only
+learn3d experiment kato --data DATA --output BASELINES_AIRPLANES --category airplane --methods Vanilla-AE Proposed --report-only
 
 # docs/short-trainings.md
 
 # Table 5
-learn3d experiment bins --data KAR --output OUTPUT --category airplane --iterations 2000 --batch-size 32 --set clamp_to_cube=true views_per_object=12 validate_every=1000
+learn3d experiment bins --data KAR --output BINS --category airplane --iterations 2000 --batch-size 32 --set clamp_to_cube=true views_per_object=12 validate_every=1000
 
 # Table 7
 learn3d make-dataset --layout pascal3d --output PASCAL --category airplane --source models/airplane --front z --augment 2
