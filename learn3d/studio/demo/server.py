@@ -120,7 +120,8 @@ class JobQueue:
     async def run(
         self, job: Callable[[Callable[[dict], None]], None], address: str
     ) -> AsyncIterator[bytes]:
-        """Run a job and yield the messages that it sends, each a line of JSON; before them {"place": jobs ahead of it}.
+        """Run a job and yield the messages that it sends, each a line of JSON; before them {"place": jobs ahead of it}
+        if it has to wait, at last 0.
 
         If the iteration ends early, because the visitor has left, a waiting job is dropped, and one
         in work ends with the next message that it sends.
@@ -144,7 +145,7 @@ class JobQueue:
         try:
             while not (self.closed() or (work and work.done() and not messages)):
                 ahead = self._line.index(ticket) if ticket in self._line else 0
-                if ahead and ahead != place:
+                if ahead != place:
                     yield _json_line({"place": ahead})
                 place = ahead
                 while messages:

@@ -27,7 +27,9 @@ export function toObj(mesh) {
     const color = [...mesh.colors.subarray(v, v + 3)].map((value) => (value / 255).toFixed(3));
     lines.push(`v ${[...mesh.points.subarray(v, v + 3)].map(number).join(" ")} ${color.join(" ")}`);
   }
+  for (let v = 0; v < mesh.normals.length; v += 3)
+    lines.push(`vn ${[...mesh.normals.subarray(v, v + 3)].map((value) => value.toFixed(3)).join(" ")}`);
   for (let f = 0; f < mesh.corners.length; f += 3)
-    lines.push(`f ${[...mesh.corners.subarray(f, f + 3)].map((corner) => corner + 1).join(" ")}`);
+    lines.push(`f ${[...mesh.corners.subarray(f, f + 3)].map((corner) => `${corner + 1}//${corner + 1}`).join(" ")}`);
   return lines.join("\n") + "\n";
 }

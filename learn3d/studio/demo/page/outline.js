@@ -48,15 +48,18 @@ export class Stage {
   constructor(canvas, hint, buttons, correct) {
     Object.assign(this, { canvas, hint, buttons, correct });
     for (const button of buttons) button.onclick = () => this.choose(this.#tool === button.dataset.tool ? null : button.dataset.tool);
-    canvas.onpointerdown = (event) => {
+    this.area = canvas.parentElement; // a box may begin beside the picture
+    this.area.onpointerdown = (event) => {
+      this.#drag = null; // a second finger ends a stroke
       if (!this.#tool) return;
-      canvas.setPointerCapture(event.pointerId);
+      if (event.button || !event.isPrimary) return this.#draw();
+      this.area.setPointerCapture(event.pointerId);
       this.#drag = [this.#at(event)];
       this.#draw();
     };
-    canvas.onpointermove = (event) => { if (this.#drag) { this.#drag.push(this.#at(event)); this.#draw(); } };
-    canvas.onpointercancel = () => { this.#drag = null; this.#draw(); };
-    canvas.onpointerup = () => this.#finish();
+    this.area.onpointermove = (event) => { if (this.#drag) { this.#drag.push(this.#at(event)); this.#draw(); } };
+    this.area.onpointercancel = () => { this.#drag = null; this.#draw(); };
+    this.area.onpointerup = () => this.#finish();
   }
 
   show(picture) {
@@ -79,7 +82,7 @@ export class Stage {
   choose(tool) {
     if (tool !== this.#tool) this.#drag = null; // what is drawn belongs to the tool that began it
     this.#tool = tool;
-    this.canvas.classList.toggle("tool", Boolean(tool));
+    this.area.classList.toggle("tool", Boolean(tool));
     this.hint.textContent = `${this.#found}${HINTS[tool] || HINT}`;
     for (const button of this.buttons) button.ariaPressed = button.dataset.tool === tool;
   }

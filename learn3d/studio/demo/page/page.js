@@ -9,15 +9,19 @@ const STAGES = {
   camera: "Finding the camera …", shape: "Finding the shape …",
   surface: "Bending the shape to the outline …", colours: "Adding the colours …",
 };
-const READY = "Drag to turn it. Scroll, or pinch with two fingers, to zoom.";
+const READY = "Done. Drag to turn it; scroll, or pinch with two fingers, to zoom.";
+const BACK = " This is the previous mesh.";
 const FRAMES = 36, FRAME_SIDE = 320, FRAME_TIME = 8; // of a turntable; the time in hundredths of a second
 const THUMBNAIL = 64; // pixels
+const READING = 4000; // milliseconds
 
 let side = 512, current = null, views = [];
 let taken = 0; // pictures; one that is read faster than an earlier one stays
 let requests = []; // what was sent for this picture: the first one, then a correction each
 let kind = null, smooth = false; // what the visitor says about the object
-let shown = null; // what belongs to the meshes on the page, for a correction that is cancelled
+let shown = null; // what belongs to the meshes on the page, for a correction that is cancelled or fails
+let clay = false; // new meshes are shown in clay
+let held = 0; // the time until which an error stays
 
 const stage = new Stage($("picture"), $("hint"), [...document.querySelectorAll("[data-tool]")], (correction) => {
   requests.push(correction);
@@ -37,11 +41,11 @@ function makeButton(text, act, into) {
 // Taking pictures
 
 async function take(source, title) {
-  cancel();
   const mine = ++taken, picture = await readPicture(source, title, side).catch(() => null);
   if (mine !== taken) return;
   if (!picture) return say("This file is not a picture that your browser can open. Try a PNG or JPEG.", true);
-  shown = null;
+  cancel();
+  [shown, clay] = [null, false];
   if (stage.picture) [kind, smooth] = [null, false];
   document.body.classList.add("given");
   $("invitation").hidden = true;
@@ -76,22 +80,26 @@ addEventListener("drop", (event) => { event.preventDefault(); $("over").hidden =
 $("undo").onclick = () => goBack(requests.length - 1);
 $("again").onclick = () => goBack(1);
 $("cancel").onclick = () => {
-  const back = shown && document.body.classList.contains("waiting");
+  const waited = document.body.classList.contains("waiting");
   cancel();
-  say(back ? "Cancelled. This is the previous mesh." : "Cancelled.");
+  say(`Cancelled.${!waited ? "" : shown ? BACK : " “Start over” makes the mesh."}`);
 };
 
 /** Take back all corrections from the one with this number on. */
 function goBack(number) {
-  stage.mask = requests[number].before; // for a stroke that comes before the answer
+  if (requests[number]) stage.mask = requests[number].before; // for a stroke that comes before the answer
   requests.length = number;
   send();
 }
 
-/** End the work, and go back to the meshes that were there before it. */
 function cancel() {
   current?.abort();
   busy(false);
+  restore();
+}
+
+/** Go back to the meshes that were there before the work, and to what belongs to them. */
+function restore() {
   if (!document.body.classList.contains("waiting")) return;
   if (!shown) return showNothing();
   document.body.classList.remove("waiting");
@@ -106,7 +114,8 @@ function cancel() {
 }
 
 function allowUndo() {
-  $("undo").disabled = $("again").disabled = requests.length < 2;
+  $("undo").disabled = requests.length < 2;
+  $("again").disabled = requests.length < 2 && (shown || document.body.classList.contains("waiting"));
 }
 
 /** Say what the object is, or nothing if `which` was said already. */
@@ -129,9 +138,15 @@ function showKind() {
 // The server's work
 
 function say(text, wrong = false) {
+  held = wrong ? performance.now() + READING : 0;
   $("words").textContent = text;
   $("status").classList.toggle("error", wrong);
   if (wrong) $("status").scrollIntoView({ block: "nearest" });
+}
+
+/** Say what is in work; an error is left to be read. */
+function report(text) {
+  if (performance.now() > held) say(text);
 }
 
 /** Show the share of the work that is done; true: it is not known, false: nothing is in work. */
@@ -153,9 +168,9 @@ async function send() {
   if (strokes) body.set(strokes, 4 * pixels);
   const hints = Object.entries({ box, category: kind, smooth: smooth && 1 }).filter(([, value]) => value);
   const query = new URLSearchParams([["width", width], ["height", height], ...hints]);
-  allowUndo();
   $("downloads").hidden = $("doubt").hidden = true;
   document.body.classList.add("waiting");
+  allowUndo();
   showKind();
   say("Finding the object …");
   busy(0.05);
@@ -164,8 +179,7 @@ async function send() {
     if (!mine.signal.aborted && !mine.ended) throw new Error("the answer broke off");
   } catch (error) {
     if (mine.signal.aborted) return;
-    if (!mine.shown) showNothing();
-    say(`The server did not make a mesh (${error.message}). Is it still running?`, true);
+    fail(mine, `The server did not make a mesh (${error.message}). Is it still running?`);
   }
   if (mine.signal.aborted) return;
   busy(false);
@@ -191,35 +205,38 @@ async function* answer(address, body, signal) {
   }
 }
 
+/** Say why there is no new mesh, or no further guess. */
+function fail(mine, reason) {
+  if (mine.shown) return mine.note = `There is no further guess: ${reason}`;
+  restore();
+  say(`${reason}${shown ? BACK : ""}`, true);
+}
+
 const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 const unpack = (made) => { const glb = bytes(made.glb); return { ...made, glb, mesh: readGlb(glb.buffer) }; };
 
 async function handle(message, mine) {
   if (mine.signal.aborted) return;
-  if (message.place) say(message.place === 1 ? "You are next …" : `${message.place} are before you …`);
+  if ("place" in message) report(["Finding the object …", "You are next …"][message.place] ?? `${message.place} are before you …`);
   if (message.mask) {
     mine.outline = [bytes(message.mask), `Found ${message.how}. ${message.left_out ? `Note: ${message.left_out}. ` : ""}`];
     stage.showMask(...mine.outline);
   }
   if (message.tool) stage.choose(message.tool); // the server asks for a box
   if (message.doubt) addDoubt(message.doubt);
-  if (message.progress && !mine.shown) { say(STAGES[message.progress]); busy(0.1 + 0.85 * message.part); }
+  if (message.progress && !mine.shown) { report(STAGES[message.progress]); busy(0.1 + 0.85 * message.part); }
   if (message.meshes) {
     mine.shown = mine.ended = true;
     present(message.meshes.map(unpack));
     const doubt = $("doubt").hidden ? "" : $("doubt").textContent;
     shown = { requests: [...requests], kind, smooth, doubt, outline: mine.outline };
-    say("Looking for other guesses …");
+    report("Looking for other guesses …");
     busy(true);
   }
   if (message.guess) addGuess(unpack(message.guess));
   if (message.error) {
     mine.ended = true;
-    if (mine.shown) mine.note = `There is no further guess: ${message.error}`;
-    else {
-      showNothing();
-      say(message.error, true);
-    }
+    fail(mine, message.error);
   }
 }
 
@@ -228,6 +245,7 @@ async function handle(message, mine) {
 function showNothing() {
   [views, shown] = [[], null];
   document.body.classList.remove("waiting");
+  allowUndo();
   $("views").innerHTML = '<div class="card view empty"><p class="quiet">The mesh appears here.</p></div>';
 }
 
@@ -272,8 +290,8 @@ class View {
     add("+", "Zoom in", () => viewer.zoomBy(1.25));
     add("−", "Zoom out", () => viewer.zoomBy(0.8));
     add("Reset", "Reset the view", () => { this.compare(false); viewer.reset(); });
-    const clay = makeButton("Clay", () => press(clay, viewer.clay = !viewer.clay), bar);
-    press(clay, false);
+    const inClay = makeButton("Clay", () => press(inClay, clay = viewer.clay = !viewer.clay), bar);
+    press(inClay, viewer.clay = clay);
     this.beside = makeButton("Beside the picture", () => this.compare(!viewer.compared), bar);
     this.beside.hidden = !made.camera.axes;
     this.canvas.addEventListener("turned", () => this.compare(false));

@@ -135,7 +135,8 @@ export class Viewer {
   /** Pictures (ImageData) of one turn of the mesh on white. */
   turntable(count, side) {
     const canvas = Object.assign(document.createElement("canvas"), { width: side, height: side });
-    const context = canvas.getContext("2d", { willReadFrequently: true }), { yaw } = this;
+    const context = canvas.getContext("2d", { willReadFrequently: true }), { yaw, zoom } = this;
+    this.zoom = 1;
     const frames = Array.from({ length: count }, (_, k) => {
       this.yaw = yaw + 2 * Math.PI * k / count;
       context.fillStyle = "#fff";
@@ -143,7 +144,7 @@ export class Viewer {
       this.#drawMesh(context, side, side, 2);
       return context.getImageData(0, 0, side, side);
     });
-    this.yaw = yaw;
+    Object.assign(this, { yaw, zoom });
     return frames;
   }
 

@@ -147,6 +147,7 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
     press(tab, "sofa")()
     press(tab, "Cancel")()
     assert tab.get_by_text("Cancelled.").is_visible() and tab.locator(".busy").count() == 0
+    answered(tab, press(tab, "Start over"))
     said = answered(tab, press(tab, "chair"))
     canvas = tab.locator(".view > canvas")
     with Image.open(io.BytesIO(example("chair"))) as image:
@@ -172,7 +173,9 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
         assert saved == base64.b64decode(each["glb"])
         mesh = trimesh.load(io.BytesIO(saved), "glb", force="mesh", process=False)
         assert len(mesh.faces) > 1000 and np.isfinite(mesh.vertices).all()
-    obj = trimesh.load(download(tab, "OBJ", tmp_path), force="mesh", process=False)
+    saved = download(tab, "OBJ", tmp_path)
+    assert saved.read_text().count("vn ") == len(mesh.vertices), "smooth normals"
+    obj = trimesh.load(saved, force="mesh", process=False)
     assert np.allclose(obj.vertices, mesh.vertices, atol=1e-4)
     with Image.open(download(tab, "Turntable", tmp_path)) as image:
         assert image.n_frames == 36
@@ -218,6 +221,7 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
         assert tab.locator("[aria-pressed=true]", has_text=tool).count() == 1
     said = answered(tab, press(tab, "It is a sofa"))
     assert [message["meshes"][0]["kind"] for message in said if "meshes" in message] == ["sofa"]
+    assert tab.get_by_role("button", name="Clay").get_attribute("aria-pressed") == "true"
     said = answered(tab, press(tab, "Smooth shape instead"))
     assert [message["meshes"][0]["kind"] for message in said if "meshes" in message] == [None]
     before = pixels(canvas)
@@ -286,6 +290,11 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(single, visit, tmp_path) 
     )
     correct("Box", (0.58, 0.2), (0.92, 0.8))
     assert part(left) == 0 and part(right) > 0.3
+    correct("Box", (-0.02, 0.2), (0.57, 0.8))  # it begins beside the picture
+    assert part(left) > 0.3 and part(right) == 0
+    press(tab, "Add")()
+    tab.locator("#picture").click(button="right")
+    assert tab.locator(".busy").count() == 0, "the other button does not paint"
     answered(tab, press(tab, "Start over"))
     assert (part(left), part(right), part(above)) == (*before, plain)
     assert tab.get_by_role("button", name="Undo").is_disabled()
@@ -302,7 +311,18 @@ def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(
     sentence = tab.get_by_text("not a picture that your browser can open")
     sentence.wait_for()
     tab.wait_for_timeout(1500)
-    assert sentence.is_visible() and tab.locator("#progress").is_hidden()
+    assert sentence.is_visible(), "it can be read"
+    tab.locator(".view > canvas").wait_for()  # the work went on
+    tab.locator("body:not(.busy)").wait_for()
+    fails = json.dumps({"error": "It is no object."}) + "\n"
+    tab.route("**/mesh?*", lambda route: route.fulfill(body=fails))
+    press(tab, "Box")()
+    drag(tab, tab.locator("#picture"), (0.1, 0.1), (0.9, 0.9))
+    tab.get_by_text("It is no object. This is the previous mesh.").wait_for()
+    assert paint_share(pixels(tab.locator(".view > canvas"))) > 0.01
+    assert tab.get_by_role("button", name="GLB").is_visible()
+    assert tab.get_by_role("button", name="Undo").is_disabled(), "the box is forgotten"
+    tab.unroute("**/mesh?*")
     grey = boxes(tmp_path / "grey.png")
     answered(tab, lambda: tab.locator("#file").set_input_files(grey), "No object was found")
     assert tab.locator("[aria-pressed=true]", has_text="Box").count() == 1, "it can be dragged"
