@@ -1,6 +1,6 @@
 # The commands that made the files of this folder, each with the table of docs/results.md that it fills.
 # Words in capitals are folders. Repeat `make-dataset` for each category.
-# Without `precision` it is bf16 on processors with AMX, as for these files; elsewhere add precision=bf16 to --set.
+# Without `precision` it is bf16 on processors that are fast with it, as for these files (with AMX); elsewhere add precision=bf16 to --set.
 
 # On Debian with the components main, contrib and non-free; then, for each category:
 python tools/free_meshes/fetch.py --output models

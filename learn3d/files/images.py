@@ -31,9 +31,7 @@ def open_image(path: Path, formats: Sequence[str], max_side: int) -> Image.Image
                 image = Image.open(file, formats=formats)
             except UnidentifiedImageError:
                 raise ValueError("it has another format") from None
-            except (
-                Image.DecompressionBombError
-            ):  # Pillow's own limit, before the size is known here
+            except Image.DecompressionBombError:  # by Pillow's own limit: the size is not known yet
                 raise DamagedFile(path, f"has too many pixels; {limit}") from None
         pixels = image.width * image.height
         if max(image.size) > max_side or pixels > most:

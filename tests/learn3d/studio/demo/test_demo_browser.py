@@ -177,6 +177,8 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
     assert saved.read_text().count("vn ") == len(mesh.vertices), "smooth normals"
     obj = trimesh.load(saved, force="mesh", process=False)
     assert np.allclose(obj.vertices, mesh.vertices, atol=1e-4)
+    for _ in range(4):
+        press(tab, "Zoom in")()
     with Image.open(download(tab, "Turntable", tmp_path)) as image:
         assert image.n_frames == 36
         frames = [
@@ -184,6 +186,9 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
         ]
     assert all(np.abs(paint(frame) - given).max() < 70 for frame in frames)
     assert np.abs(frames[9] - frames[0]).max() > 100, "it turns"
+    ends = np.concatenate([frame[[0, -1]] for frame in frames])
+    assert np.ptp(ends, axis=2).max() < 40, "all of it is shown, however near one looks"
+    press(tab, "Reset the view")()
     assert 0.1 < (cut_out(tab, tmp_path)[..., 3] > 0).mean() < 0.9
 
     before = pixels(canvas)
@@ -226,6 +231,9 @@ def test_a_whole_visit(packaged, visit, fits, pixels, tmp_path, width) -> None:
     assert [message["meshes"][0]["kind"] for message in said if "meshes" in message] == [None]
     before = pixels(canvas)
     press(tab, "It is a car")()
+    tab.evaluate("scrollTo(0, 0)")
+    place = tab.locator("#cancel").bounding_box()
+    assert place["y"] + place["height"] <= tab.viewport_size["height"], "in view beside the picture"
     press(tab, "Cancel")()
     assert tab.get_by_text("This is the previous mesh").is_visible()
     assert np.abs(pixels(canvas) - before).max() < 20
