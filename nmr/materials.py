@@ -27,8 +27,8 @@ GREY = 0.5  # of faces without a material
 class Materials:
     """The colours of a mesh of several materials: an image each, or one colour.
 
-    A face shows the image of its material, without one (or texture coordinates) its colour, without
-    a material grey (0.5).
+    A face shows the image of its material, without one (or texture coordinates) its colour times
+    those of the vertices, without a material those of the vertices alone, or grey (0.5).
 
     Parameters
     ----------
@@ -44,6 +44,8 @@ class Materials:
         Row of uv at each corner of each face; -1 without texture coordinates.
     wrap, filter
         Of all images: see :class:`UVTexture`.
+    vertex_colors : float Tensor [V, C], optional; for a list of meshes a list of [V_b, C]
+        Interpolated as :class:`VertexColors`; images do not show them. Differentiable.
 
     Raises
     ------
@@ -70,11 +72,18 @@ class Materials:
     uv_faces: Tensor | list[Tensor] | None = None
     wrap: Literal["repeat", "clamp", "mirror"] = "repeat"
     filter: Literal["bilinear", "mipmap"] = "bilinear"
+    vertex_colors: Tensor | list[Tensor] | None = None
 
     def __post_init__(self) -> None:
         colors = check_values(self.colors, "colors", "M, C")[0]
         if not isinstance(self.colors, Tensor) or self.colors.ndim != 2:
             raise ValueError(f"colors must be a tensor [M, C], got {describe(self.colors)}")
+        if self.vertex_colors is not None:
+            found = check_values(self.vertex_colors, "vertex_colors", "V, C")[0].shape[-1]
+            if found != colors.shape[1]:
+                raise ValueError(
+                    f"vertex_colors must have {colors.shape[1]} channels as colors have, got {found}"
+                )
         if not is_list(self.images) or len(self.images) != len(colors):
             got = len(self.images) if is_list(self.images) else describe(self.images)
             raise ValueError(f"images must be a list of {len(colors)}, one per colour, got {got}")
@@ -103,7 +112,7 @@ class Materials:
 
     @classmethod
     def from_mesh(cls, mesh: MeshFile) -> Materials:
-        """The materials of a mesh that :func:`load_obj` or :func:`load_gltf` has read.
+        """The materials and vertex colours of a mesh that :func:`load_obj` or :func:`load_gltf` has read.
 
         Reads their images, which needs Pillow; those of one file are one tensor. Raises
         FileNotFoundError if one is missing and ValueError if it cannot be read. The values are as
@@ -129,6 +138,7 @@ class Materials:
             mesh.face_material,
             mesh.uv,
             mesh.uv_faces,
+            vertex_colors=mesh.colors,
         )
 
     def sample(self, fragments: Fragments) -> Tensor:
@@ -142,12 +152,14 @@ class Materials:
             if self.uv_faces is not None:
                 shown = shown & (as_tuple(self.uv_faces)[k] >= 0).all(1).to(shown.device)
             chosen.append(torch.where(shown, faces, -1).to(self.colors).unsqueeze(-1))
-            grey = self.colors.new_full((1, self.colors.shape[1]), GREY)
-            colors = torch.cat([self.colors, grey])[faces]
+            none = self.colors.new_full((1, self.colors.shape[1]), self.without_material)
+            colors = torch.cat([self.colors, none])[faces]
             plain.append(torch.where(shown.unsqueeze(-1), 0.0, colors))
         as_given = list if is_list(self.face_material) else lambda parts: parts[0]
         number = fragments._per_face(as_given(chosen), "face_material").squeeze(-1)
         image = fragments._per_face(as_given(plain), "face_material")
+        if self.vertex_colors is not None:
+            image = image * fragments._interpolate(self.vertex_colors, None, "vertex_colors", "")
         for k, texture in enumerate(self.images):
             if texture is not None:
                 index = torch.where(number == k, fragments.sided_face_index, -1)
@@ -155,6 +167,11 @@ class Materials:
                     replace(fragments, sided_face_index=index)
                 )
         return image
+
+    @property
+    def without_material(self) -> float:
+        """All channels of the colour of faces without a material, before those of the vertices."""
+        return GREY if self.vertex_colors is None else 1.0
 
     def _texture(self, image: Tensor) -> UVTexture:
         """One image on all faces; those without texture coordinates have any."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from ._images import write_png
 from ._validate import describe
 from .gltf import read_gltf
-from .materials import GREY, Materials
+from .materials import Materials
 from .obj import find_image, find_libraries, load, match_materials, read_mtl
 from .textures import UVTexture, VertexColors
 
@@ -225,10 +225,13 @@ def save_obj(
         raise TypeError(
             f"colors must be nmr.VertexColors, UVTexture or Materials, got {describe(colors)}"
         )
-    if isinstance(colors, VertexColors):
-        shades = _rows(colors.colors, "colors", 3).clamp(0, 1)
+    of_vertices = {VertexColors: "colors", Materials: "vertex_colors"}.get(type(colors))
+    if of_vertices and (given := getattr(colors, of_vertices)) is not None:
+        shades = _rows(given, of_vertices, 3).clamp(0, 1)
         if len(shades) != len(points):
-            raise ValueError(f"colors must be one per vertex, {len(points)}, got {len(shades)}")
+            raise ValueError(
+                f"{of_vertices} must be one per vertex, {len(points)}, got {len(shades)}"
+            )
         points = torch.cat([points, shades.to(points)], dim=1)
     lines = _lines("v", points)
     if isinstance(colors, (UVTexture, Materials)):
@@ -246,10 +249,10 @@ def _material_lines(base: str, corners: Tensor, colors: UVTexture | Materials) -
         rows = corners - 1 if rows is None else _rows(rows, "uv_faces", 3)
         numbers = torch.zeros(len(corners), dtype=torch.int64, device="cpu")
     else:
-        shades = F.pad(colors.colors.detach().cpu(), (0, 0, 0, 1), value=GREY)
+        shades = F.pad(colors.colors.detach().cpu(), (0, 0, 0, 1), value=colors.without_material)
         images, rows = [*colors.images, None], colors.uv_faces
         numbers = _rows(colors.face_material.unsqueeze(1), "face_material", 1)[:, 0].long()
-        numbers = numbers % len(shades)  # -1 is the last one, grey
+        numbers = numbers % len(shades)  # -1 is the last one
         rows = torch.full_like(corners, -1) if rows is None else _rows(rows, "uv_faces", 3)
     if len(rows) != len(corners) or len(numbers) != len(corners):
         raise ValueError(f"colors must be those of {len(corners)} faces, got {len(rows)}")

@@ -1,5 +1,6 @@
 """Meshes of several materials: what is drawn, and what OBJ and glTF files keep of them."""
 
+import dataclasses
 import io
 import json
 import math
@@ -83,6 +84,28 @@ def test_files_keep_the_mesh_and_its_materials(tmp_path):
     colors = nmr.VertexColors(uniform(len(VERTICES), 3))
     nmr.save_obj(tmp_path / "b.obj", VERTICES, FACES, colors)
     assert torch.equal(nmr.load_obj(tmp_path / "b.obj", torch.float64).colors, colors.colors)
+
+
+def test_vertex_colors_are_shown_without_images_and_kept_in_files(tmp_path):
+    shades = uniform(len(VERTICES), 3)
+    made = dataclasses.replace(MATERIALS, vertex_colors=shades)
+    face = nmr.render_face_index(VERTICES, FACES, CAMERA, image_size=24).long()
+    has_image = (NUMBERS % 2 == 0) & (UV_FACES >= 0).all(1)
+    factors = nmr.FaceColors(torch.cat([COLORS, torch.ones(1, 3)])[NUMBERS])
+    wanted = draw(factors) * draw(nmr.VertexColors(shades))
+    wanted = torch.where((has_image[face] & (face >= 0)).unsqueeze(-1), draw(MATERIALS), wanted)
+    assert_close(draw(made), wanted)
+
+    nmr.save_obj(tmp_path / "a.obj", VERTICES, FACES, made)
+    read = nmr.Materials.from_mesh(nmr.load_obj(tmp_path / "a.obj", torch.float64))
+    assert_close(draw(read), draw(made), atol=0.003, rtol=0)
+    nmr.save_obj(tmp_path / "b.obj", VERTICES, FACES, nmr.VertexColors(shades))
+    read = nmr.Materials.from_mesh(nmr.load_obj(tmp_path / "b.obj", torch.float64))
+    assert_close(draw(read), draw(nmr.VertexColors(shades)))
+    with pytest.raises(
+        ValueError, match="vertex_colors must have 3 channels as colors have, got 4"
+    ):
+        dataclasses.replace(MATERIALS, vertex_colors=uniform(len(VERTICES), 4))
 
 
 def test_images_of_one_file_are_one_tensor(tmp_path):
