@@ -33,7 +33,7 @@ def find_outline(
 ) -> Outline:
     """Find the object in a picture uint8 [H, W, 3], and other things beside it.
 
-    A thin frame around the picture is left out. With a box, or if the background is not plain,
+    Thin frames around the picture are left out. With a box, or if the background is not plain,
     rembg finds the object if it is installed, or else `cut_out` does. On a plain background the
     object is everything that differs from the border's colour. Raises ValueError as `check_box`
     and `cut_out` do.
@@ -42,7 +42,7 @@ def find_outline(
         check_box(box, *colors.shape[1::-1])
         mask, how, doubt = _cut_out(colors, box, options)
         return Outline(mask, f"{how} in the box", doubt or _box_doubt(mask, box, options))
-    inner = peel_frame(colors, options)
+    inner = peel_frames(colors, options)
     part, doubt, most = colors[inner], None, 1
     if is_plain(part, options):
         whole = threshold_mask(part, options)
@@ -58,10 +58,25 @@ def find_outline(
     return Outline(mask, how, find_doubt(keep_object(mask)[0], most, options) or doubt)
 
 
-def peel_frame(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> tuple[slice, slice]:
-    """Rows and columns within a frame of one colour around a plain background; all if there is no such frame."""
-    whole = slice(None), slice(None)
-    different = np.abs(colors.astype(int) - colors[0, 0]).max(2) > 255 * options.even
+def peel_frames(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> tuple[slice, slice]:
+    """Rows and columns within frames, one in the other, around a plain background; all if there is none.
+
+    A line at some distance from the border is two frames: the margin and the line.
+    """
+    top, left = 0, 0
+    height, width = colors.shape[:2]
+    for _ in range(options.frames):
+        rows, columns = _peel_frame(colors[top : top + height, left : left + width], options)
+        top, left = top + rows.start, left + columns.start
+        height, width = rows.stop - rows.start, columns.stop - columns.start
+    return slice(top, top + height), slice(left, left + width)
+
+
+def _peel_frame(colors: np.ndarray, options: CutOptions) -> tuple[slice, slice]:
+    """Rows and columns within a frame of one colour, or all."""
+    whole = slice(0, colors.shape[0]), slice(0, colors.shape[1])
+    frame = np.median(np.concatenate(border_lines(colors)), axis=0)
+    different = np.abs(colors - frame).max(2) > 255 * options.even
     # JPEG leaves spots in a frame
     rows, columns = (np.flatnonzero(different.mean(axis) > 0.5) for axis in (1, 0))
     if not (len(rows) and len(columns)):
@@ -73,7 +88,7 @@ def peel_frame(colors: np.ndarray, options: CutOptions = DEFAULTS.cut) -> tuple[
     if not 0 < widest <= options.frame * min(height, width) or not is_plain(part, options):
         return whole
     background = np.median(part[[0, -1]].reshape(-1, 3), axis=0)
-    is_frame = np.abs(background - colors[0, 0]).max() > 255 * options.tolerance
+    is_frame = np.abs(background - frame).max() > 255 * options.tolerance
     object_there = 0 < threshold_mask(part, options).mean() < 255
     return inner if is_frame and object_there else whole
 
@@ -132,10 +147,11 @@ def find_doubt(mask: np.ndarray, most: int = 1, options: CutOptions = DEFAULTS.c
     inside = np.asarray(small) > 127
     if sum(line.mean() > options.touched for line in border_lines(inside)) > most:
         return "its outline touches the border of the picture"
+    area, extent = np.count_nonzero(inside), _extent(inside)
+    if area > options.rectangle * extent and extent > options.framed * inside.size:
+        return "its outline is an upright rectangle, perhaps a frame"
     length = np.count_nonzero(inside & ~ndimage.binary_erosion(inside))
-    return (
-        "its outline is ragged" if length**2 > options.ragged * np.count_nonzero(inside) else None
-    )
+    return "its outline is ragged" if length**2 > options.ragged * area else None
 
 
 @functools.lru_cache(1)

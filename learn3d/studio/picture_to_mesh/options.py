@@ -17,6 +17,8 @@ class CutOptions:
     """Longer side in pixels to which a picture is reduced before its object is searched."""
     frame: float = 0.15
     """Widest frame around a picture that is peeled off, as a share of its shorter side."""
+    frames: int = 4
+    """Frames, one in the other, that are peeled off at most."""
     plain: float = 0.9
     """Least share of the border with one colour in pictures with a plain background."""
     even: float = 0.06
@@ -42,6 +44,8 @@ class CutOptions:
     """Smaller holes are filled, as a share of the object."""
     rectangle: float = 0.9
     """Share of its box that an upright rectangle fills: probably a picture on the wall."""
+    framed: float = 0.6
+    """Share of the picture from which the box of an upright rectangle is a doubt: it may be a frame."""
     parts: int = 3
     """Parts that may be the object."""
     part: float = 0.1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
+from PIL import Image, ImageDraw
 
 import nmr
 from learn3d.data.conventions import mesh_to_object
@@ -85,6 +85,34 @@ def test_a_frame_around_a_picture_is_no_object(edge: int, top: int, suffix, tmp_
     mask = read_picture(tmp_path / f"framed.{suffix}").mask > 127
     inside = np.pad((picture < 250).any(2), wide[:2])
     assert (mask != inside).mean() < (0.002 if suffix == "png" else 0.01)
+
+
+@pytest.mark.parametrize(
+    ("offset", "width", "radius"), [(3, 1, 0), (20, 2, 0), (0, 4, 16), (3, 2, 12)]
+)
+def test_a_line_around_a_picture_is_no_object(
+    offset: int, width: int, radius: int, tmp_path
+) -> None:
+    for second in (False, True):  # a second line, of another colour, within it
+        picture = Image.new("RGB", (300, 260), "white")
+        lines = ImageDraw.Draw(picture)
+        for k, color in enumerate(("black", "navy")[: 1 + second]):
+            at = offset + k * width
+            corners = (at, at, 299 - at, 259 - at)
+            lines.rounded_rectangle(corners, max(0, radius - k * width), outline=color, width=width)
+        lines.rectangle((110, 60, 189, 199), fill="firebrick")
+        picture.save(tmp_path / "lined.png")
+        photo = read_picture(tmp_path / "lined.png")
+        inside = np.zeros((260, 300), bool)
+        inside[60:200, 110:190] = True
+        assert ((photo.mask > 127) == inside).all() and photo.doubt is None
+
+
+def test_a_large_upright_rectangle_may_be_a_frame(tmp_path) -> None:
+    picture = Image.new("RGB", (300, 260), "white")
+    ImageDraw.Draw(picture).rounded_rectangle((12, 12, 287, 247), 20, outline="black", width=2)
+    picture.save(tmp_path / "card.png")
+    assert "perhaps a frame" in read_picture(tmp_path / "card.png").doubt
 
 
 def test_a_large_picture_and_its_box_are_reduced_together(tmp_path) -> None:
