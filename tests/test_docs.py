@@ -34,12 +34,20 @@ PAGES = [README, *sorted((ROOT / "docs").glob("*.md")), *sorted(MIGRATING.values
 PAGES += [ROOT / "tools" / "free_meshes" / "README.md"]
 
 
-def run(page):
-    """Executes the blocks of a page, in order, in one namespace, which is returned."""
+def python_blocks(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+
+
+def run_blocks(*blocks):
+    """Executes them in one namespace, which is returned."""
     names = {}
-    for block in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
+    for block in blocks:
         exec(block, names)
     return names
+
+
+def run(page):
+    return run_blocks(*python_blocks(page))
 
 
 def test_readme_fits_a_mesh_that_is_right_from_all_sides(tmp_path, monkeypatch, capsys):
@@ -66,17 +74,17 @@ def test_readme_fits_a_mesh_that_is_right_from_all_sides(tmp_path, monkeypatch, 
     assert abs(picture.astype(int) - shown).mean() < 3, "draw docs/images/car.png again"
 
 
-def test_what_it_is_for_solves_its_tasks(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    names = run(ROOT / "docs" / "what-for.md")
+def test_each_recipe_solves_its_task_alone():
+    beginning, masks, texture, camera = python_blocks(ROOT / "docs" / "what-for.md")
+    names = run_blocks(beginning, masks)
     nmr = names["nmr"]
     fitted = nmr.render_silhouette(
         names["shape"], names["triangles"], names["cameras"], image_size=64
     )
     assert nmr.losses.soft_iou_loss(fitted, names["masks"]) < 0.1
-    assert names["color_loss"]() < 0.01
+    assert run_blocks(beginning, texture)["color_loss"]() < 0.01
     true_eye = nmr.cameras.points_from_angles(2.732, 30.0, 30.0)
-    assert (names["eye"] - true_eye).norm() < 0.05
+    assert (run_blocks(beginning, camera)["eye"] - true_eye).norm() < 0.05
 
 
 def test_from_pytorch3d_draws_the_same_picture_both_ways():

@@ -162,8 +162,8 @@ class Reconstruct(OnDataset):
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGE ...]")]
     ] = ()
     """Images of any size. If not given: images of --data. In those without transparency, --masks or
-    --box the object is searched: it is what differs from a plain background, or else is cut out of
-    the middle (needs the extra photos)."""
+    --box the object is searched: it is what differs from a plain background, or else a small
+    network finds it (needs the extra photos)."""
     masks: tuple[Path, ...] = ()
     """Mask images (white = object), one for each image. If not given: the transparency of the
     images."""

@@ -310,6 +310,9 @@ def serve(runs: Sequence[Path], *, host: str, port: int, browser: bool) -> None:
     # it may contain a visitor's text
     errors.format = lambda record: plain(logging.Handler.format(errors, record))
     logging.getLogger("uvicorn").addHandler(errors)
+    logging.getLogger("asyncio").setLevel(
+        logging.ERROR
+    )  # it warns of each piece for a visitor who left
     jobs = JobQueue()
     config = uvicorn.Config(
         application(models, host, jobs),

@@ -96,7 +96,7 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
 
     Writes the layout's files (see `writers`) for every split that is not empty,
     `{synset}_card.json` (settings, splits, skipped meshes) and `{synset}_contact.png` (see
-    `sheets.LEGEND`). All files get their final names together, after the last one is complete.
+    `contact_sheet.LEGEND`). All files get their final names together, after the last one is complete.
 
     Raises ValueError (no usable mesh), FileExistsError (the folder has files of the category and
     `overwrite` is False).

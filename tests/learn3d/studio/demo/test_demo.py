@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from learn3d.data.conventions import mesh_to_object
 from learn3d.data.masks import keep_object
+from learn3d.files.formats import read_mesh
 from learn3d.pictures import Surface
 from learn3d.studio.demo import picture as pictures
 from learn3d.studio.picture_to_mesh import make
@@ -194,6 +195,20 @@ def test_the_packages_own_model_is_the_default(
     assert status == 0 and "car.glb" in out
     with Image.open(tmp_path / "out" / "car.png") as strip:
         assert strip.width == 8 * 196 + 4, "input, mask and six views"
+
+
+def test_the_packages_own_model_obeys_what_is_known_of_a_picture(tmp_path, command) -> None:
+    (tmp_path / "car.png").write_bytes(pictures.example("car"))
+    words = ("reconstruct", tmp_path / "car.png", "--output")
+    status, _, said = command(*words, tmp_path / "two", "--guesses", 2, "--category", "sofa")
+    assert status == 0 and "car: category sofa, sofa\n" in said
+    first, second = (read_mesh(tmp_path / "two" / name) for name in ("car.glb", "car-2.glb"))
+    assert (
+        first.vertices.shape != second.vertices.shape or (first.vertices != second.vertices).any()
+    )
+    status, _, said = command(*words, tmp_path / "smooth", "--smooth", "--format", "obj")
+    smooth = read_mesh(tmp_path / "smooth" / "car.obj")
+    assert status == 0 and "category" not in said and len(smooth.faces) > 500
 
 
 def test_a_page_that_cannot_be_opened_is_one_sentence(finished_run, tmp_path, command) -> None:
