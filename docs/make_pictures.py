@@ -3,7 +3,7 @@
 python docs/make_pictures.py views.png     # draw this one (without names: list them, and say which are out of date)
 python docs/make_pictures.py views.png --record     # the picture is there already: only record it
 REPORT=report.html python docs/make_pictures.py report.png           # of tools/quickstart.sh, vanilla in batches of 32
-OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of `learn3d experiment plus`
+OUTPUT=results python docs/make_pictures.py results-tsne.png      # from the runs of generated chairs
 OUTPUT=long python docs/make_pictures.py results-long.png         # from those of `learn3d experiment kato`, 5,000 steps
 OUTPUT=CARS_OUTPUT python docs/make_pictures.py results-cars.png  # the same for generated cars
 OUTPUT=GENERATED_OUTPUT python docs/make_pictures.py results-airplanes.png  # generated airplanes, 20,000 steps
@@ -48,11 +48,11 @@ class Picture:
 _QUICKSTART = ("tools/quickstart.sh", "learn3d/studio/tables/grids.py")
 _QUICKSTART += ("learn3d/methods/plus.py", "learn3d/networks/encoders.py")
 _RUN = '"$OUTPUT"/runs/airplane/{}-seed0'
-_RUNS = " ".join(map(_RUN.format, ("proposed", "plus")))
 _THREE = " ".join(map(_RUN.format, ("vanilla", "proposed", "plus")))
 _LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
 _CARS = _LONG.replace("airplane", "car")
-_CURVES = ("kato-generated=generated",)
+_CHAIRS = _LONG.replace("airplane", "chair")
+_CURVES = ("kato-generated=generated", "kato-generated-chairs=generated")
 _CURVES += ("kato-cars=generated", "ablation-cars=generated", "baselines-generated-cars=generated")
 _CURVES += ("kato-5000", "ablation-5000-bf16", "baselines-debian")
 _FUNCTIONS = (
@@ -190,6 +190,7 @@ PICTURES = {
     "results-long.png": _grid(_LONG),
     "results-airplanes.png": _grid(_LONG),
     "results-cars.png": _grid(_CARS),
+    "results-chairs.png": _grid(_CHAIRS),
     "results-curves.png": Picture(
         f"python docs/draw_curves.py --output {{folder}}/curves.png {' '.join(_CURVES)}",
         "{folder}/curves.png",
@@ -209,7 +210,7 @@ PICTURES = {
         ),
     ),
     "results-tsne.png": Picture(
-        f"learn3d figures tsne --runs {_RUNS} --output {{folder}}/tsne.png",
+        f"learn3d figures tsne --runs {_CHAIRS} --output {{folder}}/tsne.png",
         "{folder}/tsne.png",
         ("learn3d/studio/tables/tsne.py",),
     ),
