@@ -225,13 +225,12 @@ def save_obj(
         raise TypeError(
             f"colors must be nmr.VertexColors, UVTexture or Materials, got {describe(colors)}"
         )
-    of_vertices = {VertexColors: "colors", Materials: "vertex_colors"}.get(type(colors))
-    if of_vertices and (given := getattr(colors, of_vertices)) is not None:
-        shades = _rows(given, of_vertices, 3).clamp(0, 1)
+    name = "colors" if isinstance(colors, VertexColors) else "vertex_colors"
+    of_vertices = getattr(colors, name, None)
+    if of_vertices is not None:
+        shades = _rows(of_vertices, name, 3).clamp(0, 1)
         if len(shades) != len(points):
-            raise ValueError(
-                f"{of_vertices} must be one per vertex, {len(points)}, got {len(shades)}"
-            )
+            raise ValueError(f"{name} must be one per vertex, {len(points)}, got {len(shades)}")
         points = torch.cat([points, shades.to(points)], dim=1)
     lines = _lines("v", points)
     if isinstance(colors, (UVTexture, Materials)):
