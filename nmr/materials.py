@@ -116,7 +116,8 @@ class Materials:
 
         Reads their images, which needs Pillow; those of one file are one tensor. Raises
         FileNotFoundError if one is missing and ValueError if it cannot be read. The values are as
-        in the files: colours of images are sRGB, and nothing is converted.
+        in the files, and nothing is converted: images are sRGB, colours of glTF's materials and
+        vertices linear, so that they look darker.
 
         Examples
         --------
