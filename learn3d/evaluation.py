@@ -17,6 +17,7 @@ from learn3d.data.poses import LookAtPoses, wrap_deg
 from learn3d.losses import mmd
 from learn3d.methods.method import Grids, Meshes, Method
 from learn3d.pictures import TILE, Surface, draw_surface, grid_surface, natural_colors, orbit, tile
+from learn3d.terminal import progress
 
 # The picture grid of a training
 TURNS_DEG = (0, 60, 120, 180, 240, 300)  # views of a shape, counted from the input's view
@@ -79,6 +80,7 @@ def evaluate(
     max_images: int | None = None,
     detailed: bool = False,
     batch_size: int = 256,
+    title: str | None = None,
 ) -> Evaluation:
     """Measure the shape of every image of a split, and the mean MMD over all pairs of view classes.
 
@@ -94,146 +96,166 @@ def evaluate(
     Chamfer-L1 and F-score between 2,000 points on each surface. If the data set has no points, both
     surfaces are those of kato18's voxels: the true voxels reach about half a cell, 1/64, beyond the
     true surface, so a mesh would have to be too thick to meet them.
+    title: of the progress on the terminal (`progress`), None to show none.
     """
     samples = spread_samples(
         dataset.object_ids, dataset.view_ids, len(dataset) if max_images is None else max_images
     )
-    others = _other_images(dataset.object_ids)
-    novel_views = bool((others != torch.arange(len(others))).any())
-    generator = torch.Generator().manual_seed(0)
-    surfaces = _true_surfaces(dataset, generator) if detailed else []
-    at_angles = None
-    if detailed and novel_views and isinstance(dataset.poses, LookAtPoses):
-        at_angles = images_by_angle(dataset.object_ids, dataset.poses.azimuth_deg)
-    codes = []
-    values = []
-    turned = []  # IoUs of silhouettes [B, angles] of each batch
+    truth = _Truth.of(dataset, detailed)
+    codes, values, turned = [], [], []
     with method.in_use():
-        for chosen in samples.split(batch_size):
+        for chosen in progress(samples.split(batch_size), title, unit="batch"):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
-            unclamped = shapes.without_clamp() if isinstance(shapes, Meshes) else None
-            measured = {}
-            if dataset.voxels is not None:
-                filled = _voxelize(shapes, dataset)
-                measured = _compare_voxels(shapes, filled, batch, dataset)
-            if detailed and measured:
-                conservative = _voxelize(shapes, dataset, "kato19")
-                measured["voxel_iou_kato19"] = nmr.metrics.voxel_iou(conservative, batch.voxels)
-                measured["voxel_iou_unclamped"] = measured["voxel_iou"]
-                if unclamped is not None:
-                    grid = dataset.convention.voxelize(unclamped.vertices, unclamped.faces)
-                    measured["voxel_iou_unclamped"] = nmr.metrics.voxel_iou(grid, batch.voxels)
-            if (
-                (novel_views or not measured)
-                and dataset.poses is not None
-                and isinstance(shapes, Meshes)
-            ):
-                measured["silhouette_iou"] = _compare_silhouettes(shapes, dataset, others[chosen])
-            if at_angles is not None and isinstance(shapes, Meshes):
-                samples_at = at_angles[:, chosen]
-                turned.append(
-                    torch.stack([_compare_silhouettes(shapes, dataset, s) for s in samples_at])
-                )
-            if surfaces:
-                ours = (
-                    shapes.surfaces()
-                    if dataset.points is not None
-                    else _surfaces_of_voxels(filled, dataset.convention)
-                )
-                truth = [surfaces[k] for k in batch.object_ids.tolist()]
-                measured |= _compare_surfaces(ours, truth, generator)
+            measured = truth.compare(shapes, batch, chosen)
             unknown = torch.full((len(chosen),), math.nan)
             values.append(
                 torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1)
             )
+            turned.append(truth.compare_by_angle(shapes, chosen))
             codes.append(code.float().cpu())
+    figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
+    means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
+    by_angle = torch.cat(turned, dim=1).double().nanmean(1).tolist()
     object_ids, view_ids = (
         torch.from_numpy(ids[samples.numpy()]) for ids in (dataset.object_ids, dataset.view_ids)
     )
-    figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
-    means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
-    all_codes = torch.cat(codes).double()
-    mmds = mean_mmd(all_codes, view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))
+    return Evaluation(
+        object_ids.long(),
+        view_ids.long(),
+        figures,
+        means | _code_means(torch.cat(codes).double(), object_ids, view_ids, detailed),
+        {a: iou for a, iou in zip(ANGLES_DEG, by_angle, strict=True) if not math.isnan(iou)},
+    )
+
+
+def _code_means(
+    codes: Tensor, object_ids: Tensor, view_ids: Tensor, detailed: bool
+) -> dict[str, float]:
+    """The MMDs of `Evaluation.means`; {} if they are undefined."""
+    mmds = mean_mmd(codes, view_ids, ("mmd", "mmd_paper") if detailed else ("mmd",))
     if detailed and mmds:
-        mmds["mmd_floor"] = mean_mmd(all_codes, shuffle_views(object_ids, view_ids))["mmd"]
-    angle_ious = {}
-    if turned:
-        by_angle = torch.cat(turned, dim=1).double().nanmean(1).tolist()
-        angle_ious = {
-            angle: iou
-            for angle, iou in zip(ANGLES_DEG, by_angle, strict=True)
-            if not math.isnan(iou)
-        }
-    return Evaluation(object_ids.long(), view_ids.long(), figures, means | mmds, angle_ious)
+        mmds["mmd_floor"] = mean_mmd(codes, shuffle_views(object_ids, view_ids))["mmd"]
+    return mmds
 
 
-def _voxelize(
-    shapes: Meshes | Grids, dataset: ViewDataset, definition: Definition = "kato18"
-) -> Tensor:
-    """Occupancy of predictions, in the axes of the stored voxels: bool [B, 32, 32, 32].
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """What the shapes of a split are compared with."""
 
-    A grid has no definition: it is pooled to that size.
-    """
-    if isinstance(shapes, Meshes):
-        return dataset.convention.voxelize(shapes.vertices, shapes.faces, definition)
-    if dataset.convention.cube_side != 1.0:
-        raise ValueError(
-            f"grids over the box [-0.5, 0.5] cannot be compared with {dataset.convention.name} voxels"
-        )
-    return dataset.convention.to_axes(shapes.occupied(dataset.voxels.shape[-1]))
+    dataset: ViewDataset
+    detailed: bool
+    # int64 [N]: for each sample the one whose mask its silhouette is compared with, if it is
+    others: Tensor | None
+    at_angles: Tensor | None  # int64 [angles, N] of `images_by_angle`, if known and asked for
+    surfaces: list[Tensor]  # points [P, 3] of each object; [] if unknown or not asked for
+    generator: torch.Generator  # of points on surfaces
 
+    @classmethod
+    def of(cls, dataset: ViewDataset, detailed: bool) -> "_Truth":
+        others = _other_images(dataset.object_ids)
+        novel_views = bool((others != torch.arange(len(others))).any())
+        compared = dataset.poses is not None and (novel_views or dataset.voxels is None)
+        at_angles = None
+        if detailed and novel_views and isinstance(dataset.poses, LookAtPoses):
+            at_angles = images_by_angle(dataset.object_ids, dataset.poses.azimuth_deg)
+        generator = torch.Generator().manual_seed(0)
+        surfaces = _true_surfaces(dataset, generator) if detailed else []
+        return cls(dataset, detailed, others if compared else None, at_angles, surfaces, generator)
 
-def _compare_voxels(
-    shapes: Meshes | Grids, filled: Tensor, batch: Batch, dataset: ViewDataset
-) -> dict[str, Tensor]:
-    precision, recall = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
-    hollow = torch.zeros(len(batch))
-    if isinstance(shapes, Meshes):
-        hollow = dataset.convention.exceeds_grid(shapes.vertices)
-    iou = nmr.metrics.voxel_iou(filled, batch.voxels)
-    return {"voxel_iou": iou, "precision": precision, "recall": recall, "hollow": hollow}
-
-
-def _compare_silhouettes(shapes: Meshes, dataset: ViewDataset, samples: Tensor) -> Tensor:
-    """IoU of the silhouette of each shape at the camera of a sample with the sample's mask:
-    float32 [B], sum of minima over sum of maxima.
-
-    NaN if both are empty, or if the sample is -1.
-    """
-    ious = torch.full((len(samples),), math.nan)
-    known = samples >= 0
-    if known.any():
-        samples = samples[known]
-        masks = torch.from_numpy(dataset.read_masks(samples.numpy())) / 255
-        silhouettes = nmr.render_silhouette(
-            shapes.vertices[known],
-            shapes.faces,
-            dataset.poses[samples].cameras(),
-            image_size=MASK_SIZE,
-        )
-        both = torch.minimum(silhouettes, masks).sum((1, 2))
-        ious[known] = both / torch.maximum(silhouettes, masks).sum((1, 2))
-    return ious
-
-
-def _compare_surfaces(
-    surfaces: list[Surface], truth: list[Tensor], generator: torch.Generator
-) -> dict[str, Tensor]:
-    """Chamfer-L1 and F-score with the true points [P, 3] of each object."""
-    found = []
-    for surface, theirs in zip(surfaces, truth, strict=True):
-        ours = _sample(surface, generator)
-        if len(ours) and len(theirs):
-            distance = nmr.metrics.chamfer_distance(ours, theirs, form="l1")
-            found.append(
-                (float(distance), float(nmr.metrics.f_score(ours, theirs, F_SCORE_DISTANCE)))
+    def compare(self, shapes: Meshes | Grids, batch: Batch, samples: Tensor) -> dict[str, Tensor]:
+        """The measures [B] of a batch's shapes, by the names of `MEASURED`, that are defined."""
+        measured = {}
+        if self.dataset.voxels is not None:
+            filled = self._voxelize(shapes)
+            measured = self._compare_voxels(shapes, filled, batch)
+        if self.others is not None and isinstance(shapes, Meshes):
+            measured["silhouette_iou"] = self._compare_silhouettes(shapes, self.others[samples])
+        if self.surfaces:
+            surfaces = (
+                shapes.surfaces()
+                if self.dataset.points is not None
+                else _surfaces_of_voxels(filled, self.dataset.convention)
             )
-        else:
-            found.append((math.nan, 0.0 if len(ours) or len(theirs) else math.nan))
-    chamfer, f_score = torch.tensor(found).T
-    return {"chamfer_l1": chamfer, "f_score": f_score}
+            measured |= self._compare_surfaces(surfaces, batch)
+        return measured
+
+    def compare_by_angle(self, shapes: Meshes | Grids, samples: Tensor) -> Tensor:
+        """IoU of silhouettes at the images of `at_angles`: float32 [angles, B], NaN if unknown."""
+        if self.at_angles is None or not isinstance(shapes, Meshes):
+            return torch.full((len(ANGLES_DEG), len(samples)), math.nan)
+        others = self.at_angles[:, samples]
+        return torch.stack([self._compare_silhouettes(shapes, chosen) for chosen in others])
+
+    def _voxelize(self, shapes: Meshes | Grids, definition: Definition = "kato18") -> Tensor:
+        """Occupancy of predictions, in the axes of the stored voxels: bool [B, 32, 32, 32].
+
+        A grid has no definition: it is pooled to that size.
+        """
+        convention = self.dataset.convention
+        if isinstance(shapes, Meshes):
+            return convention.voxelize(shapes.vertices, shapes.faces, definition)
+        if convention.cube_side != 1.0:
+            raise ValueError(
+                f"grids over the box [-0.5, 0.5] cannot be compared with {convention.name} voxels"
+            )
+        return convention.to_axes(shapes.occupied(self.dataset.voxels.shape[-1]))
+
+    def _compare_voxels(
+        self, shapes: Meshes | Grids, filled: Tensor, batch: Batch
+    ) -> dict[str, Tensor]:
+        """Measures of shapes and their kato18 voxels."""
+        precision, recall = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
+        hollow = torch.zeros(len(batch))
+        if isinstance(shapes, Meshes):
+            hollow = self.dataset.convention.exceeds_grid(shapes.vertices)
+        iou = nmr.metrics.voxel_iou(filled, batch.voxels)
+        measured = {"voxel_iou": iou, "precision": precision, "recall": recall, "hollow": hollow}
+        if self.detailed:
+            unclamped = shapes.without_clamp() if isinstance(shapes, Meshes) else None
+            grids = {
+                "voxel_iou_kato19": self._voxelize(shapes, "kato19"),
+                "voxel_iou_unclamped": filled if unclamped is None else self._voxelize(unclamped),
+            }
+            for name, grid in grids.items():
+                measured[name] = nmr.metrics.voxel_iou(grid, batch.voxels)
+        return measured
+
+    def _compare_silhouettes(self, shapes: Meshes, samples: Tensor) -> Tensor:
+        """IoU of the silhouette of each shape at the camera of a sample with the sample's mask:
+        float32 [B], sum of minima over sum of maxima.
+
+        NaN if both are empty, or if the sample is -1.
+        """
+        ious = torch.full((len(samples),), math.nan)
+        known = samples >= 0
+        if known.any():
+            samples = samples[known]
+            masks = torch.from_numpy(self.dataset.read_masks(samples.numpy())) / 255
+            silhouettes = nmr.render_silhouette(
+                shapes.vertices[known],
+                shapes.faces,
+                self.dataset.poses[samples].cameras(),
+                image_size=MASK_SIZE,
+            )
+            both = torch.minimum(silhouettes, masks).sum((1, 2))
+            ious[known] = both / torch.maximum(silhouettes, masks).sum((1, 2))
+        return ious
+
+    def _compare_surfaces(self, surfaces: list[Surface], batch: Batch) -> dict[str, Tensor]:
+        """Chamfer-L1 and F-score with the true points of the batch's objects."""
+        found = []
+        for surface, number in zip(surfaces, batch.object_ids.tolist(), strict=True):
+            ours, theirs = _sample(surface, self.generator), self.surfaces[number]
+            if len(ours) and len(theirs):
+                distance = nmr.metrics.chamfer_distance(ours, theirs, form="l1")
+                f_score = nmr.metrics.f_score(ours, theirs, F_SCORE_DISTANCE)
+                found.append((float(distance), float(f_score)))
+            else:
+                found.append((math.nan, 0.0 if len(ours) or len(theirs) else math.nan))
+        chamfer, f_score = torch.tensor(found).T
+        return {"chamfer_l1": chamfer, "f_score": f_score}
 
 
 def _true_surfaces(dataset: ViewDataset, generator: torch.Generator) -> list[Tensor]:

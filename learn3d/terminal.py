@@ -9,10 +9,13 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import ParamSpec, TextIO
+from typing import Any, ParamSpec, TextIO
+
+from tqdm import tqdm
 
 P = ParamSpec("P")
 
+SECONDS_BETWEEN_LINES = 30.0  # of progress, if stderr is no terminal
 INTERRUPTED = 130  # exit status after Ctrl-C, as shells have it
 #: Control characters, characters that change the direction of text, and surrogates, which cannot be encoded.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -83,6 +86,34 @@ def note(text: str) -> None:
 def is_watched() -> bool:
     """Whether stderr is a terminal (it may be closed, or never have been open)."""
     return sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty()
+
+
+def progress(
+    items: Iterable[Any] | None, title: str | None, *, unit: str, total: int | None = None
+) -> tqdm:
+    """Show on stderr how much of a loop over `items` is done: a bar on a terminal, elsewhere a
+    line every 30 seconds. Without a title nothing is shown.
+
+    items: None if the caller counts, by `update()` of the result. total: their number, if they
+    have no length.
+    """
+    options: dict[str, Any] = {"dynamic_ncols": True}
+    if not is_watched():
+        wait = dict.fromkeys(("delay", "mininterval", "maxinterval"), SECONDS_BETWEEN_LINES)
+        form = "{desc}: {n_fmt} of {total_fmt} {unit}, {remaining} left"
+        options = wait | {"file": _Lines(), "bar_format": form, "miniters": 1, "leave": False}
+    return tqdm(items, title, total, unit=unit, disable=title is None, **options)
+
+
+class _Lines:
+    """A file for tqdm that passes each of its states to `note`, as a line."""
+
+    def write(self, text: str) -> None:
+        if state := text.strip():  # without the carriage return before it
+            note(state)
+
+    def flush(self) -> None:
+        pass
 
 
 def _print(text: str, stream: TextIO) -> None:

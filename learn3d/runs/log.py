@@ -22,9 +22,8 @@ from learn3d.distributed import rank
 from learn3d.files import writing
 from learn3d.files.reading import parse_json
 from learn3d.runs.folder import METRICS, TENSORBOARD, WANDB_ID
-from learn3d.terminal import is_watched, note
+from learn3d.terminal import SECONDS_BETWEEN_LINES, is_watched, note
 
-SECONDS_BETWEEN_LINES = 30.0
 MEAN_OVER = 20  # steps over which shown losses are averaged
 #: Methods of a second log that writes nothing.
 _SILENT = dict.fromkeys(("add_scalar", "add_image", "flush", "close"), lambda *_, **__: None)

@@ -187,7 +187,7 @@ def evaluate_runs(
         for name in split_names(category or config.category):
             note(f"{file}: {label} ({config.preset}) on {name}, {split}")
             dataset = checkpoint.load_data(config, split, data=data, category=name, layout=layout)
-            evaluation = evaluate(method, dataset, detailed=True)
+            evaluation = evaluate(method, dataset, detailed=True, title=name)
             means = dict.fromkeys((*MEASURES, "hollow")) | evaluation.means
             if means["hollow"]:
                 note(

@@ -7,13 +7,15 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 import torch
 from children import wait_until
 
-from learn3d.terminal import align, say, without_traceback
+from learn3d import terminal
+from learn3d.terminal import align, progress, say, without_traceback
 
 INTERRUPTED = "interrupted; what was saved before is as it was\n"
 PROGRAM = """
@@ -118,6 +120,19 @@ def test_an_output_that_nobody_reads_is_no_error(program: list[str], tmp_path) -
     )
     os.close(writing)
     assert (result.returncode, result.stderr) == (0, b"")
+
+
+def test_progress_is_a_line_now_and_then_where_no_terminal_is(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(terminal, "SECONDS_BETWEEN_LINES", 0.05)
+    items = range(100, 104)
+    read = [item for item in progress(items, "a\x1bb", unit="mesh") if not time.sleep(0.06)]
+    assert read == list(items)
+    shown = capsys.readouterr().err
+    assert shown.splitlines() == [
+        line for line in shown.splitlines() if line.startswith("a\\x1bb: ")
+    ]
+    assert "2 of 4 mesh, 00:00 left\n" in shown and "\r" not in shown
+    assert list(progress(items, None, unit="mesh")) == read and capsys.readouterr().err == ""
 
 
 def test_columns_are_as_wide_as_their_widest_cell() -> None:

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from learn3d.data.dataset import MASK_SIZE
 from learn3d.files import limits
 from learn3d.files.reading import FAULTS, DamagedFile, FaultHandler, MissingFile, OddFile, attempt
 from learn3d.files.sandbox import Call, read_all
-from learn3d.terminal import is_watched
+from learn3d.terminal import progress
 
 
 class Files(NamedTuple):
@@ -53,7 +52,7 @@ def read_objects(
         masks = np.empty((len(images), MASK_SIZE, MASK_SIZE), np.uint8)
     sound, poses, shapes = [], [], []
     calls = ([cameras, shape, *views] for cameras, shape, views in map(files, names))
-    read = tqdm(read_all(calls), title, len(names), disable=not is_watched(), unit="object")
+    read = progress(read_all(calls), title, unit="object", total=len(names))
     for name, (cameras, shape, *views) in zip(names, read, strict=True):
         wanted = files(name)
         folder = wanted.cameras.path.parent

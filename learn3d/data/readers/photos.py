@@ -19,7 +19,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
-from tqdm import tqdm
 
 from learn3d.data.conventions import LAYOUTS, SPLITS, synset_of
 from learn3d.data.dataset import MASK_SIZE, ViewDataset
@@ -40,7 +39,7 @@ from learn3d.files.reading import (
 )
 from learn3d.files.sandbox import Call, read_all
 from learn3d.settings import checked
-from learn3d.terminal import is_watched
+from learn3d.terminal import progress
 
 _SCALE_ODD = 1.7  # factor between sizes in images and table that gives a warning; half angles for whole ones give 2
 _SCALE_OFF = 5.0  # factor that is an error: distances are in another unit
@@ -137,7 +136,7 @@ def _read_photos(
 ) -> Iterator[tuple[Photo, Framed]]:
     """The sound ones of some photographs, framed."""
     calls = ([Call(read_framed, p.file, (p.mask, size), "a photograph")] for p in photos)
-    read = tqdm(read_all(calls), title, len(photos), disable=not is_watched())
+    read = progress(read_all(calls), title, unit="photograph", total=len(photos))
     for photo, (found,) in zip(photos, read, strict=True):
         if isinstance(found, FAULTS):
             where = f"({TABLE}, line {photo.line})"

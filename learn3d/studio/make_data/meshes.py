@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
-from tqdm import tqdm
 from trimesh import Trimesh
 
 from learn3d.data import conventions
@@ -21,7 +20,7 @@ from learn3d.settings import Count, FilePath, Weight, checked
 from learn3d.studio.make_data.writers import WRITERS, WrittenLayout
 from learn3d.studio.shapes import CATEGORIES, numbered_shape
 from learn3d.tasks import ONE_WORKER, Workers
-from learn3d.terminal import is_watched
+from learn3d.terminal import progress
 
 MAX_FACES = 1_000_000
 _PACK = "an npz file with v0, f0, v1, f1, ... and no pickled objects"
@@ -171,7 +170,7 @@ def find_meshes(source: Path) -> tuple[dict[str, Callable[[], RawMesh]], dict[st
     if source.is_dir():
         calls = ([sandbox.Call(measure_mesh, source / name)] for name in sources)
         read = sandbox.read_all(calls)
-        bar = tqdm(read, "compare", len(sources), disable=not is_watched(), unit="mesh")
+        bar = progress(read, "compare", unit="mesh", total=len(sources))
         measures = {n: m for n, (m,) in zip(sources, bar, strict=True) if isinstance(m, np.ndarray)}
         names, others = identity.one_format(
             sorted(

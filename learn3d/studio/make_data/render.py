@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from learn3d.data.conventions import SPLITS, mesh_to_object, synset_of, view_poses
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
@@ -24,7 +23,7 @@ from learn3d.studio.make_data.meshes import DatasetConfig, Item, check, fit_to_b
 from learn3d.studio.make_data.writers import WRITERS
 from learn3d.studio.make_data.writers.writer import RenderedObject, write_png
 from learn3d.tasks import Task, make_missing
-from learn3d.terminal import is_watched, note, say, stop_on_signal
+from learn3d.terminal import note, progress, say, stop_on_signal
 
 SCALE_RANGE = (0.75, 1.25)  # per-axis scales of the augmented copies
 MAX_LISTED = 100  # skipped meshes in the text of a report; the card has all of them
@@ -113,9 +112,7 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
         )
     config.output.mkdir(parents=True, exist_ok=True)
     made, rows = [], {split: [] for split in SPLITS}
-    bar = tqdm(
-        items, desc=config.category, unit="mesh", disable=not is_watched(), dynamic_ncols=True
-    )
+    bar = progress(items, config.category, unit="mesh")
     with publishing(config.output, [*paths, *writer.shared]) as folder:
         writer.write(render_meshes(config, bar, made, rows), config.category, folder, config.output)
         report = DatasetReport(config, made, left_out)

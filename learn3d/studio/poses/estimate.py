@@ -40,7 +40,7 @@ from learn3d.methods.pose_updates import SIZE, TEMPERATURE
 from learn3d.networks.encoders import CODE_SIZE
 from learn3d.networks.generators import GENERATORS
 from learn3d.settings import checked
-from learn3d.terminal import is_watched
+from learn3d.terminal import progress
 
 MAX_FITTED = 6000  # images that shapes are fitted to and that can be neighbours
 MIN_IMAGES = 100  # with fewer images, no pose is trusted
@@ -128,7 +128,7 @@ def estimate(
     subset = data.select(fitted)
     neighbours = (Neighbours.of(subset, subset), Neighbours.of(data, subset))
     steps = options.steps * (options.restarts + STAGES) * options.repeats
-    bar = tqdm(total=steps, desc="poses", unit="step", disable=not is_watched())
+    bar = progress(None, "poses", unit="step", total=steps)
     with torch.random.fork_rng(devices=[]), bar:
         torch.manual_seed(options.seed)
         create = functools.partial(Shapes, subset, candidates, options, rng, bar)

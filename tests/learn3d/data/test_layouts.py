@@ -11,8 +11,8 @@ import pytest
 from reader_checks import cut_short
 from shapenet_files import CHAIR, write_dvr
 
+from learn3d import terminal
 from learn3d.data.layouts import LAYOUTS, Layout, check_folder, check_options, load_dataset, reader
-from learn3d.data.readers import objects
 
 TABLE = "04379243"
 
@@ -50,10 +50,10 @@ def test_a_folder_that_is_not_there_or_of_another_layout_is_named(
             load_dataset(layout, where, "chair", "test")
 
 
-def test_progress_is_shown_on_a_terminal_only(folder, capsys, monkeypatch) -> None:
+def test_short_work_shows_progress_on_a_terminal_only(folder, capsys, monkeypatch) -> None:
     load_dataset("dvr", folder, "chair", "test")
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(objects, "is_watched", lambda: True)
+    monkeypatch.setattr(terminal, "is_watched", lambda: True)
     load_dataset("dvr", folder, "chair", "test")
     assert "chair" in capsys.readouterr().err
 
