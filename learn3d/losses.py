@@ -97,10 +97,11 @@ def mmd(
 
     xx, yy, xy: float [N,N], squared distances d^2 within x, within y and from x to y;
     differentiable. b is the mean of d^2 over all pairs of different rows of x and y together, a
-    constant for the gradient. "released", as in the published code and the paper's table: mean(XX
-    + YY - XY - YX) of the sum of five kernels exp(-d^2 / (b * 2^i)), i = -2..2. "paper", as
-    printed: the square root of that mean for one kernel. The paper gives no bandwidth for it;
-    here i = 0.
+    constant for the gradient.
+
+    "released", as in the published code and the paper's table: mean(XX + YY - XY - YX) of the sum
+    of five kernels exp(-d^2 / (b * 2^i)), i = -2..2. "paper", as printed: the square root of that
+    mean for one kernel. The paper gives no bandwidth for it; here i = 0.
     """
     rows = 2 * xx.shape[0]
     width = ((xx.sum() + yy.sum() + 2 * xy.sum()) / (rows * rows - rows)).detach()

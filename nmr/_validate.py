@@ -146,8 +146,10 @@ def check_camera(camera: object, packed: bool) -> None:
             f"camera must be an instance, got the class {camera.__name__}; create one: {camera.__name__}(...)"
         )
     if not callable(getattr(camera, "transform", None)):
+        several = isinstance(camera, (list, tuple)) and camera and hasattr(camera[0], "transform")
         raise TypeError(
             f"camera must have a method transform(vertices), as nmr.LookAt does, got {describe(camera)}"
+            + "; nmr.cameras.cat joins several cameras" * bool(several)
         )
     if packed and "starts" not in inspect.signature(camera.transform).parameters:
         raise TypeError(

@@ -65,10 +65,10 @@ class Lights:
 
         light = ambient ambient_color + sum over lights of c relu(n . l) + sum over i of harmonics_i Y_i(n)
         highlight = specular * sum over lights with n . l > 0 of c relu(r . v)^shininess        (Phong)
+        c = directional directional_color, or point point_color / (1 + falloff |position - x|^2)
 
-    A directional light has ``l = direction`` and ``c = directional directional_color``; a point
-    light l of length 1 towards its position and ``c = point point_color / (1 + falloff |position -
-    x|^2)``. r is l, reflected by the surface, v points towards the eye; highlights use the unit
+    A directional light has ``l = direction``; a point light l of length 1 towards its position.
+    r is l, reflected by the surface, v points towards the eye; highlights use the unit
     vector along direction, and multiply c by its length. n is the face's normal or, if ``smooth``,
     interpolated. The defaults are the published ones.
 

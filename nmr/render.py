@@ -426,8 +426,8 @@ def render_soft_silhouette(
     camera : Camera, optional
         Such as :class:`nmr.LookAt`.
     sigma : float or Tensor []
-        A pixel at the distance d from the border of a face is covered by it with probability ``D =
-        sigmoid(d^2 / sigma)`` if it is inside, else ``sigmoid(-d^2 / sigma)``. d is in units of
+        A face covers a pixel at the distance d from its border with the probability D, which is
+        ``sigmoid(d^2 / sigma)`` inside and ``sigmoid(-d^2 / sigma)`` outside. d is in units of
         half the shorter side of the image.
     dist_eps : float
         In (0, 0.5): faces with a smaller D at a pixel outside are left out there.

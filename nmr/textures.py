@@ -124,8 +124,8 @@ class TextureCubes:
     The point with barycentric weights (b0, b1, b2) has the colour at ``(ts - 1) (b0, b1, b2)`` in
     the cube of its face, interpolated between the eight nearest texels. Texel [ts - 1, 0, 0] is the
     colour of the face's first vertex. As published, colours do not move vertices through the
-    weights, even with ``interpolation_gradient``, and the place in the cube ends at ts - 1 -
-    ``eps`` of the render function.
+    weights, even with ``interpolation_gradient``, and the place in the cube ends at
+    ``ts - 1 - eps``, with the ``eps`` of the render function.
 
     Parameters
     ----------

@@ -54,8 +54,8 @@ class TrainingSchedule:
 class EMA:
     """Exponential moving average of all parameters and floating-point buffers of networks.
 
-    After step t: average = d * average + (1 - d) * weights with d = min(decay, (1 + t) / (10 +
-    t)), so that the initial weights are soon forgotten.
+    After step t: average = d * average + (1 - d) * weights, so that the initial weights are soon
+    forgotten; d = min(decay, (1 + t) / (10 + t)).
     """
 
     def __init__(self, networks: nn.Module, decay: float) -> None:

@@ -20,7 +20,7 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     reconstruct_files,
 )
 from learn3d.studio.poses.comparison import compare
-from learn3d.studio.poses.estimate import PoseOptions
+from learn3d.studio.poses.options import PoseOptions
 from learn3d.studio.poses.sheet import draw_pose_sheet
 from learn3d.studio.poses.views import MIN_CONFIDENCE, CameraOptions, estimate_views, load_views
 from learn3d.studio.tables.experiment import describe_tables, run_experiment

@@ -154,8 +154,9 @@ _FOV = _NARROWEST_DEG, 90.0, "between 0 and 90 degrees"
 class LookAt(_Placed):
     """A perspective camera at ``eye`` that looks at ``at``.
 
-    A vertex v maps to ``u = R (v - eye)`` with rows of R ``x = n(up x z), y = n(z x x), z = n(at -
-    eye)``, then to ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``; n(v) = v / max(abs(v), 1e-5).
+    A vertex v maps to ``u = R (v - eye)``, then to ``(u_x / (u_z tan a), u_y / (u_z tan a), u_z)``.
+    The rows of R are ``x = n(up x z)``, ``y = n(z x x)`` and ``z = n(at - eye)``, with
+    ``n(v) = v / max(abs(v), 1e-5)``.
     An eye straight above or below ``at`` gives x = y = 0, as published: an empty image, and a
     UserWarning. The world is left-handed (x right, y up, z away), as published, and mesh files
     appear mirrored.

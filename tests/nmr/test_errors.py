@@ -113,6 +113,7 @@ TYPES = [
     ("subdivisions must be an integer, got float", lambda: nmr.icosphere(2.5)),
     # cameras
     (r"camera must have a method transform\(vertices\)", lambda: render(camera="front")),
+    ("got list; nmr.cameras.cat joins", lambda: render(camera=[nmr.LookAt([0.0, 0.0, -2.0])])),
     (r"got the class LookAt; create one: LookAt\(\.\.\.\)", lambda: render(camera=nmr.LookAt)),
     (
         r"SimpleNamespace.transform must take \(vertices \[N, 3\], starts",

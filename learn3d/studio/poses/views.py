@@ -20,14 +20,10 @@ from learn3d.files import limits
 from learn3d.files.reading import MissingFile
 from learn3d.methods.pose_updates import SIZE
 from learn3d.settings import checked
-from learn3d.studio.poses.estimate import (
-    MIN_IMAGES,
-    CandidatePoses,
-    Estimate,
-    Masks,
-    PoseOptions,
-    estimate,
-)
+from learn3d.studio.poses.estimate import MIN_IMAGES, Estimate, estimate
+from learn3d.studio.poses.neighbours import Masks
+from learn3d.studio.poses.options import PoseOptions
+from learn3d.studio.poses.prototypes import CandidatePoses
 
 MAX_ELEVATION_STEP_DEG = 15.0  # between neighbouring candidates
 DEFAULT_ELEVATION_DEG, DEFAULT_FOV_DEG = 30.0, 30.0

@@ -301,22 +301,20 @@ def _compare(measure: str, *sides: Side) -> str:
         text += f" ±{stats.t.ppf(0.975, len(seeds) - 1) * stats.sem(ours - sum(theirs)):.3f}"
     if measure not in ObjectMeans._fields:
         return text + (f" (x {means[0] / means[1]:.2f})" if len(means) == 2 else "")
-    for of_category in zip(*sides, strict=True):
-        if (
-            len(
-                {
-                    tuple(o.name for o in r.objects)
-                    for by_seed in of_category
-                    for r in by_seed.values()
-                }
-            )
-            > 1
-        ):
-            return text  # on different objects: they cannot be resampled together
-    ours, *theirs = (_resample(measure, side) for side in sides)
-    if interval := percentile_interval(ours - sum(theirs)):
-        text += f" [{interval[0]:{form}}, {interval[1]:{form}}]"
+    if _have_same_objects(sides):  # others cannot be resampled together
+        ours, *theirs = (_resample(measure, side) for side in sides)
+        if interval := percentile_interval(ours - sum(theirs)):
+            text += f" [{interval[0]:{form}}, {interval[1]:{form}}]"
     return text
+
+
+def _have_same_objects(sides: Sequence[Side]) -> bool:
+    """Whether all results of each category are of the same objects."""
+    for of_category in zip(*sides, strict=True):
+        results = [result for by_seed in of_category for result in by_seed.values()]
+        if len({tuple(o.name for o in result.objects) for result in results}) > 1:
+            return False
+    return True
 
 
 def _resample(measure: str, side: Side) -> np.ndarray:

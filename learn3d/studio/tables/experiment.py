@@ -20,7 +20,8 @@ from learn3d.runs import folder as run_folder
 from learn3d.runs.baselines import measure_baselines
 from learn3d.runs.measurement import Baseline, Result, evaluate_runs, read_curve
 from learn3d.studio.poses.comparison import compare
-from learn3d.studio.poses.estimate import NEAR_DEG, PoseOptions
+from learn3d.studio.poses.estimate import NEAR_DEG
+from learn3d.studio.poses.options import PoseOptions
 from learn3d.studio.poses.views import CameraOptions, estimate_views, load_views
 from learn3d.studio.tables.comparison import make_report, read_pose_errors
 from learn3d.studio.tables.plan import PlannedRun, Request, plan_runs

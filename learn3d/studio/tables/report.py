@@ -91,7 +91,7 @@ def write_report(
     results = []
     for run in runs:
         note(f"measuring {run.label} on {len(run.dataset)} images")
-        results.append(evaluate(run.method, run.dataset))
+        results.append(evaluate(run.method, run.dataset, title=run.label))
     page = _measure(runs, results, objects) | {"split": split, "which": which}
     page["data"] = plain((data or runs[0].metadata.config.data).name)
     page["browser"]["curves"] = draw_curves(logs)
@@ -148,6 +148,7 @@ def _measure(
     counts = np.stack([np.bincount(ids, ~np.isnan(row), len(names)) for row in ious])
     # run by object
     means = np.divide(sums, counts, out=np.full_like(sums, np.nan), where=counts > 0)
+    resampled = [resampled_means([s], [count]) for s, count in zip(sums, counts, strict=True)]
 
     of_objects = _mean(means, axis=0)
     numbers = np.unique(ids)
@@ -168,19 +169,8 @@ def _measure(
     legend = [
         {"name": plain(run.label), "color": COLORS[k % len(COLORS)]} for k, run in enumerate(runs)
     ]
-    resampled = [
-        resampled_means([total], [number]) for total, number in zip(sums, counts, strict=True)
-    ]
-    rows = [
-        entry | _describe(*each, metric)
-        for entry, *each in zip(legend, runs, results, resampled, strict=True)
-    ]
-    for row, samples in zip(rows[1:], resampled[1:], strict=True):
-        if None not in (row["iou"], rows[0]["iou"]):
-            row["difference"] = row["iou"] - rows[0]["iou"]
-            row["difference_interval"] = percentile_interval(samples - resampled[0])
     return {
-        "runs": rows,
+        "runs": _describe_all(legend, runs, results, resampled, metric),
         "category": plain(dataset.category),
         "images": len(dataset),
         "objects": [
@@ -195,19 +185,30 @@ def _measure(
     }
 
 
-def _describe(
-    run: TrainedModel, result: Evaluation, resampled: np.ndarray, metric: str
-) -> dict[str, Any]:
-    """A run's row of the first table, but for its difference to the first run."""
-    config = run.metadata.config
-    return {
-        "about": run.metadata,
-        "method": config.label,
-        "mmd": result.means.get("mmd"),
-        "iou": result.means.get(metric),
-        "interval": percentile_interval(resampled),
-        "command": command_line(config, data="DATA", output="OUTPUT", pretrained="WEIGHTS"),
-    }
+def _describe_all(
+    legend: Sequence[dict[str, str]],
+    runs: Sequence[TrainedModel],
+    results: Sequence[Evaluation],
+    resampled: Sequence[np.ndarray],
+    metric: str,
+) -> list[dict[str, Any]]:
+    """The runs' rows of the first table, with their differences to the first run."""
+    rows: list[dict[str, Any]] = []
+    for entry, run, result, samples in zip(legend, runs, results, resampled, strict=True):
+        config = run.metadata.config
+        row = entry | {
+            "about": run.metadata,
+            "method": config.label,
+            "mmd": result.means.get("mmd"),
+            "iou": result.means.get(metric),
+            "interval": percentile_interval(samples),
+            "command": command_line(config, data="DATA", output="OUTPUT", pretrained="WEIGHTS"),
+        }
+        if rows and None not in (row["iou"], rows[0]["iou"]):
+            row["difference"] = row["iou"] - rows[0]["iou"]
+            row["difference_interval"] = percentile_interval(samples - resampled[0])
+        rows.append(row)
+    return rows
 
 
 def _typical_images(

@@ -12,11 +12,9 @@ from scipy.spatial.transform import Rotation
 import nmr
 from learn3d.data.conventions import KAR, SPLITS, synset_of
 from learn3d.data.dataset import DEPTH_REACH
-from learn3d.data.readers.kar import read_splits
+from learn3d.data.readers.kar import HALF_FOV_DEG, read_splits
 from learn3d.files.writing import write_json
 from learn3d.studio.make_data.writers.writer import RenderedObject, Writer, random_views, write_png
-
-KAR_HALF_FOV_DEG = 14.9314  # 60 mm lens, 32 mm sensor
 
 
 def _write_kar(objects: Iterable[RenderedObject], category: str, root: Path, output: Path) -> None:
@@ -29,7 +27,7 @@ def _write_kar(objects: Iterable[RenderedObject], category: str, root: Path, out
     """
     renders, volumes = (root / path for path in KAR_WRITER.paths(category))
     size, lists = KAR_WRITER.image_size, {split: [] for split in SPLITS}
-    focal = size / 2 / np.tan(np.deg2rad(KAR_HALF_FOV_DEG))
+    focal = size / 2 / np.tan(np.deg2rad(HALF_FOV_DEG))
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     for item in objects:
         folder, poses, cameras = renders / item.name, item.poses, item.poses.cameras()
@@ -72,7 +70,7 @@ KAR_WRITER = Writer(
         f"voxels/modelVoxels32/{synset_of(category)}",
     ),
     write=_write_kar,
-    views=functools.partial(random_views, (-20.0, 40.0), KAR_HALF_FOV_DEG),
+    views=functools.partial(random_views, (-20.0, 40.0), HALF_FOV_DEG),
     image_size=224,
     default_views=20,
     convention=KAR,

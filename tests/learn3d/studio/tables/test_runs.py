@@ -25,7 +25,7 @@ from learn3d.runs import checkpoint
 from learn3d.runs.checkpoint import Progress
 from learn3d.runs.measurement import evaluate_runs
 from learn3d.runs.run import Summary
-from learn3d.studio.poses.estimate import PoseOptions
+from learn3d.studio.poses.options import PoseOptions
 from learn3d.studio.tables import experiment
 from learn3d.studio.tables.experiment import (
     find_conflict,
