@@ -100,6 +100,23 @@ def test_a_doubtful_outline_is_said_and_gets_its_mesh(finished_run) -> None:
     assert [step["part"] for step in steps] == [0.0, 0.3, 0.7, 0.9] and last["meshes"]
 
 
+def test_a_stroke_over_nearly_all_of_an_object_is_doubted(finished_run) -> None:
+    mask = np.zeros((100, 120), np.uint8)
+    mask[30:70, 30:90] = 255
+    strokes = np.zeros_like(mask)
+    sent: list[dict] = []
+    models = {"my run": load_model(finished_run)}
+    for last, doubted in (
+        (60, []),
+        (88, ["Is this the object? Little of it is left. If not, press Undo."]),
+    ):
+        strokes[:, :last] = 2  # background
+        picture = pictures.Picture(np.full((100, 120, 3), 150, np.uint8), mask, strokes)
+        pictures.make_meshes(models, picture, sent.append)
+        assert [each["doubt"] for each in sent if "doubt" in each] == doubted
+        assert not [each for each in sent if "tool" in each], "the visitor goes on with the brush"
+
+
 def test_a_kind_is_told_to_the_models_that_know_it(finished_run) -> None:
     model = load_model(finished_run)
     other = model._replace(config=dataclasses.replace(model.config, category="car"))
