@@ -25,8 +25,7 @@ from learn3d.studio.shapes import make_shape
 SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
 EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # category: seed
 GUESSES = 3  # different shapes of one picture among which a visitor can choose
-BY_HAND = "by hand"  # how an outline was found that strokes corrected
-_LITTLE = 0.1  # the smallest part of a mask that strokes may leave without a question
+_LEAST = 0.02  # the part of a mask that strokes must leave: less are specks between them
 _MARGIN = 24  # pixels around the object of an example
 
 Send = Callable[[dict[str, Any]], None]
@@ -65,13 +64,13 @@ def outline_object(picture: Picture) -> tuple[Outline, str | None]:
     """The object's outline, and what was left out, see `keep_parts`.
 
     The mask is the given one, or is found in the box or picture. If it was corrected, nothing is
-    left out, and a doubt says if little of the object is left.
+    left out. Raises ValueError if the correction leaves nearly nothing.
     """
     if picture.box is None and picture.strokes is not None:
         mask = correct(picture.colors, picture.mask, picture.strokes)
-        left = (mask > 127).sum() / max(1, (picture.mask > 127).sum())
-        doubt = "little of it is left" if left < _LITTLE else None
-        return Outline(mask, BY_HAND, doubt), None
+        if (mask > 127).sum() < _LEAST * (picture.mask > 127).sum():
+            raise ValueError("Almost nothing of the object is left. Paint over a smaller part.")
+        return Outline(mask, "by hand"), None
     if picture.box is None and picture.mask.min() < 255:
         outline = Outline(picture.mask, "by the picture's transparency")
     else:
@@ -101,11 +100,10 @@ def make_meshes(
         mask = _base64(np.packbits(outline.mask > 127).tobytes())
         send({"mask": mask, "how": outline.how, "left_out": left_out})
         if outline.doubt:
-            asked = f"Is this the object? {outline.doubt.capitalize()}. If not, "
-            if outline.how == BY_HAND:
-                send({"doubt": f"{asked}press Undo."})
-            else:
-                send({"doubt": f"{asked}drag a box around it.", "tool": "box"})
+            doubt = (
+                f"Is this the object? {outline.doubt.capitalize()}. If not, drag a box around it."
+            )
+            send({"doubt": doubt, "tool": "box"})
         made = {
             label: reconstruct_guesses(
                 model,

@@ -100,21 +100,19 @@ def test_a_doubtful_outline_is_said_and_gets_its_mesh(finished_run) -> None:
     assert [step["part"] for step in steps] == [0.0, 0.3, 0.7, 0.9] and last["meshes"]
 
 
-def test_a_stroke_over_nearly_all_of_an_object_is_doubted(finished_run) -> None:
+def test_a_stroke_over_nearly_all_of_an_object_is_refused() -> None:
     mask = np.zeros((100, 120), np.uint8)
     mask[30:70, 30:90] = 255
-    strokes = np.zeros_like(mask)
+    strokes = np.full_like(mask, 2)  # background
     sent: list[dict] = []
-    models = {"my run": load_model(finished_run)}
-    for last, doubted in (
-        (60, []),
-        (88, ["Is this the object? Little of it is left. If not, press Undo."]),
-    ):
-        strokes[:, :last] = 2  # background
+    for last in (32, 31):
+        strokes[:, 30:last] = 0
         picture = pictures.Picture(np.full((100, 120, 3), 150, np.uint8), mask, strokes)
-        pictures.make_meshes(models, picture, sent.append)
-        assert [each["doubt"] for each in sent if "doubt" in each] == doubted
-        assert not [each for each in sent if "tool" in each], "the visitor goes on with the brush"
+        pictures.make_meshes({}, picture, sent.append)
+        strokes[:] = 2
+    (found, made), (refused,) = sent[:2], sent[2:]
+    assert found["how"] == "by hand" and made == {"meshes": []}
+    assert refused["error"].startswith("Almost nothing of the object is left.")
 
 
 def test_a_kind_is_told_to_the_models_that_know_it(finished_run) -> None:
