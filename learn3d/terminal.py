@@ -100,7 +100,7 @@ def progress(
     options: dict[str, Any] = {"dynamic_ncols": True}
     if not is_watched():
         wait = dict.fromkeys(("delay", "mininterval", "maxinterval"), SECONDS_BETWEEN_LINES)
-        form = "{desc}: {n_fmt} of {total_fmt} {unit}, {remaining} left"
+        form = "{desc}: {n_fmt} of {total_fmt}, {remaining} left"
         options = wait | {"file": _Lines(), "bar_format": form, "miniters": 1, "leave": False}
     return tqdm(items, title, total, unit=unit, disable=title is None, **options)
 

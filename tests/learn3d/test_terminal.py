@@ -131,7 +131,7 @@ def test_progress_is_a_line_now_and_then_where_no_terminal_is(capsys, monkeypatc
     assert shown.splitlines() == [
         line for line in shown.splitlines() if line.startswith("a\\x1bb: ")
     ]
-    assert "2 of 4 mesh, 00:00 left\n" in shown and "\r" not in shown
+    assert "2 of 4, 00:00 left\n" in shown and "\r" not in shown
     assert list(progress(items, None, unit="mesh")) == read and capsys.readouterr().err == ""
 
 
