@@ -9,9 +9,10 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from types import SimpleNamespace
-from typing import Any, ParamSpec, TextIO
+from typing import TYPE_CHECKING, Any, ParamSpec, TextIO
 
-from tqdm import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 P = ParamSpec("P")
 
@@ -90,13 +91,15 @@ def is_watched() -> bool:
 
 def progress(
     items: Iterable[Any] | None, title: str | None, *, unit: str, total: int | None = None
-) -> tqdm:
+) -> "tqdm":
     """Show on stderr how much of a loop over `items` is done: a bar on a terminal, elsewhere a
     line every 30 seconds. Without a title nothing is shown.
 
     items: None if the caller counts, by `update()` of the result. total: their number, if they
     have no length.
     """
+    from tqdm import tqdm  # here, as `learn3d --help` and errors work without it
+
     options: dict[str, Any] = {"dynamic_ncols": True}
     if not is_watched():
         wait = dict.fromkeys(("delay", "mininterval", "maxinterval"), SECONDS_BETWEEN_LINES)

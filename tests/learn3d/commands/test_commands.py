@@ -6,9 +6,11 @@ import json
 import re
 import runpy
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from children import environment
 from PIL import Image, ImageDraw
 
 from learn3d import commands
@@ -234,6 +236,24 @@ def test_errors_while_libraries_are_imported_are_one_line(
     monkeypatch.setattr(commands.importlib, "import_module", fail)
     found, out, text = command("report")
     assert (found, out, text.count("\n")) == (status, "", 1) and re.search(said, text)
+
+
+def test_without_any_extra_help_is_there_and_a_command_names_the_extra() -> None:
+    """Only what `pip install .` brings: the standard library, torch, numpy and earcut."""
+    script = """
+import sys
+for name in "tqdm tyro trimesh skimage imageio PIL scipy pydantic safetensors tensorboard filelock jinja2".split():
+    sys.modules[name] = None
+from learn3d.commands import main
+assert main("--help") == 0
+sys.exit(main("train"))
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env=environment(), capture_output=True, text=True
+    )
+    assert ended.returncode == 1 and ended.stdout.startswith("usage: learn3d COMMAND")
+    wanted = r"error: learn3d train needs the package \w+, .*pip install '.\[train\]'.*\n"
+    assert re.fullmatch(wanted, ended.stderr), ended.stderr
 
 
 @pytest.mark.parametrize(("best_step", "shown"), [(0, False), (500, True)])
