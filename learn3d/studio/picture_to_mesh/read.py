@@ -40,11 +40,6 @@ def read_picture(
     object.
     """
     colors, mask = read_photo(path, mask_path, optional=True)
-    if max(colors.shape[:2]) < MASK_SIZE:
-        size = f"{colors.shape[1]}x{colors.shape[0]} pixels"
-        note(
-            f"note: {path} has {size}, fewer than the {MASK_SIZE} of training; expect a rough shape"
-        )
     searched = mask is None or box is not None  # a box counts even if the file has transparency
     doubt = None
     if searched:
@@ -63,6 +58,12 @@ def read_picture(
         note(f"note: {path}: {left_out}")
     if np.count_nonzero(kept > 127) < options.kept * np.count_nonzero(mask > 127):
         doubt = doubt or "large parts beside it were left out"
+    left, top, right, bottom = mask_box(kept)
+    if max(right - left, bottom - top) < MASK_SIZE // 2:
+        size = f"{right - left}x{bottom - top} pixels"
+        note(
+            f"note: {path}: the object has only {size}; expect a rough shape, or give a closer picture"
+        )
     return Photo(colors, kept, doubt)
 
 
