@@ -193,6 +193,24 @@ def configure(preset: str = DEFAULT_PRESET, **options: Any) -> TrainConfig:
     return replace(base, settings=settings, **options)
 
 
+#: Options of older runs of VPL that are gone, with their only value that is still possible.
+_GONE = {
+    "image_size": 64,
+    "vertex_scale": 0.01,
+    "object_scale": 0.5,
+    "discriminator": "dcgan",
+    "class_conditional": False,
+    "adversary": "alternating",
+    "other_views": "random",
+    "silhouette_size": 64,
+    "anti_aliasing": True,
+    "renderer_gradient": "nmr",
+    "silhouette_loss": "iou",
+    "adam_beta1": 0.9,
+    "lambda_inflation": 0.0,
+}
+
+
 def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
     """Build a TrainConfig from plain values.
 
@@ -201,6 +219,13 @@ def config_from_dict(values: Any, source: str = "config") -> TrainConfig:
     try:
         if not isinstance(values, dict):
             raise ValueError(f"must hold options by name ({{...}}), got {type(values).__name__}")
+        if isinstance(settings := values.get("settings"), dict):
+            kept = {
+                name: value
+                for name, value in settings.items()
+                if name not in _GONE or value != _GONE[name]
+            }
+            values = values | {"settings": kept}
         return configure(**values)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
