@@ -96,24 +96,24 @@ def evaluate(
     Chamfer-L1 and F-score between 2,000 points on each surface. If the data set has no points, both
     surfaces are those of kato18's voxels: the true voxels reach about half a cell, 1/64, beyond the
     true surface, so a mesh would have to be too thick to meet them.
-    title: of the progress on the terminal (`progress`), None to show none.
+    title: of the lines of progress (`terminal.progress`); None to show none.
     """
     samples = spread_samples(
         dataset.object_ids, dataset.view_ids, len(dataset) if max_images is None else max_images
     )
-    truth = _Truth.of(dataset, detailed)
+    comparison = _Comparison.of(dataset, detailed)
     codes, values, turned = [], [], []
     with method.in_use():
         for chosen in progress(samples.split(batch_size), title, unit="batch"):
             batch = dataset.batch(chosen)
             code = method.encode(batch.images)
             shapes = method.decode(code)
-            measured = truth.compare(shapes, batch, chosen)
+            measured = comparison.compare(shapes, batch, chosen)
             unknown = torch.full((len(chosen),), math.nan)
             values.append(
                 torch.stack([measured.get(name, unknown).double() for name in MEASURED], dim=1)
             )
-            turned.append(truth.compare_by_angle(shapes, chosen))
+            turned.append(comparison.compare_by_angle(shapes, chosen))
             codes.append(code.float().cpu())
     figures = dict(zip(MEASURED, torch.cat(values).T, strict=True))
     means = {name: float(v.nanmean()) for name, v in figures.items() if not v.isnan().all()}
@@ -141,19 +141,19 @@ def _code_means(
 
 
 @dataclass(frozen=True, eq=False)
-class _Truth:
-    """What the shapes of a split are compared with."""
+class _Comparison:
+    """Compares the shapes of a split with all that is known of its objects."""
 
     dataset: ViewDataset
     detailed: bool
-    # int64 [N]: for each sample the one whose mask its silhouette is compared with, if it is
+    # int64 [N]: the sample with whose mask each silhouette is compared; None: with none
     others: Tensor | None
     at_angles: Tensor | None  # int64 [angles, N] of `images_by_angle`, if known and asked for
     surfaces: list[Tensor]  # points [P, 3] of each object; [] if unknown or not asked for
     generator: torch.Generator  # of points on surfaces
 
     @classmethod
-    def of(cls, dataset: ViewDataset, detailed: bool) -> "_Truth":
+    def of(cls, dataset: ViewDataset, detailed: bool) -> "_Comparison":
         others = _other_images(dataset.object_ids)
         novel_views = bool((others != torch.arange(len(others))).any())
         compared = dataset.poses is not None and (novel_views or dataset.voxels is None)
@@ -205,7 +205,7 @@ class _Truth:
     def _compare_voxels(
         self, shapes: Meshes | Grids, filled: Tensor, batch: Batch
     ) -> dict[str, Tensor]:
-        """Measures of shapes and their kato18 voxels."""
+        """The measures of voxels. filled: kato18's voxels of the shapes."""
         precision, recall = nmr.metrics.voxel_precision_recall(filled, batch.voxels)
         hollow = torch.zeros(len(batch))
         if isinstance(shapes, Meshes):

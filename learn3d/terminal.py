@@ -1,4 +1,4 @@
-"""The terminal: errors and lines of a command, and signals that stop it."""
+"""The terminal: errors, lines and progress of a command, and signals that stop it."""
 
 import contextlib
 import difflib
@@ -105,7 +105,8 @@ def progress(
         wait = dict.fromkeys(("delay", "mininterval", "maxinterval"), SECONDS_BETWEEN_LINES)
         form = "{desc}: {n_fmt} of {total_fmt}, {remaining} left"
         options = wait | {"file": _Lines(), "bar_format": form, "miniters": 1, "leave": False}
-    return tqdm(items, title, total, unit=unit, disable=title is None, **options)
+        options["position"] = 0  # else a second bar moves the cursor
+    return tqdm(items, title and plain(title), total, unit=unit, disable=title is None, **options)
 
 
 class _Lines:
@@ -119,7 +120,9 @@ class _Lines:
         pass
 
 
-def _print(text: str, stream: TextIO) -> None:
+def _print(text: str, stream: TextIO | None) -> None:
+    if stream is None:  # closed before the program began; print would take stdout
+        return
     try:
         print(plain(text), file=stream, flush=True)
     except OSError:

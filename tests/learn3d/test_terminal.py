@@ -133,6 +133,16 @@ def test_progress_is_a_line_now_and_then_where_no_terminal_is(capsys, monkeypatc
     ]
     assert "2 of 4, 00:00 left\n" in shown and "\r" not in shown
     assert list(progress(items, None, unit="mesh")) == read and capsys.readouterr().err == ""
+    monkeypatch.setattr(terminal, "is_watched", lambda: True)
+    assert list(progress(items, "a\x1bb", unit="mesh")) == read
+    assert capsys.readouterr().err.startswith("\ra\\x1bb: ")
+
+
+def test_a_closed_stderr_puts_nothing_among_the_results(capsys, monkeypatch) -> None:
+    monkeypatch.setattr("sys.stderr", None)
+    terminal.note("a line of progress")
+    monkeypatch.undo()
+    assert capsys.readouterr() == ("", "")
 
 
 def test_columns_are_as_wide_as_their_widest_cell() -> None:

@@ -43,7 +43,7 @@ def read_objects(
     """Read objects. Those with faults are left out, if `on_fault` does not raise them.
 
     build: the poses and the shape of an object, from its files and the content of the first two; it
-    may raise DamagedFile. title: of the progress bar. Raises DamagedFile if no object is left.
+    may raise DamagedFile. title: of the progress. Raises DamagedFile if no object is left.
     """
     count = len(files(names[0]).views)
     images = np.empty((len(names) * count, 4, image_size, image_size), np.uint8)

@@ -25,7 +25,7 @@ from learn3d.studio.shapes import make_shape
 SIDE = 512  # largest side of a picture in pixels; the networks see 64 to 224
 EXAMPLES = {"airplane": 1, "car": 2, "chair": 6, "lamp": 0, "sofa": 3, "table": 7}  # category: seed
 GUESSES = 3  # different shapes of one picture among which a visitor can choose
-_LEAST = 0.02  # the part of a mask that strokes must leave: less are specks between them
+_LEAST = 0.02  # smallest share of a mask that strokes may leave; less is only specks between them
 _MARGIN = 24  # pixels around the object of an example
 
 Send = Callable[[dict[str, Any]], None]

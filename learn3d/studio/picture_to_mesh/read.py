@@ -17,6 +17,7 @@ from learn3d.studio.picture_to_mesh.cutting import Box, check_box, find_outline
 from learn3d.studio.picture_to_mesh.options import DEFAULTS, CutOptions
 from learn3d.terminal import note
 
+_FEW_PIXELS = MASK_SIZE // 2  # a side of an object; in the images of training it has about 45
 _MIN_OBJECT_SIZE = 0.05  # smallest possible object size
 
 
@@ -59,11 +60,10 @@ def read_picture(
     if np.count_nonzero(kept > 127) < options.kept * np.count_nonzero(mask > 127):
         doubt = doubt or "large parts beside it were left out"
     left, top, right, bottom = mask_box(kept)
-    if max(right - left, bottom - top) < MASK_SIZE // 2:
-        size = f"{right - left}x{bottom - top} pixels"
-        note(
-            f"note: {path}: the object has only {size}; expect a rough shape, or give a closer picture"
-        )
+    if max(right - left, bottom - top) < _FEW_PIXELS:
+        size = f"{right - left}x{bottom - top} of the {kept.shape[1]}x{kept.shape[0]} pixels"
+        advice = "expect a rough shape, or crop the picture to the object"
+        note(f"note: {path}: the object has only {size} that are used; {advice}")
     return Photo(colors, kept, doubt)
 
 

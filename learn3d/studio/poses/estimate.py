@@ -32,8 +32,8 @@ from learn3d.methods.pose_updates import TEMPERATURE
 from learn3d.networks.encoders import CODE_SIZE
 from learn3d.studio.poses.neighbours import Masks, Neighbours, normalize
 from learn3d.studio.poses.options import PoseOptions
-from learn3d.studio.poses.prototypes import CandidatePoses, Shapes, pose_posteriors, turned
-from learn3d.studio.poses.turns import TURNS, common_turns, solve_turns
+from learn3d.studio.poses.prototypes import CandidatePoses, Shapes, compute_posteriors
+from learn3d.studio.poses.turns import TURNS, find_turns, solve_turns, turn_azimuths
 from learn3d.terminal import progress
 
 MAX_FITTED = 6000  # images that shapes are fitted to and that can be neighbours
@@ -143,16 +143,18 @@ def _estimate_once(
     for stage in range(STAGES):
         shapes.fit(start=0.03 if stage else 0.05, smoothness_weight=3e-4, log_prior=log_prior)
         values = shapes.all_distances(shapes.data)
-        turns, front_votes = common_turns(values, shapes.data, shapes.rng)
+        turns, front_votes = find_turns(values, shapes.data, shapes.rng)
         shapes.turns = (shapes.turns + turns) % TURNS
-        own = pose_posteriors(-turned(values, turns) / TEMPERATURE, options.prior)
+        own = compute_posteriors(-turn_azimuths(values, turns) / TEMPERATURE, options.prior)
         smoothed = of_fitted.smooth(own.sum(1), options.prior)
         log_prior = (smoothed + 1e-3).log()
     chunks = (
         shapes.all_distances(data.select(rows))
         for rows in torch.arange(len(data.masks)).split(2048)
     )
-    alone = torch.cat([pose_posteriors(-values / TEMPERATURE, "free").sum(1) for values in chunks])
+    alone = torch.cat(
+        [compute_posteriors(-values / TEMPERATURE, "free").sum(1) for values in chunks]
+    )
     posterior = normalize(alone**0.3 * (of_all.message(smoothed) + 1e-3))
     agreement = of_all.message(own.sum(1)).sum(2)
     return posterior, agreement, shapes, own.sum((2, 3)).mean(0), front_votes

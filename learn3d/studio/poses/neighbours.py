@@ -9,7 +9,7 @@ from torch import Tensor
 
 from learn3d.methods.pose_updates import SIZE
 
-NEIGHBOURS = 8  # nearest masks for smoothing
+_NEIGHBOURS = 8  # nearest masks for smoothing
 _NEIGHBOUR_SCALE = 0.1  # distance at which the weight of a neighbour has fallen to 1 / e
 _FAR = 9.0  # distance of masks that must not be neighbours
 
@@ -40,7 +40,7 @@ class Neighbours(NamedTuple):
 
     @classmethod
     def of(
-        cls, data: Masks, known: Masks, kinds: Tensor | None = None, count: int = NEIGHBOURS
+        cls, data: Masks, known: Masks, kinds: Tensor | None = None, count: int = _NEIGHBOURS
     ) -> Neighbours:
         """Neighbours of `data` among `known`: other objects, and other `kinds` (int64 [N])."""
         found = []
@@ -78,4 +78,5 @@ class Neighbours(NamedTuple):
 
 
 def normalize(posterior: Tensor) -> Tensor:
+    """Posteriors [N, A, E] with the sum 1 for each mask."""
     return posterior / posterior.sum((1, 2), keepdim=True)

@@ -16,7 +16,7 @@ from learn3d.networks.encoders import CODE_SIZE
 from learn3d.networks.generators import GENERATORS
 from learn3d.studio.poses.neighbours import Masks, distances
 from learn3d.studio.poses.options import PoseOptions
-from learn3d.studio.poses.turns import TURNS
+from learn3d.studio.poses.turns import TURNS, turn_azimuths
 
 _BATCH = 256
 
@@ -83,7 +83,7 @@ class Shapes:
         values = distances(masks, rendered.flatten(3).flatten(0, 2)).reshape(
             len(masks), *rendered.shape[:3]
         )
-        return turned(values, self.turns)
+        return turn_azimuths(values, self.turns)
 
     @torch.no_grad()
     def all_distances(self, data: Masks) -> Tensor:
@@ -122,7 +122,7 @@ class Shapes:
             )
             if log_prior is not None:
                 logits = logits + log_prior[batch][:, None, :, elevations]
-            loss = (pose_posteriors(logits, self.options.prior) * values).sum((1, 2, 3)).mean()
+            loss = (compute_posteriors(logits, self.options.prior) * values).sum((1, 2, 3)).mean()
             total = loss + smoothness_weight * nmr.losses.smoothness_loss(
                 vertices, self.network.edges
             )
@@ -135,7 +135,7 @@ class Shapes:
     def loss(self) -> float:
         """The mean silhouette loss over all masks."""
         values = self.all_distances(self.data)
-        posterior = pose_posteriors(-values / TEMPERATURE, self.options.prior)
+        posterior = compute_posteriors(-values / TEMPERATURE, self.options.prior)
         return float((posterior * values.nan_to_num(posinf=0.0)).sum((1, 2, 3)).mean())
 
     @torch.no_grad()
@@ -148,14 +148,7 @@ class Shapes:
         return torch.stack([cos * x - sin * z, y, sin * x + cos * z], 2)
 
 
-def turned(values: Tensor, turns: Tensor) -> Tensor:
-    """Values [B, M, A, E] when shape m is turned by `turns[m]` quarter turns, int64 [M]."""
-    azimuths = values.shape[2]
-    before = (torch.arange(azimuths) - turns[:, None] * (azimuths // TURNS)) % azimuths
-    return values.gather(2, before[None, :, :, None].expand_as(values))
-
-
-def pose_posteriors(logits: Tensor, prior: str) -> Tensor:
+def compute_posteriors(logits: Tensor, prior: str) -> Tensor:
     """Posterior [B, M, A, E] over shapes and poses.
 
     With the prior "uniform", all azimuths get about the same mass.

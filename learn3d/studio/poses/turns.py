@@ -18,7 +18,14 @@ _PEAK_WIDTH = 5  # peaks of upper outlines are narrower, in pixels
 _PEAK_WEIGHT = 0.002  # weight of their votes; that of nearly equal masks is 1
 
 
-def common_turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, float]:
+def turn_azimuths(values: Tensor, turns: Tensor) -> Tensor:
+    """Values [B, M, A, E] when shape m is turned by `turns[m]` quarter turns, int64 [M]."""
+    azimuths = values.shape[2]
+    before = (torch.arange(azimuths) - turns[:, None] * (azimuths // TURNS)) % azimuths
+    return values.gather(2, before[None, :, :, None].expand_as(values))
+
+
+def find_turns(values: Tensor, data: Masks, rng: torch.Generator) -> tuple[Tensor, float]:
     """The quarter turns of the prototypes that give similar masks nearly equal azimuths, int64 [M].
 
     Also `Estimate.front_votes`.

@@ -208,6 +208,7 @@ async function* answer(address, body, signal) {
 /** Say why there is no new mesh, or no further guess. */
 function fail(mine, reason) {
   if (mine.shown) return mine.note = `There is no further guess: ${reason}`;
+  if (!shown && requests.length > 1) stage.mask = requests.pop().before; // else `restore` takes the correction back
   restore();
   say(`${reason}${shown ? BACK : ""}`, true);
 }

@@ -116,7 +116,10 @@ def test_a_large_upright_rectangle_may_be_a_frame(tmp_path) -> None:
 
 
 def test_a_small_object_is_said_however_large_the_picture(tmp_path, capsys) -> None:
-    for size, said in ((31, "the object has only 31x20 pixels; expect a rough shape"), (32, "")):
+    for size, said in (
+        (31, "the object has only 31x20 of the 400x300 pixels that are used; "),
+        (32, ""),
+    ):
         pixels = np.zeros((300, 400, 4), np.uint8)
         pixels[100:120, 50 : 50 + size, 3] = 255
         Image.fromarray(pixels).save(tmp_path / "small.png")

@@ -21,7 +21,7 @@ from learn3d.studio.poses.neighbours import Masks
 from learn3d.studio.poses.options import PoseOptions
 from learn3d.studio.poses.prototypes import CandidatePoses
 from learn3d.studio.poses.sheet import COLUMNS, PICTURE_SIZE, draw_pose_sheet
-from learn3d.studio.poses.turns import _peak_votes, common_turns
+from learn3d.studio.poses.turns import _peak_votes, find_turns
 from learn3d.studio.poses.views import (
     CameraOptions,
     EstimatedViews,
@@ -119,7 +119,7 @@ def test_prototypes_are_turned_into_one_frame(turns: int) -> None:
     for wrong in (0, flipped):
         values = torch.ones(144, 2, 24, 1)
         values[torch.arange(144), prototype, (azimuth + wrong - 6 * turns * prototype) % 24] = 0.0
-        found, front_votes = common_turns(values, data, torch.Generator().manual_seed(0))
+        found, front_votes = find_turns(values, data, torch.Generator().manual_seed(0))
         assert found[0] % 2 == 0 and (found[1] - found[0]) % 4 == turns
         assert (front_votes > 0.9) == (wrong is not flipped)
     assert front_votes < 0.8
