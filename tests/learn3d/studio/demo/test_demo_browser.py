@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import json
 import signal
@@ -334,6 +335,20 @@ def test_what_is_no_picture_gets_a_sentence_and_a_drop_replaces_it(
     grey = boxes(tmp_path / "grey.png")
     answered(tab, lambda: tab.locator("#file").set_input_files(grey), "No object was found")
     assert tab.locator("[aria-pressed=true]", has_text="Box").count() == 1, "it can be dragged"
+    sent: list[np.ndarray] = []
+
+    def refuse(route: Any) -> None:
+        body = np.frombuffer(route.request.post_data_buffer, np.uint8)
+        sent.append(body[: len(body) // 5 * 4].reshape(-1, 4)[:, 3])  # the mask before the stroke
+        route.fulfill(body=fails)
+
+    tab.route("**/mesh?*", refuse)
+    press(tab, "Add")()
+    for y in (0.3, 0.6):
+        stroke = functools.partial(drag, tab, tab.locator("#picture"), (0.3, y), (0.6, y))
+        answered(tab, stroke, "It is no object.")
+    assert len(sent) == 2 and not np.any(sent), "a refused stroke does not count"
+    tab.unroute("**/mesh?*")
     both = boxes(tmp_path / "two.png", (slice(80, 220), BLUE), (slice(240, 290), (0, 0, 0)))
     answered(tab, lambda: tab.locator("#file").set_input_files(both))
     assert tab.get_by_text("away from the object").is_visible()
