@@ -53,6 +53,7 @@ _LONG = " ".join(map(_RUN.format, ("vanilla", "proposed")))
 _CARS = _LONG.replace("airplane", "car")
 _CHAIRS = _LONG.replace("airplane", "chair")
 _CURVES = ("kato-generated=generated", "kato-generated-chairs=generated")
+_CURVES += ("kato-generated-chairs-longer=generated",)
 _CURVES += ("kato-cars=generated", "ablation-cars=generated", "baselines-generated-cars=generated")
 _CURVES += ("kato-5000", "ablation-5000-bf16", "baselines-debian")
 _FUNCTIONS = (

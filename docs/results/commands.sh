@@ -33,7 +33,8 @@ learn3d experiment kato --data GENERATED --output GENERATED_OUTPUT --category ai
 # Generated airplanes, table 4 (stopped early: ablation-generated.json has the validations out of metrics.jsonl)
 learn3d experiment ablation --data GENERATED --output GENERATED_OUTPUT --category airplane --methods Proposed "w/o adversarial" "w/o prior" --iterations 20000 --seeds 1 --set clamp_to_cube=true validate_every=1000 precision=fp32
 
-# Generated chairs
+# Generated chairs; with --iterations 20000 afterwards the same runs go on (kato-generated-chairs-longer.json has the
+# validations out of metrics.jsonl, up to 6,000 steps)
 learn3d make-dataset --layout kato --output CHAIRS --category chair --procedural 2000
 learn3d experiment kato --data CHAIRS --output CHAIRS_OUTPUT --category chair --methods Vanilla-AE Proposed --iterations 3000 --seeds 1 --set clamp_to_cube=true validate_every=500 precision=fp32
 
