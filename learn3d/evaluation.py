@@ -146,7 +146,7 @@ class _Comparison:
 
     dataset: ViewDataset
     detailed: bool
-    # int64 [N]: the sample with whose mask each silhouette is compared; None: with none
+    # int64 [N]: samples whose masks the silhouettes are compared with; None if none is compared
     others: Tensor | None
     at_angles: Tensor | None  # int64 [angles, N] of `images_by_angle`, if known and asked for
     surfaces: list[Tensor]  # points [P, 3] of each object; [] if unknown or not asked for

@@ -105,7 +105,7 @@ def progress(
         wait = dict.fromkeys(("delay", "mininterval", "maxinterval"), SECONDS_BETWEEN_LINES)
         form = "{desc}: {n_fmt} of {total_fmt}, {remaining} left"
         options = wait | {"file": _Lines(), "bar_format": form, "miniters": 1, "leave": False}
-        options["position"] = 0  # else a second bar moves the cursor
+        options |= {"position": 0}  # else a second loop within this one moves the cursor
     return tqdm(items, title and plain(title), total, unit=unit, disable=title is None, **options)
 
 
