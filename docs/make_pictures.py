@@ -174,9 +174,9 @@ PICTURES = {
     ),
     "door-paper.png": Picture(
         "true",
-        "docs/images/results-grid.png",
-        ("docs/images/results-grid.png",),
-        (0, 0, 1, 0.34),
+        "docs/images/results-airplanes.png",
+        ("docs/images/results-airplanes.png",),
+        (0, 0.53, 0.62, 1),
         True,
     ),
     **{
