@@ -111,13 +111,18 @@ class Scene(NamedTuple):
         shown = face_index, weights, depth, self.mesh, self.world, self.camera
         return Fragments(*shown, anti_aliasing, eps, self.drawn, drawn_face_index)
 
-    def soft_fragments(self, layers: int, sigma: Tensor, reach: float) -> Fragments:
-        """The nearest faces whose border is at a squared distance of less than ``sigma * reach``."""
+    def soft_fragments(
+        self, layers: int, sigma: Tensor, reach: float, with_empty: bool = False
+    ) -> Fragments:
+        """The nearest faces whose border is at a squared distance of less than ``sigma * reach``;
+        ``with_empty``: also layers that no pixel has.
+        """
         settings = self.settings
         how = *settings[3:6], settings.perspective
         drawn_index = ops.soft_layers(
             *self.drawn[:3], sigma.detach().double(), *settings.raster, layers, *how, reach
         )
+        drawn_index = drawn_index if with_empty else without_empty_layers(drawn_index)
         of_drawn = ops.soft_fragments(
             *self.drawn[:3], drawn_index, settings.far, settings.perspective
         )
@@ -262,7 +267,7 @@ def shade(
 
     With layers the raster is ``[B, H, W, K, C]``.
     """
-    if not interpolation_gradient:
+    if not check_flag(interpolation_gradient, "interpolation_gradient"):
         fragments = replace(fragments, weights=fragments.weights.detach())
     shape = fragments.sided_face_index.shape
     if lights is not None and not isinstance(lights, Lights):
@@ -308,6 +313,14 @@ def background_rows(background: object, channels: int, batch: int, like: Tensor)
             "alpha with background 0, and add (1 - alpha)[..., None] * picture"
         )
     return behind.expand(channels).unsqueeze(0) if behind.ndim < 2 else behind.expand(-1, channels)
+
+
+def without_empty_layers(face_index: Tensor) -> Tensor:
+    """Layers ``[B, H, W, K]``, nearest first, without those that no pixel has; at least one."""
+    if not can_read():
+        return face_index
+    used = int((face_index >= 0).flatten(0, 2).any(0).sum())
+    return face_index[..., : max(used, 1)].contiguous()
 
 
 def average(image: Tensor, anti_aliasing: bool) -> Tensor:

@@ -306,6 +306,8 @@ def check_number(value: object, name: str) -> float:
     """A Python or NumPy number, or a tensor with one element and without a gradient, as float."""
     if isinstance(value, Tensor) and value.requires_grad:
         raise TypeError(f"{name} has no gradient here; pass {name}.item(), or a number")
+    if isinstance(value, (str, bytes)):
+        raise TypeError(f"{name} must be a number, got {value!r}")
     try:
         return float(value)
     except (TypeError, ValueError, RuntimeError) as error:

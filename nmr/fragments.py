@@ -16,11 +16,12 @@ from ._validate import (
     as_floats,
     cast_under_autocast,
     check_choice,
+    check_flag,
     check_values,
     describe,
 )
 from ._vectors import unit
-from .cameras.projection import ProjectingCamera, has_perspective
+from .cameras.projection import ProjectingCamera, cofactors, has_perspective
 
 if TYPE_CHECKING:
     from .cameras import Camera
@@ -224,9 +225,11 @@ class Fragments:
 
         With ``space="camera"`` the axes are those of renderer space: x to the right of the image,
         y up, z away from the viewer (so z is negative if a face looks at the viewer). It needs
-        one of nmr's cameras, or none, and is differentiable in its rotation, too.
+        one of nmr's cameras, or none, and is differentiable in its rotation, too. A camera that
+        sees nothing gives 0.
         """
         check_choice(space, "space", ("world", "camera"))
+        smooth = check_flag(smooth, "smooth")
         if self.layers:
             return self._each_layer(self._wide().normals(smooth, space))
         normals = self._lit(None, None, torch.zeros(0, 3, dtype=torch.int64, device="cpu"), smooth)
@@ -238,10 +241,8 @@ class Fragments:
                 "rotate those in world space"
             )
         matrix, intrinsics, *_ = self.camera.projection(normals.dtype).parameters()
-        turn = (
-            _image_axes(intrinsics.to(normals)) @ torch.linalg.inv(matrix[:, :, :3].to(normals)).mT
-        )[:, None]
-        return unit(normals @ turn.mT)
+        turned = _turn(normals, _along_normals(matrix[:, :, :3].to(normals))[:, None, None])
+        return unit(_turn(turned, _image_axes(intrinsics.to(normals))[:, None, None]))
 
     def _lit(
         self,
@@ -349,13 +350,28 @@ class Fragments:
         )
 
 
+def _turn(vectors: Tensor, matrices: Tensor) -> Tensor:
+    """Matrices times vectors ``[..., 3]``, also under autocast in the precision of the vectors."""
+    return (matrices * vectors.unsqueeze(-2)).sum(-1)
+
+
+def _along_normals(matrices: Tensor) -> Tensor:
+    """What turns normals of points that ``matrices [B, 3, 3]`` move, up to their length; 0 if it
+    is not known.
+    """
+    matrices = torch.where(matrices.isfinite(), matrices, 0.0)
+    turns = cofactors(matrices)
+    return turns * (turns[:, 2] * matrices[:, 2]).sum(-1).sign()[:, None, None]
+
+
 def _image_axes(intrinsics: Tensor) -> Tensor:
     """Right and up in the image and the direction of view ``[B, 3, 3]``, in camera axes; a skew
     turns nothing.
     """
     up = unit(intrinsics[:, 1, :2])
     right = torch.stack([up[:, 1], -up[:, 0]], dim=1)
-    right = right * torch.where((right * intrinsics[:, 0, :2]).sum(1, keepdim=True) < 0, -1.0, 1.0)
+    mirrored = (right * intrinsics[:, 0, :2]).sum(1, keepdim=True) < 0
+    right = torch.where(mirrored, -right, right)
     flat = torch.nn.functional.pad(torch.stack([right, up], dim=1), (0, 1))
     return torch.cat([flat, flat.new_tensor([[[0.0, 0.0, 1.0]]]).expand(len(flat), 1, 3)], dim=1)
 

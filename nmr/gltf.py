@@ -86,8 +86,10 @@ def read_gltf(
             if "skin" in node:
                 skin = tree["skins"][_index(node["skin"])]
                 points = _skinned(points, primitive["attributes"], skin, accessors, places)
+                mirrored = False
             else:
                 points = points @ place[:3, :3].T + place[:3, 3]
+                mirrored = np.linalg.det(place[:3, :3]) < 0
             indices = np.arange(len(points))
             if "indices" in primitive:
                 indices = accessors.read(primitive["indices"])[:, 0].astype(np.int64)
@@ -97,7 +99,9 @@ def read_gltf(
                 )
             # primitives may share one large array
             used, indices = np.unique(indices, return_inverse=True)
-            faces.append(_triangles(indices, primitive.get("mode", 4)) + total)
+            triangles = _triangles(indices, primitive.get("mode", 4)) + total
+            # so that their normals point to the same side as before
+            faces.append(triangles[:, ::-1] if mirrored else triangles)
             vertices.append(points[used])
             total += len(used)
             number = primitive.get("material", -1) if with_materials else -1

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from itertools import accumulate
 
 import torch
 from torch import Tensor
 
-from ._scene import Meshes, average, make_scene, shade
+from ._scene import Meshes, average, make_scene, shade, without_empty_layers
 from ._validate import as_floats, as_positive, check_number, check_size, describe, holds_for_all
 from .cameras import Camera
 from .fragments import Fragments
@@ -96,7 +97,8 @@ def render_soft(
 
     The true derivative in vertices, colours, lights, background, sigma and gamma, up to the jumps
     where faces come within reach or leave the K nearest. The memory is that of B h w K faces, about
-    100 bytes each with gradients in float32. There is no second derivative.
+    100 bytes each with gradients in float32; layers that no pixel needs take none. There is no
+    second derivative.
 
     Raises
     ------
@@ -118,6 +120,8 @@ def render_soft(
     sigma, gamma = as_positive(sigma, "sigma", dtype), as_positive(gamma, "gamma", dtype)
     reach = math.log(1 / check_dist_eps(dist_eps) - 1)
     least = check_number(background_eps, "background_eps")
+    if not 0 <= least < math.inf:
+        raise ValueError(f"background_eps must be finite and 0 or more, got {background_eps}")
     fragments = scene.soft_fragments(layers, sigma, reach)
     image, behind = shade(fragments, colors, lights, background, True)
     rgb, alpha = _blend(fragments, image, behind, sigma, gamma, least, float(near), float(far))
@@ -146,8 +150,9 @@ def _blend(
     share = covers * torch.exp((closeness - nearest) / gamma)
     behind = torch.exp((least - nearest) / gamma)
     colors = torch.where(fragments.covered.unsqueeze(-1), colors, zero)
-    rgb = (share.unsqueeze(-1) * colors).sum(-2) + behind * background[:, None, None]
-    return rgb / (share.sum(-1, keepdim=True) + behind), 1 - _running_products(1 - covers)[..., -1]
+    rgb = _sum(share.unsqueeze(-1) * colors, -2) + behind * background[:, None, None]
+    weight = _sum(share, -1).unsqueeze(-1) + behind
+    return rgb / weight, 1 - _running_products(1 - covers)[..., -1]
 
 
 def render_transparent(
@@ -234,21 +239,24 @@ def render_transparent(
     scene = make_scene(
         vertices, faces, camera, image_size, anti_aliasing, fill_back, near, far, clip, eps
     )
-    fragments = scene.fragments(
-        scene.rasterize_layers(check_size(faces_per_pixel, "faces_per_pixel", 1024))
-    )
+    layers = scene.rasterize_layers(check_size(faces_per_pixel, "faces_per_pixel", 1024))
+    fragments = scene.fragments(without_empty_layers(layers))
     image, behind = shade(fragments, colors, lights, background, interpolation_gradient)
     opacity = torch.where(fragments.covered, _opacity_at(fragments, opacity), image.new_zeros(()))
     transmittance = _running_products(1 - opacity)
     before = torch.cat([torch.ones_like(transmittance[..., :1]), transmittance[..., :-1]], dim=-1)
     image = torch.where(fragments.covered.unsqueeze(-1), image, image.new_zeros(()))
-    rgb = ((before * opacity).unsqueeze(-1) * image).sum(-2) + transmittance[..., -1:] * behind[
-        :, None, None
-    ]
+    rgb = _sum((before * opacity).unsqueeze(-1) * image, -2)
+    rgb = rgb + transmittance[..., -1:] * behind[:, None, None]
     both = fragments.layer(0)._resolve(
         torch.cat([rgb, 1 - transmittance[..., -1:]], dim=-1), None, "nmr"
     )
     return Images({"rgb": both[..., :-1], "alpha": both[..., -1]})
+
+
+def _sum(terms: Tensor, axis: int) -> Tensor:
+    """As torch.sum, one after the other: further layers that are empty change no bit."""
+    return reduce(torch.add, terms.unbind(axis))
 
 
 def _running_products(factors: Tensor) -> Tensor:
@@ -267,12 +275,19 @@ def _opacity_at(fragments: Fragments, opacity: float | Tensor | Colors) -> Tenso
             raise ValueError(
                 f"opacity must have one channel and give {[*shape, 1]}, got {describe(values)}"
             )
-        return values.squeeze(-1).to(fragments.weights)
+        values = values.squeeze(-1).to(fragments.weights)
+        seen = torch.where(fragments.covered, values, values.new_zeros(()))
+        _check_opacity(seen, "colours")
+        return values
     values = as_floats(opacity, "opacity", "a number, [] or [B], or colours of one channel").to(
         fragments.weights
     )
     if values.ndim > 1 or values.numel() not in (1, shape[0]):
         raise ValueError(f"opacity must be a number, [] or [{shape[0]}], got {describe(values)}")
-    if not holds_for_all((values >= 0) & (values <= 1)):
-        raise ValueError(f"opacity must lie in [0, 1], got {opacity}")
+    _check_opacity(values, opacity)
     return values.view(-1, 1, 1, 1)
+
+
+def _check_opacity(values: Tensor, given: object) -> None:
+    if not holds_for_all((values >= 0) & (values <= 1)):
+        raise ValueError(f"opacity must lie in [0, 1], got {given}")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ._packing import is_list
-from ._validate import as_floats, check_values, describe, holds_for_all
+from ._validate import as_floats, check_flag, check_values, describe, holds_for_all
 
 if TYPE_CHECKING:
     from .fragments import Fragments
@@ -145,6 +145,7 @@ class Lights:
         if isinstance(self.specular, (int, float)) and self.specular == 0:
             unused = (*unused, "specular", "shininess")
         object.__setattr__(self, "_unused", unused)
+        object.__setattr__(self, "smooth", check_flag(self.smooth, "smooth"))
         for name, (shape, dimensions, _) in _SHAPES.items():
             if name in unused:
                 continue
@@ -165,6 +166,8 @@ class Lights:
             value = as_floats(self.harmonics, "harmonics", wanted)
             if value.ndim not in (2, 3) or value.shape[-2:] != (9, 3):
                 raise ValueError(f"harmonics must have shape {wanted}, got {describe(value)}")
+            if not holds_for_all(value.isfinite()):
+                raise ValueError(f"harmonics must be finite, got {value}")
             object.__setattr__(self, "harmonics", value)
         if self.normals is not None and not callable(getattr(self.normals, "sample", None)):
             value = check_values(self.normals, "normals", "V, 3")
@@ -209,17 +212,17 @@ class Lights:
         positions = highlights or "position" not in self._unused
         colors = None if colors is None else colors.to(fragments.weights)
         parameters, layout = torch.cat(values), torch.tensor(layout, device="cpu")
-        smooth = bool(self.smooth)
-        lit = fragments._lit(colors, parameters, layout, smooth, positions, highlights, own)
+        lit = fragments._lit(colors, parameters, layout, self.smooth, positions, highlights, own)
         if self.harmonics is None:
             return lit
-        x, y, z = fragments._lit(None, None, layout[:0], smooth, own=own).unbind(-1)
+        x, y, z = fragments._lit(None, None, layout[:0], self.smooth, own=own).unbind(-1)
         basis = torch.stack(
             [torch.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], dim=-1
         )
         harmonics = self.harmonics.to(x).reshape(-1, 9, 3)
         _check_images(harmonics, "harmonics", batch)
-        light = (basis * basis.new_tensor(_HARMONICS)) @ harmonics.unsqueeze(1)
+        with torch.autocast(x.device.type, enabled=False):
+            light = (basis * basis.new_tensor(_HARMONICS)) @ harmonics.unsqueeze(1)
         light = torch.where(fragments.covered.unsqueeze(-1), light, torch.zeros_like(light))
         return lit + (light if colors is None else colors * light)
 

@@ -236,7 +236,8 @@ def normal_consistency_loss(vertices: Tensor, edges: Tensor) -> Tensor:
     check_indices(edges, vertices.shape[1], "edges")
     rows = _batch_last(vertices)
     origin, end, left, right = (rows.index_select(0, column) for column in edges.unbind(1))
-    normal, other = _cross(end - origin, left - origin), _cross(right - origin, end - origin)
+    normal = _of_size_one(_cross(end - origin, left - origin))
+    other = _of_size_one(_cross(right - origin, end - origin))
     lengths = _length(normal) * _length(other)
     flat = lengths == 0
     cos = (normal * other).sum(1) / torch.where(flat, 1.0, lengths)
@@ -350,6 +351,14 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     """Cross products of vectors [N, 3, B]."""
     (a0, a1, a2), (b0, b1, b2) = a.unbind(1), b.unbind(1)
     return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], dim=1)
+
+
+def _of_size_one(vectors: Tensor) -> Tensor:
+    """Vectors [N, 3, B] with a largest coordinate of 1, so that their squares neither under- nor
+    overflow; those of length 0 stay. The factor is a constant for the gradient.
+    """
+    size = vectors.detach().abs().amax(1, keepdim=True)
+    return vectors / torch.where(size < torch.finfo(size.dtype).tiny, 1.0, size)
 
 
 def _length(vectors: Tensor) -> Tensor:

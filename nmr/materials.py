@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from ._clip import can_read
 from ._images import read_image
 from ._packing import as_tuple, is_list
 from ._validate import check_indices, check_values, describe
@@ -146,13 +147,21 @@ class Materials:
         """Colours ``[B, H, W, C]`` of fragments, 0 on background."""
         # the image of each face, -1 if it has none; then the colour, 0 if it has an image
         chosen, plain = [], []
+        images: list[Tensor] = []  # materials may share one
+        for image in self.images:
+            if image is not None and not any(image is other for other in images):
+                images.append(image)
+        of_material = [
+            next((k for k, other in enumerate(images) if other is image), -1)
+            for image in self.images
+        ]
         for k, faces in enumerate(as_tuple(self.face_material)):
             faces = faces.to(self.colors.device, torch.int64)
-            has_image = [image is not None for image in self.images]
-            shown = faces.new_tensor([*has_image, False], dtype=torch.bool)[faces]
+            image_of_face = faces.new_tensor([*of_material, -1])[faces]
+            shown = image_of_face >= 0
             if self.uv_faces is not None:
                 shown = shown & (as_tuple(self.uv_faces)[k] >= 0).all(1).to(shown.device)
-            chosen.append(torch.where(shown, faces, -1).to(self.colors).unsqueeze(-1))
+            chosen.append(torch.where(shown, image_of_face, -1).to(self.colors).unsqueeze(-1))
             none = self.colors.new_full((1, self.colors.shape[1]), self.without_material)
             colors = torch.cat([self.colors, none])[faces]
             plain.append(torch.where(shown.unsqueeze(-1), 0.0, colors))
@@ -161,12 +170,15 @@ class Materials:
         image = fragments._per_face(as_given(plain), "face_material")
         if self.vertex_colors is not None:
             image = image * fragments._interpolate(self.vertex_colors, None, "vertex_colors", "")
-        for k, texture in enumerate(self.images):
-            if texture is not None:
+        # images that no pixel shows are left out, unless they need a gradient of 0
+        parameters = [*images, *(() if self.uv is None else as_tuple(self.uv))]
+        constant = can_read() and not any(x.requires_grad for x in parameters)
+        drawn = number.unique().tolist() if constant else range(len(images))
+        for k, texture in enumerate(images):
+            if k in drawn:
                 index = torch.where(number == k, fragments.sided_face_index, -1)
-                image = image + self._texture(texture).sample(
-                    replace(fragments, sided_face_index=index)
-                )
+                of_image = replace(fragments, sided_face_index=index)
+                image = image + self._texture(texture).sample(of_image)
         return image
 
     @property

@@ -14,11 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ._images import write_png
-from ._validate import describe
+from ._validate import _FLOATS, _INTEGERS, check_indices, describe
 from .gltf import read_gltf
 from .materials import Materials
 from .obj import find_image, find_libraries, load, match_materials, read_mtl
-from .textures import UVTexture, VertexColors
+from .textures import NormalMap, UVTexture, VertexColors
 
 __all__ = ["load_gltf", "load_obj", "save_obj"]
 
@@ -66,8 +66,9 @@ def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) ->
         rows of ``vertices [V, 3]`` and ``uv [T, 2]`` at the corners of face f; (0, 0) of ``uv`` is
         the lower left corner of an image. ``materials[face_material[f]]`` has name, colour and
         image path of its material, for :meth:`Materials.from_mesh`. ``colors [V, 3]`` are those of
-        the lines ``v x y z r g b``, None if there are none; values above 1 count as 0..255,
-        vertices without are grey (0.5).
+        the lines ``v x y z r g b``, None if there are none; vertices without are grey (0.5). They
+        count as 0..255 if one is above 2, or if all are whole numbers and one is above 1, and are
+        clipped to [0, 1].
 
     Raises
     ------
@@ -108,9 +109,9 @@ def load_obj(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) ->
     ]
     if colors is not None:
         colors = np.where(np.isfinite(colors).all(axis=1, keepdims=True), colors, np.nan)
-        colors = np.nan_to_num(
-            colors / (255 if np.nanmax(colors, initial=0) > 1 else 1), nan=0.5
-        ).clip(0, 1)
+        largest, known = np.nanmax(colors, initial=0), colors[np.isfinite(colors)]
+        in_bytes = largest > 2 or (largest > 1 and (known == known.round()).all())
+        colors = np.nan_to_num(colors / (255 if in_bytes else 1), nan=0.5).clip(0, 1)
         colors = torch.tensor(colors, dtype=dtype)
     # Each array is freed as soon as its tensor exists.
     vertices, uv = torch.tensor(vertices, dtype=dtype), torch.tensor(uv, dtype=dtype)
@@ -158,6 +159,8 @@ def load_gltf(filename: str | os.PathLike, dtype: torch.dtype = torch.float32) -
             raise ValueError(f"it refers to {name!r}, which is outside of its folder")
         return path.read_bytes()
 
+    if filename.exists() and not filename.is_file():
+        raise ValueError(f"{filename} is not a regular file")
     content = filename.read_bytes()
     try:
         gltf = read_gltf(content, read_other, with_materials=True)
@@ -205,7 +208,9 @@ def save_obj(
     Raises
     ------
     TypeError, ValueError
-        For wrong types and shapes, several meshes, another ending; nothing is written.
+        For wrong types and shapes, numbers that are not finite, faces of missing vertices, several
+        meshes, another ending; nothing is written. That a texture is not repeated is not stored: a
+        warning.
     ImportError
         If there are images and Pillow is missing.
 
@@ -219,9 +224,11 @@ def save_obj(
     base, ending = os.path.splitext(os.fspath(filename))
     if ending.lower() != ".obj":
         raise ValueError(f"filename must end in .obj, got {os.fspath(filename)!r}")
-    corners = _rows(faces, "faces", 3).long() + 1
+    corners = _rows(faces, "faces", 3, integers=True) + 1
     points = _rows(vertices, "vertices", 3)
-    if colors is not None and not isinstance(colors, (VertexColors, UVTexture, Materials)):
+    check_indices(corners - 1, len(points))
+    accepted = isinstance(colors, (VertexColors, UVTexture, Materials))
+    if colors is not None and (not accepted or isinstance(colors, NormalMap)):
         raise TypeError(
             f"colors must be nmr.VertexColors, UVTexture or Materials, got {describe(colors)}"
         )
@@ -245,18 +252,26 @@ def _material_lines(base: str, corners: Tensor, colors: UVTexture | Materials) -
     name = os.path.basename(base)
     if isinstance(colors, UVTexture):
         images, shades, rows = [colors.image], None, colors.uv_faces
-        rows = corners - 1 if rows is None else _rows(rows, "uv_faces", 3)
+        rows = corners - 1 if rows is None else _rows(rows, "uv_faces", 3, integers=True)
         numbers = torch.zeros(len(corners), dtype=torch.int64, device="cpu")
     else:
         shades = F.pad(colors.colors.detach().cpu(), (0, 0, 0, 1), value=colors.without_material)
         images, rows = [*colors.images, None], colors.uv_faces
-        numbers = _rows(colors.face_material.unsqueeze(1), "face_material", 1)[:, 0].long()
+        numbers = _rows(colors.face_material.unsqueeze(1), "face_material", 1, integers=True)[:, 0]
         numbers = numbers % len(shades)  # -1 is the last one
-        rows = torch.full_like(corners, -1) if rows is None else _rows(rows, "uv_faces", 3)
+        missing = torch.full_like(corners, -1)
+        rows = missing if rows is None else _rows(rows, "uv_faces", 3, integers=True)
     if len(rows) != len(corners) or len(numbers) != len(corners):
         raise ValueError(f"colors must be those of {len(corners)} faces, got {len(rows)}")
     pictures = {k: _rows(x, "image", 3, 3) for k, x in enumerate(images) if x is not None}
-    uv = [] if colors.uv is None else _lines("vt", _rows(colors.uv, "uv", 2))
+    uv = torch.empty(0, 2) if colors.uv is None else _rows(colors.uv, "uv", 2)
+    used = rows[rows.amin(1) >= 0]
+    check_indices(used, len(uv), "uv_faces", "row", "uv", "rows")
+    if colors.wrap != "repeat" and ((uv[used] < 0) | (uv[used] > 1)).any():
+        warnings.warn(
+            f"an OBJ file cannot store wrap={colors.wrap!r}: where uv is outside of [0, 1], readers repeat the image",
+            stacklevel=3,
+        )
     material_lines = []
     for k in sorted(set(numbers.tolist())):
         material_lines.append(f"newmtl material_{k + 1}")
@@ -267,7 +282,7 @@ def _material_lines(base: str, corners: Tensor, colors: UVTexture | Materials) -
             write_png(os.path.join(os.path.dirname(base), file), pictures[k].float().numpy())
             material_lines.append(f"map_Kd {file}")
     _write_text(f"{base}.mtl", material_lines)
-    lines, before = [f"mtllib {name}.mtl", *uv], -1
+    lines, before = [f"mtllib {name}.mtl", *_lines("vt", uv)], -1
     for face, row, number in zip(corners.tolist(), rows.tolist(), numbers.tolist(), strict=True):
         if number != before:
             lines.append(f"usemtl material_{number + 1}")
@@ -277,14 +292,20 @@ def _material_lines(base: str, corners: Tensor, colors: UVTexture | Materials) -
     return lines
 
 
-def _rows(values: object, name: str, columns: int, ndim: int = 2) -> Tensor:
-    """Values of one mesh in host memory."""
+def _rows(values: object, name: str, columns: int, ndim: int = 2, integers: bool = False) -> Tensor:
+    """Values of one mesh in host memory: finite floats, or integers as int64."""
     if not isinstance(values, Tensor) or values.ndim != ndim or values.shape[-1] != columns:
         wanted = ", ".join([*("N", "H, W")[ndim == 3 :][:1], str(columns)])
         raise ValueError(
             f"{name} must be those of one mesh, a tensor [{wanted}], got {describe(values)}; take [0]"
         )
-    return values.detach().cpu()
+    if values.dtype not in (_INTEGERS if integers else _FLOATS):
+        kind = "integers" if integers else "float32 or float64"
+        raise TypeError(f"{name} must be {kind}, got {describe(values)}")
+    values = values.detach().cpu()
+    if not values.isfinite().all():
+        raise ValueError(f"{name} must be finite, but has values that are infinite or NaN")
+    return values.long() if integers else values
 
 
 def _lines(keyword: str, rows: Tensor) -> list[str]:

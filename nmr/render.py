@@ -17,7 +17,7 @@ from ._scene import (
     make_scene,
     shade,
 )
-from ._validate import GRADIENTS, as_positive, check_choice, check_number, check_size
+from ._validate import GRADIENTS, as_positive, check_choice, check_flag, check_number, check_size
 from .cameras import Camera
 from .fragments import Fragments
 from .images import OUTPUTS, Images
@@ -129,6 +129,7 @@ def render(
     how = image_size, anti_aliasing, fill_back, near, far, clip, eps
     if outputs == ("alpha",):
         return Images({"alpha": draw_silhouette(vertices, faces, camera, *how, gradient=gradient)})
+    interpolation_gradient = check_flag(interpolation_gradient, "interpolation_gradient")
     scene = make_scene(vertices, faces, camera, *how)
     how = interpolation_gradient, gradient, smooth, space
     return Images(_draw(scene, outputs, background, colors, lights, *how))
@@ -690,9 +691,8 @@ def render_fragments(
     if not 0 <= blur_radius < float("inf"):
         raise ValueError(f"blur_radius must be 0 or more and finite, got {blur_radius}")
     if blur_radius > 0:
-        return scene.soft_fragments(
-            layers, torch.tensor(blur_radius, dtype=torch.float64, device="cpu"), 1.0
-        )
+        sigma = torch.tensor(blur_radius, dtype=torch.float64, device="cpu")
+        return scene.soft_fragments(layers, sigma, 1.0, with_empty=True)
     return scene.fragments(scene.rasterize() if layers == 1 else scene.rasterize_layers(layers))
 
 

@@ -12,12 +12,13 @@ and ``R @ diag(1, 1, -1)`` (PyTorch3D: ``diag(1, 1, -1) @ R``).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from .._validate import as_numbers, describe, holds_for_all
+from .._validate import as_numbers, check_number, describe, holds_for_all
 from .pinhole import Pinhole
 from .projection import (
     Numbers,
@@ -271,6 +272,7 @@ def to_opengl(
     >>> view.shape, projection.shape
     (torch.Size([1, 4, 4]), torch.Size([1, 4, 4]))
     """
+    near, far = check_number(near, "near"), check_number(far, "far")
     if not 0 <= near < far < float("inf"):
         raise ValueError(
             f"near and far must be finite with 0 <= near < far, got near={near}, far={far}"
@@ -395,7 +397,10 @@ def from_pytorch3d_fov(
     [0.25, 0.125, 2.0]
     """
     fov = as_parameter(fov, "fov").to("cpu", torch.float64).reshape(-1)
-    focal = 1 / torch.tan((torch.deg2rad(fov) if degrees else fov) / 2)
+    half = (torch.deg2rad(fov) if degrees else fov) / 2
+    if not holds_for_all((half > 0) & (half < math.pi / 2)):
+        raise ValueError(f"fov must lie between 0 and 180 degrees, got {fov.tolist()}")
+    focal, aspect_ratio = 1 / torch.tan(half), check_number(aspect_ratio, "aspect_ratio")
     return from_pytorch3d(
         R, T, torch.stack([focal / aspect_ratio, focal], dim=-1), image_size=image_size
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .._validate import as_numbers, callers_level, holds_for_all
+from .._validate import as_numbers, callers_level, check_flag, holds_for_all
 from .projection import (
     Numbers,
     Projection,
@@ -90,6 +90,7 @@ class _Placed(SquarePixels):
         names = ("eye", target, "up")
         parameters = {name: as_parameter(getattr(self, name), name, 3) for name in names}
         parameters[view] = _scalar(getattr(self, view), view, low, high, wanted)
+        parameters["right_handed"] = check_flag(self.right_handed, "right_handed")
         for name, value in parameters.items():
             object.__setattr__(self, name, value)
         scale = parameters[view]
@@ -137,7 +138,7 @@ class _Placed(SquarePixels):
 
     def _given(self, dtype: torch.dtype) -> tuple:
         pose = (x.to("cpu", torch.float64) for x in self._parameters())
-        how = self._along, bool(self.right_handed), self.perspective
+        how = self._along, self.right_handed, self.perspective
         return *pose, None, None, None, None, None, *how
 
     def projection(self, dtype: torch.dtype = torch.float64) -> Projection:

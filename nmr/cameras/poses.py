@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, TypeVar
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .._packing import is_list
-from .._validate import check_values, describe
+from .._validate import check_values, describe, holds_for_all
 
 if TYPE_CHECKING:
     from .projection import ProjectingCamera
@@ -36,10 +37,14 @@ class Poses:
         Gradients reach the parameters of the whole camera.
         """
         count = len(self)
-        if isinstance(index, int):
+        number = _as_number(index)
+        if number is not None:
+            index = number
             if not -count <= index < count:
                 raise IndexError(f"pose {index} of a camera with {count} poses")
             index = [index]
+        elif not isinstance(index, slice):
+            index = _as_rows(index)
         return replace(self, **{name: x[index] for name, x in _parameters(self, count).items()})
 
     def unproject(self: ProjectingCamera, points: Tensor) -> Tensor:
@@ -61,8 +66,8 @@ class Poses:
         Raises
         ------
         TypeError, ValueError
-            For wrong types and shapes, another batch size than that of the poses, and a camera
-            with lens distortion.
+            For wrong types and shapes, another batch size than that of the poses, a camera with
+            lens distortion, and a pose that sees nothing.
 
         Examples
         --------
@@ -85,10 +90,10 @@ class Poses:
                 f"points must have batch size 1 or {camera.batch}, that of the poses, got {describe(points)}"
             )
         place, depth = given.double().split([2, 1], dim=-1)
-        place = (place - intrinsics[:, None, :, 2]) @ torch.linalg.inv(intrinsics[:, :, :2]).mT
+        place = (place - intrinsics[:, None, :, 2]) @ _inverse(intrinsics[:, :, :2]).mT
         place = place * depth if camera.perspective else place
         seen = torch.cat([place, depth.expand(*place.shape[:2], 1)], dim=-1)
-        world = (seen - matrix[:, None, :, 3]) @ torch.linalg.inv(matrix[:, :, :3]).mT
+        world = (seen - matrix[:, None, :, 3]) @ _inverse(matrix[:, :, :3]).mT
         return world.to(points)
 
     def unproject_depth(self: ProjectingCamera, depth: Tensor) -> Tensor:
@@ -133,6 +138,46 @@ class Poses:
         points = torch.cat([grid, given.unsqueeze(-1)], dim=-1)
         camera = self.for_image(height, width)
         return camera.unproject(points.flatten(1, 2)).unflatten(1, (height, width))
+
+
+def _as_number(index: object) -> int | None:
+    """An integer of Python, NumPy or a tensor []; None for anything else."""
+    if isinstance(index, bool) or getattr(index, "shape", ()) != ():
+        return None
+    try:
+        return operator.index(index)
+    except TypeError:
+        return None
+
+
+def _as_rows(index: object) -> Tensor:
+    """Numbers of poses, or for each pose whether it is taken."""
+    try:
+        rows = torch.as_tensor(index, device="cpu")
+    except (TypeError, ValueError, RuntimeError):
+        rows = None
+    if rows is None or rows.ndim != 1 or (len(rows) and not _is_whole(rows)):
+        got = describe(index) if rows is None else describe(rows)
+        raise TypeError(
+            f"poses are chosen by a number, a slice, or several numbers or bools [N], got {got}"
+        )
+    return rows if len(rows) else rows.long()
+
+
+def _is_whole(rows: Tensor) -> bool:
+    return not (rows.is_floating_point() or rows.is_complex())
+
+
+def _inverse(matrices: Tensor) -> Tensor:
+    """The inverses of the matrices ``[B, n, n]`` of cameras."""
+    inverse, failed = torch.linalg.inv_ex(matrices)
+    known = (failed == 0) & inverse.isfinite().flatten(1).all(1)
+    if not holds_for_all(known):
+        raise ValueError(
+            f"pose {int((~known).nonzero()[0])} of the camera sees nothing (it is not finite, or has no left and "
+            "right), so its points are not known"
+        )
+    return inverse
 
 
 def cat(cameras: Sequence[C]) -> C:

@@ -261,9 +261,8 @@ class Projection(ProjectingCamera):
         matrix, intrinsics, _, origin, _ = (
             None if x is None else x.detach().to("cpu", torch.float64) for x in self.parameters()
         )
-        x, y, z = matrix[:, :, :3].unbind(1)
-        products = _cross(y, z), _cross(z, x), _cross(x, y)
-        determinant = _sum_of_three(products[2] * z)
+        products = cofactors(matrix[:, :, :3]).unbind(1)
+        determinant = _sum_of_three(products[2] * matrix[:, 2, :3])
         columns = [product / determinant for product in products]  # of the inverse
         flip = intrinsics[:, 0, 0] * intrinsics[:, 1, 1] - intrinsics[:, 0, 1] * intrinsics[:, 1, 0]
         if self.perspective:
@@ -292,6 +291,12 @@ class SquarePixels(ProjectingCamera):
         shaped, short = copy.copy(self), min(height, width)
         object.__setattr__(shaped, "_stretch", (short / width, short / height))
         return shaped
+
+
+def cofactors(matrices: Tensor) -> Tensor:
+    """``[B, 3, 3]``: the inverse, transposed and times the determinant; in single operations."""
+    x, y, z = matrices.unbind(1)
+    return torch.stack([_cross(y, z), _cross(z, x), _cross(x, y)], dim=1)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -237,7 +237,7 @@ def _in_front(pos: Tensor, tri: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, T
     w = depths[..., 2]
     largest = float(w[w.isfinite()].abs().max()) if bool(w.isfinite().any()) else 0.0
     plane = _NEAREST * largest
-    counts = ops.clip_count(depths, tri, None, plane)
+    counts = ops.clip_count(depths, tri, None, plane).cpu()
     if (counts[:, 0] <= 0).all():
         return pos, tri, None
     batch, vertices = pos.shape[:2]
@@ -249,7 +249,8 @@ def _in_front(pos: Tensor, tri: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, T
     both = pos.double().view(-1, 4)[ends[:, :2]]
     new = cut_edges(both, both[..., 3:], plane)[1]
     parts = zip(pos.double(), new.split(counts[:, 0].tolist()), strict=True)
-    starts = new_starts + torch.arange(batch + 1).unsqueeze(1) * torch.tensor([vertices, 0])
+    given = vertices * torch.arange(batch + 1, device="cpu")
+    starts = new_starts + torch.stack([given, torch.zeros_like(given)], dim=1)
     return torch.cat([x for pair in parts for x in pair]), faces, (source, starts)
 
 

@@ -25,6 +25,7 @@ IMAGE, UV, CUBES = torch.rand(4, 4, 3), torch.rand(42, 2), torch.rand(2, 80, 2, 
 BATCH, FACES = V.expand(2, -1, -1), F.expand(2, -1, -1)
 CORNERS = torch.rand(2, 80, 3, 3)
 ONES = torch.ones(1, 3)
+WITHOUT_ROWS = nmr.UVTexture(IMAGE, UV[:5])
 GRID = torch.zeros(2, 4, 4, 4, dtype=torch.bool)
 
 
@@ -54,6 +55,10 @@ def lists(**how):
 
 def fragments(**how):
     return nmr.render_fragments(V, F, LOOK, image_size=4, **how)
+
+
+def save(faces, vertices=V, **how):
+    nmr.save_obj("is not written.obj", vertices, faces, **how)
 
 
 def entry(matrix, row, column, value=1.0):
@@ -99,13 +104,18 @@ TYPES = [
         r"image_size must be an integer or a pair \(height, width\), got str",
         lambda: render(image_size="8x9"),
     ),
-    ("near must be a number, got str", lambda: render(near="close")),
+    ("near must be a number, got NoneType", lambda: render(near=None)),
     (r"far must be a number, got float32 \[2\]", lambda: render(far=torch.ones(2))),
     ("anti_aliasing must be True or False, got 'no'", lambda: render(anti_aliasing="no")),
     (
         r"sigma must be a number or a tensor \[\], got str",
         lambda: nmr.render_soft_silhouette(V, F, sigma="wide"),
     ),
+    ("near must be a number, got '0.1'", lambda: render(near="0.1")),
+    ("interpolation_gradient must be True or", lambda: render(interpolation_gradient="no")),
+    ("smooth must be True or False, got 'no'", lambda: fragments().normals(smooth="no")),
+    ("smooth must be True or False, got 'flat'", lambda: nmr.Lights(smooth="flat")),
+    ("right_handed must be True or", lambda: nmr.LookAt(EYE, right_handed="left")),
     (r"eps has no gradient here", lambda: render(eps=torch.tensor(1e-3, requires_grad=True))),
     ("normals must be a float tensor .* got float", lambda: nmr.Lights(normals=0.5)),
     ("ordinary tensor, got one of layout torch.sparse_coo", lambda: render(V.to_sparse())),
@@ -151,6 +161,12 @@ TYPES = [
         "image must be a tensor of torch.float32",
         lambda: fragments().resolve(torch.zeros(1, 4, 4, 3).double()),
     ),
+    ("near must be a number, got 'a'", lambda: cameras.to_opengl(LOOK, near="a", far=1.0)),
+    ("aspect_ratio must be", lambda: cameras.from_pytorch3d_fov(I3, EYE, aspect_ratio="a")),
+    # files
+    (r"faces must be integers, got float32 \[80, 3\]", lambda: save(F + 0.6)),
+    (r"vertices must be float32 or float64, got int64", lambda: save(F, V.long())),
+    ("got NormalMap", lambda: save(F, colors=nmr.NormalMap(IMAGE, UV))),
     # losses and metrics
     ("prediction and target must be tensors", lambda: losses.soft_iou_loss([0.0], ONES)),
     ("prediction a float tensor, got uint8", lambda: losses.soft_iou_loss(ONES.byte(), ONES)),
@@ -219,10 +235,28 @@ VALUES = [
         r"got float32 \[1, 4, 4, 3\].*add \(1 - alpha\)",
         lambda: rgb(None, background=torch.rand(1, 4, 4, 3)),
     ),
+    (
+        "background_eps must be finite and 0 or more, got nan",
+        lambda: nmr.render_soft(V, F, background_eps=math.nan),
+    ),
     ("sigma must be positive", lambda: nmr.render_soft_silhouette(V, F, sigma=0.0)),
     ("dist_eps must lie between", lambda: nmr.render_soft_silhouette(V, F, dist_eps=0.5)),
     ("faces_per_pixel", lambda: fragments(faces_per_pixel=1025)),
     ("size must lie in 1", lambda: nmr.voxelize(V, F, 0)),
+    (
+        r"opacity must lie in \[0, 1\], got colours",
+        lambda: nmr.render_transparent(V, F, LOOK, opacity=nmr.FaceColors(2 * V.new_ones(80, 1))),
+    ),
+    (
+        r"fov must lie between 0 and 180 degrees, got \[0.0\]",
+        lambda: cameras.from_pytorch3d_fov(I3, EYE, 0.0),
+    ),
+    # files
+    (r"\. is not a regular file", lambda: nmr.load_gltf(".")),
+    ("faces refer to vertex 42, but a mesh has 42 vertices", lambda: save(F + 1)),
+    ("faces refer to vertex -1", lambda: save(F - 1)),
+    ("vertices must be finite", lambda: save(F, V / 0)),
+    ("uv_faces refer to row 41, but uv has 5 rows", lambda: save(F, colors=WITHOUT_ROWS)),
     (
         "definition must be 'kato18' or 'kato19', got 'kato20'",
         lambda: nmr.voxelize(V, F, definition="kato20"),
@@ -284,7 +318,7 @@ VALUES = [
     ("last row of projection must be", lambda: cameras.from_opengl(I4, FRUSTUM.T)),
     (r"projection\[0:2, 3\] must be 0", lambda: cameras.from_opengl(I4, entry(FRUSTUM, 0, 3))),
     (r"projection\[0:2, 2\] must be 0", lambda: cameras.from_opengl(I4, entry(I4, 1, 2))),
-    ("0 <= near < far, got near=1, far=1", lambda: cameras.to_opengl(LOOK, near=1, far=1)),
+    ("0 <= near < far, got near=1.0, far=1.0", lambda: cameras.to_opengl(LOOK, near=1, far=1)),
     ("OpenGL has no lens distortion", lambda: cameras.to_opengl(PINHOLE, near=1, far=2)),
     (
         r"focal_length must be a number .*, got \[2, 3\]",

@@ -68,3 +68,23 @@ def test_gradients_are_the_derivative():
         return layers.weights, layers.depth, layers.interpolate(values)
 
     gradcheck(draw, leaf_of(vertices), eps=1e-7, atol=1e-5, rtol=1e-5)
+
+
+def test_layers_that_no_pixel_needs_change_no_bit():
+    """The largest number of surfaces in a pixel decides the work, not faces_per_pixel."""
+    vertices, faces = random_soup(3)
+    colors = nmr.VertexColors(uniform(*vertices.shape, seed=4).to(vertices))
+    how = dict(colors=colors, background=0.25, image_size=16)
+
+    def drawn(draw, layers):
+        leaf = leaf_of(vertices)
+        images = draw(leaf, faces, faces_per_pixel=layers, **how)
+        both = torch.cat([images.rgb, images.alpha.unsqueeze(-1)], dim=-1)
+        return both, *torch.autograd.grad((both * both).sum(), leaf)
+
+    for draw in (
+        lambda *args, **how: nmr.render_transparent(*args, opacity=0.3, **how),
+        lambda *args, **how: nmr.render_soft(*args, sigma=1e-3, gamma=1e-2, **how),
+    ):
+        few, many = drawn(draw, 12), drawn(draw, 40)
+        assert all(torch.equal(a, b) for a, b in zip(few, many, strict=True))

@@ -1,5 +1,6 @@
 """Lights: against the formula written out, their gradients, bad input."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -273,3 +274,41 @@ def test_a_camera_that_turns_with_the_mesh_sees_the_same_normals():
     ]
     assert_close(*images)
     assert (images[0][..., 2] <= 1e-2).all() and images[0][..., 2].min() < -0.9
+
+
+NOTHING_TO_SEE = [[0.0, 0.0, -3.0], [0.0, 3.0, 0.0], [math.nan, 0.0, 0.0]]
+
+
+@pytest.mark.filterwarnings("ignore:.*sees|.*looks along|.*is not finite")
+def test_normals_in_camera_space_of_poses_that_see_nothing():
+    """A pose along its up vector, and one that is not finite, leave the others as they are."""
+    vertices, faces = nmr.icosphere(1)
+    how = dict(space="camera", **SIZE)
+    normals = nmr.render_normals(vertices, faces, nmr.LookAt(NOTHING_TO_SEE), **how)
+    alone = nmr.render_normals(vertices, faces, nmr.LookAt(NOTHING_TO_SEE[0]), **how)
+    assert torch.equal(normals[:1], alone) and normals.isfinite().all()
+    assert (normals[2] == 0).all()
+
+
+def test_settings_of_torch_do_not_change_normals_and_light():
+    vertices, faces = nmr.icosphere(1)
+    lights = nmr.Lights(harmonics=uniform(9, 3, seed=0).float(), smooth=True)
+    camera = nmr.LookAt([1.0, 2.0, -3.0])
+
+    def images():
+        normals = nmr.render_normals(vertices, faces, camera, space="camera", smooth=True, **SIZE)
+        return torch.cat([normals, nmr.render_rgb(vertices, faces, camera, lights=lights, **SIZE)])
+
+    usual = images()
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(images(), usual)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(images(), usual)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_harmonics_must_be_finite():
+    with pytest.raises(ValueError, match="harmonics must be finite"):
+        nmr.Lights(harmonics=torch.full((9, 3), math.nan))

@@ -196,3 +196,15 @@ def test_collapsed_meshes_have_finite_gradients(loss, sizes, dtype):
         lambda x: loss(x, table), (vertices * torch.tensor(sizes)).to(dtype)
     )
     assert all(x.isfinite().all() for x in results)
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-10, 1e8])
+def test_the_size_of_a_mesh_does_not_change_how_smooth_it_is(size):
+    vertices, faces = nmr.icosphere(2)
+    edges = nmr.edge_table(faces)
+    usual = value_and_gradients(lambda v: nmr.losses.normal_consistency_loss(v, edges), vertices)
+    found = value_and_gradients(
+        lambda v: nmr.losses.normal_consistency_loss(v, edges), size * vertices
+    )
+    assert_close(found[0], usual[0])
+    assert_close(size * found[1], usual[1], rtol=1e-3, atol=1e-6)

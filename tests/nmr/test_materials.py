@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from gltf_files import SQUARE, square_glb
+from gltf_files import SQUARE, Arrays, glb, square_glb
 from PIL import Image
 from scenes import bumpy_sphere, leaf_of, uniform
 from torch.autograd import gradcheck
@@ -220,3 +220,55 @@ def test_a_gltf_file_refers_to_its_folder_alone(tmp_path):
         (tmp_path / "a.gltf").write_text(json.dumps(tree))
         with pytest.raises(kind, match="outside of its folder" if kind is ValueError else "b.bin"):
             nmr.load_gltf(tmp_path / "a.gltf")
+
+
+def test_a_mirrored_node_keeps_the_side_of_its_faces(tmp_path):
+    arrays = Arrays()
+    look = {
+        "attributes": {"POSITION": arrays.add(SQUARE)},
+        "indices": arrays.add(np.uint8([[0], [1], [2]])),
+    }
+    nodes = [{"mesh": 0}, {"mesh": 0, "scale": [-1, 1, 1]}]
+    tree = {"asset": {"version": "2.0"}, "nodes": nodes, "meshes": [{"primitives": [look]}]}
+    (tmp_path / "a.glb").write_bytes(glb(tree | arrays.tree(embedded=False), arrays.content))
+    mesh = nmr.load_gltf(tmp_path / "a.glb")
+    assert_close(nmr.face_normals(mesh.vertices, mesh.faces), torch.tensor([[0.0, 0, 1]] * 2))
+    assert mesh.vertices[mesh.faces][..., 0].amin(1).tolist() == [0, -1]
+
+
+def test_materials_that_share_an_image_are_sampled_once(monkeypatch):
+    vertices, faces = nmr.icosphere(2)
+    image, other = uniform(4, 4, 3, seed=1).float(), uniform(4, 4, 3, seed=2).float()
+    number = torch.arange(len(faces)) % 5
+    sampled = []
+    sample = nmr.UVTexture.sample
+    monkeypatch.setattr(
+        nmr.UVTexture, "sample", lambda self, at: sampled.append(self.image) or sample(self, at)
+    )
+
+    def draw(images, number):
+        uv = 0.5 + vertices[:, :2] / 2
+        colors = nmr.Materials(uniform(len(images), 3, seed=3).float(), images, number, uv, faces)
+        return nmr.render_rgb(
+            vertices, faces, nmr.LookAt([0.0, 0, -3]), colors=colors, image_size=16
+        )
+
+    copies = draw([image, image.clone(), None, other, image.clone()], number)
+    sampled.clear()
+    assert torch.equal(draw([image, image, None, other, image], number), copies)
+    assert len(sampled) == 2 and sampled[0] is image and sampled[1] is other
+    sampled.clear()  # no face has image 3
+    draw([image, image, None, other, image], number.where(number != 3, 0))
+    assert len(sampled) == 1
+    sampled.clear()  # its gradient is 0
+    wanted = other.clone().requires_grad_()
+    rgb = draw([image, image, None, wanted, image], number.where(number != 3, 0))
+    assert (torch.autograd.grad(rgb.sum(), wanted)[0] == 0).all()
+
+
+def test_files_cannot_store_that_an_image_is_not_repeated(tmp_path):
+    vertices, faces = nmr.icosphere(1)
+    texture = nmr.UVTexture(torch.rand(4, 4, 3), 2 * vertices[:, :2], wrap="clamp")
+    with pytest.warns(UserWarning, match="cannot store wrap='clamp'") as said:
+        nmr.save_obj(tmp_path / "a.obj", vertices, faces, texture)
+    assert said[0].filename == __file__

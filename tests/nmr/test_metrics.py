@@ -123,3 +123,13 @@ def test_precision_and_recall_of_boxes():
     precision, recall = voxel_precision_recall(a, b)
     assert precision[:2].tolist() == [1 / 2, 0] and precision[2].isnan()
     assert recall[0] == 1 / 3 and recall[1:].isnan().all()
+
+
+def test_metrics_of_points_under_vmap():
+    """Sets of points are a batch, whoever adds its axis."""
+    a, b = uniform(3, 1, 20, 3, seed=1), uniform(3, 1, 30, 3, seed=2)
+    for measure in (
+        lambda x, y: metrics.chamfer_distance(x, y, "l1"),
+        lambda x, y: metrics.f_score(x, y, 0.2),
+    ):
+        assert_close(torch.func.vmap(measure)(a, b), measure(a[:, 0], b[:, 0]).unsqueeze(1))

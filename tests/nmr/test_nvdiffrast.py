@@ -250,3 +250,14 @@ def antialias(topology_hash):
 def test_errors(call, words):
     with pytest.raises((TypeError, ValueError, RuntimeError), match=words):
         call()
+
+
+def test_the_default_device_does_not_matter():
+    pos, tri = triangles(0)
+    usual = dr.rasterize(CONTEXT, pos, tri, SIZE)
+    torch.set_default_device("meta")
+    try:
+        found = dr.rasterize(CONTEXT, pos, tri, SIZE)
+    finally:
+        torch.set_default_device(None)
+    assert all(torch.equal(a, b) for a, b in zip(found, usual, strict=True))

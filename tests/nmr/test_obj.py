@@ -213,3 +213,19 @@ def test_tensors_of_an_obj_file(tmp_path: Path) -> None:
     path.write_text(CORNERS)
     with pytest.raises(ValueError, match=r"a\.obj has no faces"):
         nmr.load_obj(path)
+
+
+@pytest.mark.parametrize(
+    "colors, first",
+    [
+        (["1.0001 1 0", "0 0 0", "0.5 0 0"], [1, 1, 0]),  # a rounded 1
+        (["2 0 0", "0 0 0", "1 0 0"], [2 / 255, 0, 0]),  # bytes, nearly black
+        (["127.5 0 0", "0 0 0", "0.5 0 0"], [0.5, 0, 0]),
+        (["1 0 1", "0 0 0", "1 0 0"], [1, 0, 1]),
+    ],
+)
+def test_colors_above_one(tmp_path: Path, colors: list[str], first: list[float]) -> None:
+    lines = [f"v {k} {k % 2} 0 {color}" for k, color in enumerate(colors)]
+    (tmp_path / "a.obj").write_text("\n".join([*lines, "f 1 2 3"]))
+    mesh = nmr.load_obj(tmp_path / "a.obj", dtype=torch.float64)
+    assert_close(mesh.colors[0], double(first))

@@ -1,5 +1,6 @@
 """Cameras of several poses: counted, selected, joined; points from renderer space back to the world."""
 
+import numpy as np
 import pytest
 import torch
 from scenes import bumpy_sphere, leaf_of, normal, uniform
@@ -110,6 +111,10 @@ WRONG = {
         ValueError,
         "batch size 1 or 3, that of the poses",
     ),
+    "index": (lambda: CAMERAS["look at"]["first"], TypeError, "by a number, a slice.* got str"),
+    "axes": (lambda: CAMERAS["look at"][None], TypeError, "by a number, a slice.* got NoneType"),
+    "fraction": (lambda: CAMERAS["look at"][[0.5]], TypeError, r"got float32 \[1\]"),
+    "out of range": (lambda: CAMERAS["look at"][np.int64(3)], IndexError, "pose 3 of a camera"),
     "depth": (lambda: CAMERAS["one"].unproject_depth(FACES), TypeError, "float tensor"),
     "depth's shape": (
         lambda: CAMERAS["one"].unproject_depth(EYES[0]),
@@ -124,3 +129,18 @@ def test_wrong_arguments(name):
     call, kind, said = WRONG[name]
     with pytest.raises(kind, match=said):
         call()
+
+
+@pytest.mark.parametrize("camera", [CAMERAS["look at"], CAMERAS["look at"].projection()])
+def test_numbers_of_numpy_and_torch_choose_a_pose(camera):
+    for number in (np.int64(1), torch.tensor(1), np.uint8(1)):
+        assert_close(camera[number].transform(EYES), camera[1].transform(EYES), rtol=0, atol=0)
+    chosen = np.arange(len(camera)) != 1
+    assert len(camera[chosen]) == len(camera[[0, 2]]) == 2 and len(camera[[]]) in (0, 1)
+
+
+@pytest.mark.filterwarnings("ignore:.*looks along")
+def test_a_pose_that_sees_nothing_has_no_points():
+    camera = nmr.LookAt([[0.0, 0.0, -3.0], [0.0, 3.0, 0.0]])
+    with pytest.raises(ValueError, match="pose 1 of the camera sees nothing"):
+        camera.unproject(EYES[:1])
