@@ -86,7 +86,7 @@ def clip_near(
     num_new, num_drawn = zip(*room, strict=True)
     new_starts = packed_starts(num_new, num_drawn)
     faces, source, corners, ends = ops.clip_faces(
-        *mesh[:3], plane, new_starts, sum(num_new), sum(num_drawn)
+        *mesh.arrays, plane, new_starts, sum(num_new), sum(num_drawn)
     )
     share, new = _new_vertices(world, mesh, camera, plane, ends[:, :2], new_starts)
     own = mesh.each_vertices()
@@ -111,7 +111,7 @@ def _room(mesh: MeshBatch, plane: float, nearest: Tensor | None) -> list[tuple[i
     """
     if can_read():
         depth = mesh.vertices.detach()[..., 2] if nearest is None else nearest
-        return ops.clip_count(*mesh[:3], plane).tolist() if (depth < plane).any() else None
+        return ops.clip_count(*mesh.arrays, plane).tolist() if (depth < plane).any() else None
     return [(2 * n, 2 * n) for n in mesh.face_counts or (mesh.faces.shape[-2],) * mesh.batch]
 
 

@@ -34,6 +34,11 @@ class MeshBatch(NamedTuple):
     face_counts: tuple[int, ...] = ()  # packed: F of each mesh
 
     @property
+    def arrays(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Vertices, faces and starts, as the operators take them."""
+        return self.vertices, self.faces, self.starts
+
+    @property
     def batch(self) -> int:
         return self.vertices.shape[0] if self.starts is None else len(self.vertex_counts)
 

@@ -68,17 +68,17 @@ class Scene(NamedTuple):
     def rasterize(self) -> Tensor:
         settings = self.settings
         return ops.rasterize(
-            *self.drawn[:3], *settings.raster, *settings[3:6], settings.perspective
+            *self.drawn.arrays, *settings.raster, *settings.visibility, settings.perspective
         )
 
     def rasterize_layers(self, layers: int) -> Tensor:
         settings = self.settings
         return ops.rasterize_layers(
-            *self.drawn[:3], *settings.raster, layers, *settings[3:6], settings.perspective
+            *self.drawn.arrays, *settings.raster, layers, *settings.visibility, settings.perspective
         )
 
     def silhouette(self, gradient: str) -> tuple[Tensor, Tensor]:
-        vertices, faces, starts = self.drawn[:3]
+        vertices, faces, starts = self.drawn.arrays
         vertices = vertices.detach() if gradient == "none" else vertices
         camera, how = ops.no_camera(self.settings.perspective), self.settings[:-1]
         local = gradient == "local"
@@ -87,14 +87,18 @@ class Scene(NamedTuple):
     def soft_silhouette(self, sigma: Tensor, dist_eps: float) -> Tensor:
         settings, reach = self.settings, math.log(1 / dist_eps - 1)
         transmittance = ops.soft_silhouette(
-            *self.drawn[:3], sigma.double(), *settings.raster, *settings[3:6], reach
+            *self.drawn.arrays, sigma.double(), *settings.raster, *settings.visibility, reach
         )
         return 1 - average(transmittance.unsqueeze(-1), settings.anti_aliasing).squeeze(-1)
 
     def depth(self, face_index: Tensor) -> Tensor:
         settings = self.settings
         return ops.depth_image(
-            *self.drawn[:3], face_index, settings.anti_aliasing, settings.far, settings.perspective
+            *self.drawn.arrays,
+            face_index,
+            settings.anti_aliasing,
+            settings.far,
+            settings.perspective,
         )
 
     def fragments(self, face_index: Tensor) -> Fragments:
@@ -118,13 +122,13 @@ class Scene(NamedTuple):
         ``with_empty``: also layers that no pixel has.
         """
         settings = self.settings
-        how = *settings[3:6], settings.perspective
+        how = *settings.visibility, settings.perspective
         drawn_index = ops.soft_layers(
-            *self.drawn[:3], sigma.detach().double(), *settings.raster, layers, *how, reach
+            *self.drawn.arrays, sigma.detach().double(), *settings.raster, layers, *how, reach
         )
         drawn_index = drawn_index if with_empty else without_empty_layers(drawn_index)
         of_drawn = ops.soft_fragments(
-            *self.drawn[:3], drawn_index, settings.far, settings.perspective
+            *self.drawn.arrays, drawn_index, settings.far, settings.perspective
         )
         face_index, (weights, depth, distances) = drawn_index, of_drawn
         if self.clipped is not None:
@@ -137,7 +141,7 @@ class Scene(NamedTuple):
 
     def _weights_and_depth(self, face_index: Tensor) -> tuple[Tensor, Tensor]:
         weights, depth = ops.fragments(
-            *self.drawn[:3], face_index, self.settings.far, self.settings.perspective
+            *self.drawn.arrays, face_index, self.settings.far, self.settings.perspective
         )
         return weights if self.clipped is None else self.clipped.weights(face_index, weights), depth
 

@@ -342,7 +342,7 @@ class Fragments:
         """The same; pixels without a face have the colour ``background [B | 1, C]``, if it is
         given.
         """
-        vertices, faces, starts = self._drawn[:3]
+        vertices, faces, starts = self._drawn.arrays
         vertices = vertices.detach() if gradient == "none" else vertices
         edges = self.anti_aliasing, self.eps, gradient == "local", has_perspective(self.camera)
         return ops.resolve(

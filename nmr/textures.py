@@ -274,7 +274,8 @@ class UVTexture:
                     [vertices[..., :2], torch.ones_like(vertices[..., 2:])], dim=-1
                 )
             values = (
-                x if x is None else x.detach() for x in (vertices, *fragments.mesh[1:3], *at, grids)
+                x if x is None else x.detach()
+                for x in (vertices, *fragments.mesh.arrays[1:], *at, grids)
             )
             level = ops.uv_levels(*values)
         return ops.sample_uv(texels, grids, level, *at, ops.WRAPS.index(self.wrap))

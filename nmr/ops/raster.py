@@ -28,6 +28,11 @@ class RasterSettings(NamedTuple):
         scale = 2 if self.anti_aliasing else 1
         return scale * self.height, scale * self.width
 
+    @property
+    def visibility(self) -> tuple[bool, float, float]:
+        """Which faces are seen: from their backs too, between the limits of the depth."""
+        return self.fill_back, self.near, self.far
+
 
 def batch_size(vertices: Tensor, starts: Tensor | None) -> int:
     """B of vertices ``[B, V, 3]``, or of packed vertices ``[N, 3]`` with starts ``[B + 1, 2]``."""
