@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,20 +36,32 @@ _HARMONICS = (
     0.54627422,
 )
 
-# In the order of the kernel's enum LightParameter: accepted shapes, as text and as numbers of
-# axes; then 1 for vectors, else 0.
-_SHAPES = {
-    "ambient": ("[] or [B]", (0, 1), 0),
-    "ambient_color": ("[3] or [B, 3]", (1, 2), 1),
-    "directional": ("[], [L] or [B, L]", (0, 1, 2), 0),
-    "directional_color": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
-    "direction": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
-    "point": ("[], [L] or [B, L]", (0, 1, 2), 0),
-    "point_color": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
-    "position": ("[3], [L, 3] or [B, L, 3]", (1, 2, 3), 1),
-    "falloff": ("[], [L] or [B, L]", (0, 1, 2), 0),
-    "specular": ("[] or [B]", (0, 1), 0),
-    "shininess": ("[] or [B]", (0, 1), 0),
+
+class _Parameter(NamedTuple):
+    """What a parameter may be: one for all lights or each its own, a number or three."""
+
+    shape: str
+    per_light: bool
+    vector: bool
+
+
+_NUMBER = _Parameter("[] or [B]", False, False)
+_NUMBERS = _Parameter("[], [L] or [B, L]", True, False)
+_VECTOR = _Parameter("[3] or [B, 3]", False, True)
+_VECTORS = _Parameter("[3], [L, 3] or [B, L, 3]", True, True)
+# In the order of the kernel's enum LightParameter.
+_PARAMETERS = {
+    "ambient": _NUMBER,
+    "ambient_color": _VECTOR,
+    "directional": _NUMBERS,
+    "directional_color": _VECTORS,
+    "direction": _VECTORS,
+    "point": _NUMBERS,
+    "point_color": _VECTORS,
+    "position": _VECTORS,
+    "falloff": _NUMBERS,
+    "specular": _NUMBER,
+    "shininess": _NUMBER,
 }
 _DIRECTIONAL = ("directional", "directional_color", "direction")
 _POINT = ("point", "point_color", "position", "falloff")
@@ -146,15 +158,13 @@ class Lights:
             unused = (*unused, "specular", "shininess")
         object.__setattr__(self, "_unused", unused)
         object.__setattr__(self, "smooth", check_flag(self.smooth, "smooth"))
-        for name, (shape, dimensions, _) in _SHAPES.items():
+        for name, (shape, per_light, vector) in _PARAMETERS.items():
             if name in unused:
                 continue
             value = as_floats(getattr(self, name), name, shape)
-            if (
-                value.ndim not in dimensions
-                or 0 in value.shape
-                or ("3" in shape and value.shape[-1] != 3)
-            ):
+            missing = 1 + per_light + vector - value.ndim  # axes that may be left out
+            wrong = not 0 <= missing <= 1 + per_light or (vector and value.shape[-1] != 3)
+            if wrong or 0 in value.shape:
                 raise ValueError(f"{name} must have shape {shape}, got {describe(value)}")
             if not holds_for_all(value.isfinite()):
                 raise ValueError(f"{name} must be finite, got {value}")
@@ -199,7 +209,7 @@ class Lights:
 
     def _shade(self, fragments: Fragments, colors: Tensor | None, own: Tensor | None) -> Tensor:
         batch, values, layout, first = fragments.mesh.batch, [], [], 0
-        for name in _SHAPES:
+        for name in _PARAMETERS:
             if name in self._unused:
                 layout.append((first, 1, 0))
                 continue
@@ -251,8 +261,7 @@ def _check_images(value: Tensor, name: str, batch: int) -> None:
 
 def _rows(value: Tensor, name: str) -> Tensor:
     """A parameter as ``[B or 1, L or 1, width]``."""
-    shape, _, vector = _SHAPES[name]
-    per_light = "L" in shape
+    _, per_light, vector = _PARAMETERS[name]
     value = value if vector else value.unsqueeze(-1)
     if not per_light:
         value = value.unsqueeze(-2)
