@@ -58,7 +58,7 @@ def fragments(**how):
 
 
 def save(faces, vertices=V, **how):
-    nmr.save_obj("is not written.obj", vertices, faces, **how)
+    nmr.save_obj("no folder/is not written.obj", vertices, faces, **how)
 
 
 def entry(matrix, row, column, value=1.0):
