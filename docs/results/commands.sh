@@ -46,7 +46,11 @@ learn3d experiment prgan --data DATA --output OUTPUT --category airplane --itera
 
 learn3d make-dataset --layout kar --views 12 --output KAR --category airplane --source models/airplane --front z --augment 6
 
-# Table 3
+# Table 3, as published: one view of each of 2,000 generated airplanes
+learn3d make-dataset --layout kar --output KAR_GENERATED --category airplane --procedural 2000
+learn3d experiment kar --data KAR_GENERATED --output KAR_GENERATED_OUTPUT --category airplane --methods Vanilla-AE Proposed --iterations 5000 --seeds 1 --set clamp_to_cube=true validate_every=1000 precision=fp32
+
+# Table 3, 12 views of each real airplane
 learn3d experiment kar --data KAR --output OUTPUT --category airplane --methods Vanilla-AE Proposed --iterations 2000 --seeds 1 --set clamp_to_cube=true views_per_object=12 validate_every=1000
 
 # Table 4
