@@ -59,15 +59,20 @@ def read_framed(path: Path, mask_path: Path | None, size: int) -> Framed:
     return Framed(frame(colors, mask, size), small, object_size, touches_border, left_out)
 
 
-def _read(
-    path: Path, mask_path: Path | None, optional: bool
-) -> tuple[np.ndarray, np.ndarray | None]:
+def _open_8_bit(path: Path) -> Image.Image:
     image = _open(path)
     if image.mode.startswith(("I", "F")):  # Pillow would clamp values above 255
         raise DamagedFile(
             path, f"has more than 8 bits a pixel and channel ({image.mode}); save it with 8"
         )
-    mask_image = image if mask_path is None else _open(mask_path)
+    return image
+
+
+def _read(
+    path: Path, mask_path: Path | None, optional: bool
+) -> tuple[np.ndarray, np.ndarray | None]:
+    image = _open_8_bit(path)
+    mask_image = image if mask_path is None else _open_8_bit(mask_path)
     if mask_image.size != image.size:
         photo, other = (f"{i.width}x{i.height} pixels" for i in (image, mask_image))
         raise DamagedFile(

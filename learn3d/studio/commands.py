@@ -80,6 +80,8 @@ class EstimatePoses(Command):
         if self.output.suffix != ".npz":
             raise ValueError(f"--output must end in .npz, got {self.output}")
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
+        if self.compare and any(dataset.poses is None for dataset in datasets):
+            raise ValueError("--compare needs true poses, but this data set has none")
         views = estimate_views(datasets, self.cameras, self.options)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())

@@ -263,3 +263,12 @@ def test_the_plane_is_found_before_the_first_step_and_kept(
     method, config, metadata = checkpoint.load_method(run_folder / "best.safetensors")
     assert (config.settings.symmetry, metadata.info.mirror_plane_deg) == ("auto", 37.5)
     assert method.generator.mirror is not None
+
+
+def test_symmetry_auto_without_poses_says_that_poses_are_missing(
+    tiny_config, tiny_set, run_folder, monkeypatch
+) -> None:
+    unknown = dataclasses.replace(tiny_set, poses=None)
+    monkeypatch.setattr(training, "load_data", lambda *_, **__: unknown)
+    with pytest.raises(ValueError, match=r"has no poses; .* estimate them from its masks"):
+        train(tiny_config(run_folder, symmetry="auto"))

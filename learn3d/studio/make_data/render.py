@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from learn3d.data.conventions import SPLITS, mesh_to_object, synset_of, view_poses
+from learn3d.data.conventions import SPLITS, has_shards, mesh_to_object, synset_of, view_poses
 from learn3d.data.shards import finish_set, remove, shard_path, write_shard
 from learn3d.files.formats import RawMesh
 from learn3d.files.identity import describe
@@ -104,6 +104,11 @@ def make_dataset(config: DatasetConfig) -> DatasetReport:
     items = [item for of_split in splits.values() for item in of_split]
     writer = WRITERS[config.layout]
     paths = [*writer.paths(config.category), *report_files(config.category)]
+    if any(has_shards(config.output, config.category, split) for split in SPLITS):
+        raise FileExistsError(
+            f"{config.output} has shards of {config.category}, which are read before other files; give another folder, "
+            "or remove the shards"
+        )
     there = [path for path in paths if (config.output / path).exists()]
     if there and not config.overwrite:
         raise FileExistsError(

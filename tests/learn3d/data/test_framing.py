@@ -125,3 +125,10 @@ def test_unreadable_photos_are_named(tmp_path: Path) -> None:
         ValueError, match=r"b.png: has more than 8 bits a pixel and channel \(.*\); save it with 8"
     ):
         read_photo(path, path)
+
+
+def test_masks_of_more_than_8_bits_are_refused(tmp_path: Path) -> None:
+    photo = save(tmp_path / "a.png", np.full((8, 6, 3), 10, np.uint8))
+    mask = save(tmp_path / "m.png", np.full((8, 6), 3_000, np.uint16))
+    with pytest.raises(ValueError, match=r"m\.png: has more than 8 bits a pixel"):
+        read_photo(photo, mask)

@@ -182,5 +182,7 @@ function drawOutline(mask, width, height) {
 
 function boxOf(points) {
   const [[x, y], [u, v]] = [points[0], points.at(-1)];
-  return [Math.min(x, u), Math.min(y, v), Math.abs(x - u), Math.abs(y - v)].map(Math.round);
+  const [left, top] = [Math.min(x, u), Math.min(y, v)].map(Math.round);
+  const [right, bottom] = [Math.max(x, u), Math.max(y, v)].map(Math.round);
+  return [left, top, right - left, bottom - top];
 }

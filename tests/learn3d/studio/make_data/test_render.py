@@ -13,7 +13,7 @@ from lopsided_meshes import lopsided_mesh, make, write_meshes
 from PIL import Image
 from runs import contents
 
-from learn3d.data.conventions import mesh_to_object
+from learn3d.data.conventions import SET_FILE, mesh_to_object, shards_folder
 from learn3d.data.dataset import ViewDataset
 from learn3d.data.readers import kato
 from learn3d.studio.make_data import meshes, render
@@ -302,3 +302,11 @@ def test_arrays_that_are_refused(vertices: np.ndarray, faces: np.ndarray, messag
 def test_vertices_that_no_face_uses_are_dropped_unchecked() -> None:
     stray = np.vstack([TRIANGLE, [[np.nan] * 3], [[50.0] * 3]])
     np.testing.assert_array_equal(meshes.check(meshes.RawMesh(stray, FACE)).vertices, TRIANGLE)
+
+
+def test_shards_of_the_category_would_be_read_instead(tmp_path, folder):
+    shards = shards_folder(tmp_path / "data", "chair", "test")
+    shards.mkdir(parents=True)
+    (shards / SET_FILE).write_text("{}")
+    with pytest.raises(FileExistsError, match="has shards of chair, which are read before"):
+        make(tmp_path / "data", folder)
