@@ -186,6 +186,9 @@ def stop_on_signal() -> Iterator[SimpleNamespace]:
     def handle(number: int, _: object) -> None:
         if stop.name and number == signal.SIGINT:
             raise KeyboardInterrupt
+        if not stop.name and number == signal.SIGINT and sys.stderr.isatty():
+            # os.write: print may be interrupted within itself
+            os.write(sys.stderr.fileno(), b"\nstopping; a second Ctrl-C ends at once\n")
         stop.name = signal.Signals(number).name
 
     hangup = [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from children import wait_until
+from children import environment, wait_until
 
 from learn3d import terminal
 from learn3d.terminal import align, progress, say, without_traceback
@@ -165,3 +165,17 @@ def test_names_of_strangers_give_a_terminal_no_commands(tmp_path, capsys, comman
     words = f"make-dataset --output {tmp_path}/data --category chair --source {tmp_path} --test 0 --val 0"
     status, out, _ = command(*words.split())
     assert status == 0 and "skipped \\udcff\\x1b[2J.off (train): " in out
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs terminals as of Unix")
+def test_ctrl_c_is_answered_on_a_terminal() -> None:
+    master, slave = os.openpty()
+    script = "import os, signal; from learn3d.terminal import stop_on_signal\n"
+    script += "with stop_on_signal() as stop: os.kill(os.getpid(), signal.SIGINT); print(stop.name)"
+    ended = subprocess.run(
+        [sys.executable, "-c", script], stderr=slave, stdout=subprocess.PIPE, env=environment()
+    )
+    os.close(slave)
+    said = os.read(master, 1000)
+    os.close(master)
+    assert ended.stdout.split() == [b"SIGINT"] and b"a second Ctrl-C ends at once" in said

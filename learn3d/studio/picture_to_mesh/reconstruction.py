@@ -87,7 +87,8 @@ def reconstruct_files(
                 guesses=guesses,
             )
         )
-        for doubt in filter(None, (photo.doubt, made[0].warning)):
+        empty = "the shape is empty, as the object is too thin" * (not len(made[0].surface.faces))
+        for doubt in filter(None, (photo.doubt, made[0].warning, empty)):
             note(f"warning: {name}: {doubt}")
         if made[0].kind:
             note(f"{name}: category {', '.join(each.kind for each in made)}")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from learn3d.pictures import draw_around
 from learn3d.studio.picture_to_mesh.fit import Target, frame_target
@@ -13,6 +14,7 @@ from learn3d.studio.picture_to_mesh.inflation import inflate
 from learn3d.studio.picture_to_mesh.make import load_model, reconstruct_picture
 from learn3d.studio.picture_to_mesh.options import DEFAULTS
 from learn3d.studio.picture_to_mesh.read import fill_drawing, keep_parts
+from learn3d.studio.picture_to_mesh.reconstruction import reconstruct_files
 
 SIZE = 200
 Y, X = np.indices((SIZE, SIZE)) - (SIZE - 1) / 2
@@ -106,3 +108,11 @@ def test_a_smooth_shape_is_made_if_it_is_asked_for() -> None:
     made = reconstruct_picture(load_model(None), *picture, smooth=True)
     assert made.kind is made.warning is None and made.silhouette_iou > 0.9
     assert made.azimuth_deg == 0 and made.view is not None
+
+
+def test_an_empty_shape_of_a_file_is_said(tmp_path, capsys) -> None:
+    pixels = np.zeros((512, 512, 4), np.uint8)
+    pixels[20:490, 250] = 255  # a line of one pixel
+    Image.fromarray(pixels).save(tmp_path / "line.png")
+    reconstruct_files(None, tmp_path / "meshes", [tmp_path / "line.png"], smooth=True)
+    assert "line: the shape is empty" in capsys.readouterr().err
