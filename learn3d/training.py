@@ -122,10 +122,7 @@ def create_run(config: TrainConfig) -> tuple[Run, ViewDataset, ViewDataset]:
     train_set = load_data(config, "train")
     val_set = load_data(config, config.val_split)
     settings = config.settings
-    wants_plane = (
-        settings.wants_mirror_plane and train_set.poses is not None
-    )  # else: see the method
-    plane = find_mirror_plane(train_set) if wants_plane else None
+    plane = find_mirror_plane(train_set) if settings.wants_mirror_plane else None
     solidity = train_set.solidity() if settings.wants_solidity else None
     info = train_set.info(plane, solidity)
     method = create_method(

@@ -320,7 +320,9 @@ def background_rows(background: object, channels: int, batch: int, like: Tensor)
 
 
 def without_empty_layers(face_index: Tensor) -> Tensor:
-    """Layers ``[B, H, W, K]``, nearest first, without those that no pixel has; at least one."""
+    """Layers ``[B, H, W, K]``, nearest first, without the last ones if they are empty at all
+    pixels; at least one stays.
+    """
     if not can_read():
         return face_index
     used = int((face_index >= 0).flatten(0, 2).any(0).sum())

@@ -351,13 +351,15 @@ class Fragments:
 
 
 def _turn(vectors: Tensor, matrices: Tensor) -> Tensor:
-    """Matrices times vectors ``[..., 3]``, also under autocast in the precision of the vectors."""
+    """Matrices times vectors ``[..., 3]``; in full precision, as torch.autocast changes products
+    of matrices alone.
+    """
     return (matrices * vectors.unsqueeze(-2)).sum(-1)
 
 
 def _along_normals(matrices: Tensor) -> Tensor:
-    """What turns normals of points that ``matrices [B, 3, 3]`` move, up to their length; 0 if it
-    is not known.
+    """How normals turn if ``matrices [B, 3, 3]`` move the points: the transposed inverse, times a
+    positive number; 0 if there is no inverse.
     """
     matrices = torch.where(matrices.isfinite(), matrices, 0.0)
     turns = cofactors(matrices)

@@ -170,7 +170,7 @@ class Materials:
         image = fragments._per_face(as_given(plain), "face_material")
         if self.vertex_colors is not None:
             image = image * fragments._interpolate(self.vertex_colors, None, "vertex_colors", "")
-        # images that no pixel shows are left out, unless they need a gradient of 0
+        # images that no pixel shows are not sampled, unless autograd wants their gradient (0)
         parameters = [*images, *(() if self.uv is None else as_tuple(self.uv))]
         constant = can_read() and not any(x.requires_grad for x in parameters)
         drawn = number.unique().tolist() if constant else range(len(images))

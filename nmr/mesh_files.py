@@ -209,8 +209,8 @@ def save_obj(
     ------
     TypeError, ValueError
         For wrong types and shapes, numbers that are not finite, faces of missing vertices, several
-        meshes, another ending; nothing is written. That a texture is not repeated is not stored: a
-        warning.
+        meshes, another ending; nothing is written. A texture whose ``wrap`` is not "repeat" is a
+        warning, as the file cannot store it.
     ImportError
         If there are images and Pillow is missing.
 
@@ -264,7 +264,7 @@ def _material_lines(base: str, corners: Tensor, colors: UVTexture | Materials) -
     if len(rows) != len(corners) or len(numbers) != len(corners):
         raise ValueError(f"colors must be those of {len(corners)} faces, got {len(rows)}")
     pictures = {k: _rows(x, "image", 3, 3) for k, x in enumerate(images) if x is not None}
-    uv = torch.empty(0, 2) if colors.uv is None else _rows(colors.uv, "uv", 2)
+    uv = torch.empty(0, 2, device="cpu") if colors.uv is None else _rows(colors.uv, "uv", 2)
     used = rows[rows.amin(1) >= 0]
     check_indices(used, len(uv), "uv_faces", "row", "uv", "rows")
     if colors.wrap != "repeat" and ((uv[used] < 0) | (uv[used] > 1)).any():

@@ -22,7 +22,8 @@ _MAX_RATIO = 0.1
 
 
 def find_mirror_plane(dataset: ViewDataset) -> float | None:
-    """Azimuth in degrees of a camera that looks along the mirror plane; None if there is none.
+    """Azimuth in degrees of a camera that looks along the mirror plane; None if there is none, or
+    if poses are unknown.
 
     The difference at a plane p is the mean squared difference of the mean masks of the sectors v
     and 2 p - v, less its expected value from noise. A plane is found if the smallest of the 24
@@ -30,8 +31,10 @@ def find_mirror_plane(dataset: ViewDataset) -> float | None:
     four images each; for random azimuths some 150 images suffice. Cameras at n < 24 equally
     spaced azimuths give n candidate planes; at least 6 are needed.
 
-    Raises ValueError if poses are unknown, or not given by azimuth and elevation.
+    Raises ValueError if poses are not given by azimuth and elevation.
     """
+    if dataset.poses is None:
+        return None
     if not isinstance(dataset.poses, LookAtPoses):
         raise ValueError(
             "symmetry 'auto' needs camera poses given by azimuth and elevation; give the plane (x, z, degrees) or None"

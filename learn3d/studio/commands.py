@@ -19,7 +19,7 @@ from learn3d.studio.picture_to_mesh.reconstruction import (
     reconstruct_dataset,
     reconstruct_files,
 )
-from learn3d.studio.poses.comparison import compare
+from learn3d.studio.poses.comparison import check_true_poses, compare
 from learn3d.studio.poses.options import PoseOptions
 from learn3d.studio.poses.sheet import draw_pose_sheet
 from learn3d.studio.poses.views import MIN_CONFIDENCE, CameraOptions, estimate_views, load_views
@@ -80,8 +80,8 @@ class EstimatePoses(Command):
         if self.output.suffix != ".npz":
             raise ValueError(f"--output must end in .npz, got {self.output}")
         datasets = load_views(self.layout, self.data, self.category, self.views_per_object)
-        if self.compare and any(dataset.poses is None for dataset in datasets):
-            raise ValueError("--compare needs true poses, but this data set has none")
+        if self.compare:
+            check_true_poses(datasets)
         views = estimate_views(datasets, self.cameras, self.options)
         table, offset_deg = views.table, 0.0
         doubtful = float((table.confidence < MIN_CONFIDENCE).mean())

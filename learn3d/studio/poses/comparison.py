@@ -1,10 +1,12 @@
 """Compares estimated azimuths with the true ones of a data set."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from learn3d.data.dataset import ViewDataset
 from learn3d.data.poses import wrap_deg
 from learn3d.studio.poses.estimate import NEAR_DEG
 from learn3d.studio.poses.views import EstimatedViews, number_objects
@@ -39,6 +41,12 @@ class Comparison:
         )
 
 
+def check_true_poses(datasets: Sequence[ViewDataset]) -> None:
+    """Raise a ValueError if a data set has no poses to compare with."""
+    if any(dataset.poses is None for dataset in datasets):
+        raise ValueError("--compare needs true poses, but this data set has none")
+
+
 def compare(views: EstimatedViews) -> Comparison:
     """Compare the most probable azimuths with the true ones.
 
@@ -47,8 +55,7 @@ def compare(views: EstimatedViews) -> Comparison:
     which alone decides for objects that look the same from front and back. Raises ValueError if
     the data set has no poses.
     """
-    if any(dataset.poses is None for dataset in views.datasets):
-        raise ValueError("--compare needs true poses, but this data set has none")
+    check_true_poses(views.datasets)
     true = torch.cat([dataset.poses.azimuth_deg for dataset in views.datasets])
     found = torch.from_numpy(views.table.azimuth_deg[:, 0])
     chosen = torch.cat(

@@ -230,6 +230,8 @@ def test_photographs_without_poses_learn_from_an_estimate(
     table = tmp_path / "poses.npz"
     options = ["--steps", "2", "--restarts", "1", "--prototypes", "2"]
     where = ["estimate-poses", chairs.parent, "--category", "chair", "--layout", "photos"]
+    status, out, said = command(*where, "--output", table, *options, "--compare")
+    assert status != 0 and "needs true poses" in said and "mean confidence" not in out
     status, _, said = command(*where, "--output", table, *options)
     assert status == 0, said
     assert "has no poses" not in said
