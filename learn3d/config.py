@@ -147,7 +147,9 @@ def differences(config: TrainConfig, saved: TrainConfig) -> list[str]:
     )
     schedule = f"the schedule {config.lr_schedule}" if config.lr_schedule != "constant" else ""
     updates = "pose_updates" if config.poses is not None and config.pose_updates > 0 else ""
-    varies = schedule or config.settings.varies_over_run or updates
+    # the ramp of a short run is shorter, see `TrainConfig.schedule`
+    ramp = "warmup_steps" if config.schedule.warmup_steps != saved.schedule.warmup_steps else ""
+    varies = schedule or config.settings.varies_over_run or updates or ramp
     # a preset only sets defaults
     allowed = (_MAY_DIFFER_NAMES | {"preset"}) - ({"iterations"} if varies else set())
     return [

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from typing_extensions import Self  # in typing from Python 3.11 on
 
 from learn3d.distributed import world_size
 
@@ -66,11 +67,12 @@ class ThreadTuner:
     """Chooses between one thread and all by the duration of the first training steps.
 
     The number is fixed if `threads` or the environment (OMP_NUM_THREADS) sets it, if there is
-    only one core, or if several ranks train together.
+    only one core, or if several ranks train together. As a context it restores the number before.
     """
 
     def __init__(self, threads: int | None) -> None:
-        self.all = threads or torch.get_num_threads()
+        self._before = torch.get_num_threads()
+        self.all = threads or self._before
         self.fixed = (
             threads is not None
             or "OMP_NUM_THREADS" in os.environ
@@ -80,6 +82,12 @@ class ThreadTuner:
         self._trying = not self.fixed
         self._seconds: list[float] = []  # durations of a trial with all threads, then one with 1
         self._use(self.all)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._use(self._before)
 
     def resume(self, chosen: int | None) -> None:
         """Use the number that the run had chosen before it was interrupted, if this machine has

@@ -65,8 +65,14 @@ def _sentence(error: Any, cls: type) -> str:
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list of names."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    """The different names of a comma-separated list; () for an empty text.
+
+    Raises ValueError if a text has commas alone.
+    """
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if text and not names:
+        raise ValueError(f"a category must be a name, or names joined by commas, got {text!r}")
+    return names
 
 
 def _path(value: Any) -> Path:

@@ -45,8 +45,7 @@ def train(config: TrainConfig, *, resume: bool = False, overwrite: bool = False)
     )
     check_log(config)
     keep_freed_memory()
-    threads = ThreadTuner(config.threads)
-    with run_folder.lock_folder(folder):
+    with ThreadTuner(config.threads) as threads, run_folder.lock_folder(folder):
         if not resume:
             run_folder.check_can_start(folder, overwrite)
         run, train_set, val_set = create_run(config)

@@ -14,7 +14,14 @@ from learn3d.distributed import join_ranks, rank
 from learn3d.files.writing import check_target, write_json
 from learn3d.presets import DEFAULT_PRESET, PRESETS, SHORT_NAMES, full_name, load_config
 from learn3d.runs.baselines import baselines_of_runs
-from learn3d.runs.measurement import MEASURES, class_means, evaluate_runs, format_table
+from learn3d.runs.measurement import (
+    MEASURES,
+    Baseline,
+    Result,
+    class_means,
+    evaluate_runs,
+    format_table,
+)
 from learn3d.terminal import INTERRUPTED, align, say
 from learn3d.training import train
 
@@ -111,15 +118,26 @@ class Evaluate(OnDataset):
 
     @classmethod
     def about(cls) -> str:
-        columns = "Columns of the table (means over the images, then over the categories; - if there is no value):"
+        columns = (
+            "Columns of the table (means over the images; the last row of a method is the mean over seeds, then over\n"
+            "categories, and is left out if two of its runs have the same category and seed; - if there is no value):"
+        )
         measures = align([("", *measure) for measure in MEASURES.values()])
         return f"{super().about()}\n\n{columns}\n{measures}"
 
     def run(self) -> None:
         if self.json is not None:
             check_target(self.json, "--json")
-        results = evaluate_runs(self.runs, **self.pick("layout", "device"))
         baselines = baselines_of_runs(self.runs, **self.pick("layout")) if self.baselines else []
+        results: list[Result] = []
+        try:
+            for result in evaluate_runs(self.runs, **self.pick("layout", "device")):
+                results.append(result)
+        finally:  # what is measured is not lost if a later category cannot be read
+            if results:
+                self._report(results, baselines)
+
+    def _report(self, results: Sequence[Result], baselines: Sequence[Baseline]) -> None:
         say(format_table(results, baselines))
         if self.json is not None:
             protocol = {"split": self.split, "checkpoint": self.which}

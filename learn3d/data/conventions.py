@@ -93,6 +93,8 @@ class LayoutProperties:
     angles: bool = True  # True if poses have azimuth and elevation, as cells of view classes need
     # True if images are boxes of photographs with background, stretched to squares
     stretched: bool = False
+    # views of each object that training uses by the published protocol, the first ones; None: all
+    training_views: int | None = None
     options: tuple[str, ...] = ()  # those of image_size and views_per_object that the reader takes
 
     def about(self, category: str, split: str) -> dict[str, Any]:
@@ -118,6 +120,7 @@ LAYOUTS = {
         voxels=True,
         convention=KAR,
         inverted=False,
+        training_views=1,
         options=("image_size", "views_per_object"),
     ),
     "pascal3d": LayoutProperties(

@@ -300,13 +300,14 @@ class ViewDataset:
         parts = {"view_names": tuple(bins.names()), "candidates": candidates}
         return dataclasses.replace(self, view_ids=bins.ids(self.poses).numpy(), **parts)
 
-    def with_few_views(self, count: int) -> ViewDataset:
-        """`count` random views of each object, or all; the same ones in every run.
+    def with_few_views(self, count: int, first: bool = False) -> ViewDataset:
+        """`count` random views of each object, the same ones in every run, or its first ones; all
+        views of objects that have no more.
 
         Raises ValueError if no object has `count` views.
         """
-        order = np.random.default_rng(0).permutation(len(self))
-        # sorted by object, shuffled within it
+        order = np.arange(len(self)) if first else np.random.default_rng(0).permutation(len(self))
+        # sorted by object, in this order within it
         order = order[np.argsort(self.object_ids[order], kind="stable")]
         _, starts, sizes = np.unique(self.object_ids[order], return_index=True, return_counts=True)
         if not 1 <= count <= sizes.max(initial=0):
@@ -368,9 +369,10 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
     """
     first = datasets[0]
     for other in datasets[1:]:
-        if other.view_names != first.view_names or other.images.shape[1:] != first.images.shape[1:]:
+        if other.view_names != first.view_names:
             raise ValueError(
-                f"{other.category} and {first.category} differ in view classes or image size"
+                f"{other.category} and {first.category} differ in view classes; give --view-bins (such as "
+                "15x20) if cameras look at the object, else train a model of each category"
             )
     joined = {}
     for name in (*_OF_VIEWS, "view_ids", "voxels", "points"):
@@ -379,6 +381,9 @@ def join_datasets(datasets: Sequence[ViewDataset]) -> ViewDataset:
             raise ValueError(
                 f"{name} of different kinds cannot be joined: convert all categories to shards, or none"
             )
+        if len({getattr(part, "shape", ())[1:] for part in parts}) > 1:
+            sizes = " and ".join(str(list(part.shape[1:])) for part in parts)
+            raise ValueError(f"{name} of different sizes cannot be joined: {sizes}")
         joined[name] = (
             None if parts[0] is None else getattr(parts[0], "join", np.concatenate)(parts)
         )

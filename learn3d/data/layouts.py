@@ -93,7 +93,7 @@ def load_dataset(
     view_bins: cells of azimuth and elevation as view classes, see `AngleBins.parse`; None: the
     layout's own classes.
     views_per_object: number of views of each object (kar: the first ones; else random, the same
-    ones in every run); None: as in the layout's published protocol.
+    ones in every run); None: as in the layout's published protocol (`training_views`, else all).
     poses: file of a `PoseTable`, which replaces the poses of the data set.
 
     Raises ValueError for an unknown layout, an unsupported option or a damaged file,
@@ -106,7 +106,10 @@ def load_dataset(
         raise ValueError(
             f"category must be one name, or different names joined by commas, got {category!r}"
         )
-    options = {"image_size": image_size, "views_per_object": views_per_object}
+    protocol = LAYOUTS[layout].training_views
+    views = views_per_object or (protocol if split == "train" else None)
+    options = {"image_size": image_size, "views_per_object": views}
+    bins = None if view_bins is None else AngleBins.parse(view_bins)
     check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"
     odd: list[OddFile] = []
 
@@ -115,9 +118,7 @@ def load_dataset(
         odd.append(found)
 
     try:
-        dataset = concatenate(
-            [_read_split(layout, folder, name, split, on_fault, **options) for name in names]
-        )
+        parts = [_read_split(layout, folder, name, split, on_fault, **options) for name in names]
     except FAULTS as error:
         _check_layout(folder, layout)
         message = f"{error.message}. To list all faults of the data set, run: {check}"
@@ -125,13 +126,17 @@ def load_dataset(
     if odd:
         others = f" ({len(odd) - 1} more: {check})" if len(odd) > 1 else ""
         note(f"note: {odd[0]}{others}")
-    if views_per_object is not None:
-        dataset = dataset.with_few_views(views_per_object)
+    if bins is not None and poses is None:
+        parts = [part.with_bins(bins) for part in parts]
+    dataset = concatenate(parts)
+    if views is not None:
+        dataset = dataset.with_few_views(views, first=protocol is not None)
     if poses is not None:
         from learn3d.data.pose_table import PoseTable  # here, as few runs need its reader
 
         dataset = PoseTable.read(poses).apply(dataset, str(poses))
-    return dataset if view_bins is None else dataset.with_bins(AngleBins.parse(view_bins))
+        dataset = dataset if bins is None else dataset.with_bins(bins)
+    return dataset
 
 
 def _read_split(

@@ -47,7 +47,11 @@ def batches(
             if dataset.candidates is not None:  # their weights may have changed in the last step
                 poses, view_ids = dataset.candidates.draw(indices, options.seed, step)
                 batch = dataclasses.replace(batch, poses=poses[rows], view_ids=view_ids[rows])
-            whole = {"count": len(indices), "rows": rows}
+            whole = {
+                "count": len(indices),
+                "views": VIEWS_OF_OBJECT[options.sampling],
+                "rows": rows,
+            }
             yield augment(
                 batch, options.augment, options.seed, step, inverted=dataset.inverted, **whole
             )
@@ -124,13 +128,14 @@ def augment(
     *,
     inverted: bool,
     count: int | None = None,
+    views: int = 1,
     rows: Tensor | slice = ALL_ROWS,
 ) -> Batch:
     """The batch with the named augmentations, in this order, each drawn independently for every
     sample.
 
     "flip": image, mask, depth and pose (if known) mirrored left-right with probability 1/2 (Kato
-    and Harada 2019).
+    and Harada 2019); all `views` of an object in the batch (`VIEWS_OF_OBJECT`), or none.
     "flip-image": only the colours mirrored (published code of both papers on Pascal3D+, whose
     meshes are symmetric).
     "channels": a random permutation of the three colour channels.
@@ -168,7 +173,9 @@ def augment(
                 darkness = (darkness * gain).round_().clamp_(max=255).to(torch.uint8)
                 colors = darkness if inverted else 255 - darkness
         else:
-            mirrored = torch.from_numpy((rng.random(count) < 0.5)[rows])
+            together = views if name == "flip" else 1
+            coins = np.tile(rng.random(count // together) < 0.5, together)
+            mirrored = torch.from_numpy(coins[rows])
             colors = _flip(colors, mirrored)
             if name == "flip":
                 images = _flip(images, mirrored)

@@ -1,6 +1,6 @@
 """Measures trained networks on a split, for `learn3d evaluate` and for experiments."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -167,9 +167,9 @@ def evaluate_runs(
     which: Literal["last", "best"] = "last",
     layout: Layout | None = None,
     device: str = "cpu",
-) -> list[Result]:
+) -> Iterator[Result]:
     """Measure run folders (their checkpoint `which`) or checkpoint files, on each of their
-    categories by itself.
+    categories by itself. Yields each result when it is known.
 
     `data` and `category` default to those of the training. A model that learnt from estimated
     poses is measured with them only on its own data (`data` is None). Raises ValueError or
@@ -180,7 +180,6 @@ def evaluate_runs(
     files = dict.fromkeys(checkpoint.find(path, which) for path in paths)
     for file in files:
         require_folder(data or checkpoint.load_metadata(file).config.data)
-    results = []
     for file in files:
         method, config, metadata = checkpoint.load_method(file, device=device)
         label = config.label
@@ -195,26 +194,23 @@ def evaluate_runs(
                 )
             if means["mmd"] is None:
                 note(f"warning: {NO_MMD}")
-            results.append(
-                Result(
-                    checkpoint=str(file),
-                    method=label,
-                    preset=config.preset,
-                    category=name,
-                    data=str((data or config.data).resolve()),
-                    command=command_line(config),
-                    iterations=config.iterations,
-                    step=metadata.progress.step,
-                    seed=config.seed,
-                    seconds=metadata.progress.seconds,
-                    versions=metadata.versions,
-                    images=len(evaluation.view_ids),
-                    objects=[] if dataset.voxels is None else _means_by_object(evaluation, dataset),
-                    angles=[AngleMean(*pair) for pair in evaluation.angle_ious.items()],
-                    **means,
-                )
+            yield Result(
+                checkpoint=str(file),
+                method=label,
+                preset=config.preset,
+                category=name,
+                data=str((data or config.data).resolve()),
+                command=command_line(config),
+                iterations=config.iterations,
+                step=metadata.progress.step,
+                seed=config.seed,
+                seconds=metadata.progress.seconds,
+                versions=metadata.versions,
+                images=len(evaluation.view_ids),
+                objects=[] if dataset.voxels is None else _means_by_object(evaluation, dataset),
+                angles=[AngleMean(*pair) for pair in evaluation.angle_ious.items()],
+                **means,
             )
-    return results
 
 
 def read_curve(folder: Path) -> list[CurvePoint]:
@@ -260,7 +256,10 @@ def format_measures(values: dict[str, Any]) -> list[str]:
 
 
 def class_means(results: Iterable[Result]) -> list[dict[str, Any]]:
-    """Each method's measures, as means over seeds, then over categories."""
+    """Each method's measures, as means over seeds, then over categories.
+
+    Methods with two runs of one category and seed are left out: other settings are no seeds.
+    """
     by_method: dict[tuple[str, str], dict[str, list[Result]]] = {}
     for r in results:
         by_method.setdefault((r.method, r.preset), {}).setdefault(r.category, []).append(r)
@@ -271,6 +270,7 @@ def class_means(results: Iterable[Result]) -> list[dict[str, Any]]:
             for name in MEASURES
         }
         for (method, preset), classes in by_method.items()
+        if all(len({r.seed for r in same}) == len(same) for same in classes.values())
     ]
 
 

@@ -120,6 +120,15 @@ def test_the_length_of_a_run_whose_poses_are_weighted_anew_is_kept(tiny_config, 
         assert differences(dataclasses.replace(config, iterations=7), config) == found
 
 
+def test_the_length_of_a_run_with_a_short_ramp_is_kept(tiny_config, tmp_path):
+    config = tiny_config(tmp_path, iterations=60, warmup_steps=10)
+    for longer, found in (
+        (70, ["iterations: 60 in the run, 70 asked for (warmup_steps depends on it)"]),
+        (65, []),
+    ):
+        assert differences(dataclasses.replace(config, iterations=longer), config) == found
+
+
 def test_files_that_are_no_json_or_too_large(tmp_path, monkeypatch):
     path = tmp_path / "config.json"
     with pytest.raises(

@@ -335,7 +335,7 @@ def test_a_run_on_several_categories_is_measured_on_each(
         "learn3d.runs.checkpoint.load_dataset",
         lambda *where, **options: dataclasses.replace(few, category=where[2]),
     )
-    results = evaluate_runs([finished_run], category="airplane, chair")
+    results = list(evaluate_runs([finished_run], category="airplane, chair"))
     assert [result.category for result in results] == ["airplane", "chair"]
     assert class_means(results)[0]["classes"] == 2
 
@@ -345,18 +345,22 @@ def test_another_layout_must_store_colours_alike(finished_run, tiny_folder) -> N
     (same,) = evaluate_runs([finished_run], data=tiny_folder)
     assert alike.voxel_iou == same.voxel_iou
     with pytest.raises(ValueError, match="colours as the layout kato has them, not kar"):
-        evaluate_runs([finished_run], layout="kar", data=tiny_folder)
+        next(evaluate_runs([finished_run], layout="kar", data=tiny_folder))
     with pytest.raises(ValueError, match="layout must be one of"):
-        evaluate_runs([finished_run], layout="karo", data=tiny_folder)
+        next(evaluate_runs([finished_run], layout="karo", data=tiny_folder))
 
 
 def test_mean_is_over_classes_not_over_runs() -> None:
-    figures = (("airplane", 0.6), ("airplane", 0.4), ("chair", 0.1))
-    results = [stub_work.result(category=c, voxel_iou=v, mmd_paper=None) for c, v in figures]
+    figures = (("airplane", 0, 0.6), ("airplane", 1, 0.4), ("chair", 0, 0.1))
+    results = [
+        stub_work.result(category=c, seed=s, voxel_iou=v, mmd_paper=None) for c, s, v in figures
+    ]
     (mean,) = class_means(results)
     assert mean["classes"] == 2
     assert mean["voxel_iou"] == pytest.approx(0.3)
     assert mean["mmd_paper"] is None
+    other = [stub_work.result(category="chair", seed=0, iterations=99)]
+    assert class_means(results + other) == [], "runs of other settings are no seeds"
 
 
 PUBLISHED_IOUS = {KATO: "iou_CVPR18", KAR: "iou_NIPS17", PASCAL3D: "iou_Pascal3D"}

@@ -23,7 +23,7 @@ def test_train_resume_and_evaluate(precision: str, tiny_config, run_folder, read
     tensors, _ = checkpoint.load(run_folder / "last.safetensors")
     assert "random.cuda" in tensors
     on_gpu, on_cpu = (
-        evaluate_runs([run_folder], split="test", device=device)[0].voxel_iou
+        next(evaluate_runs([run_folder], split="test", device=device)).voxel_iou
         for device in ("cuda", "cpu")
     )
     assert on_gpu == pytest.approx(on_cpu, abs=0.02)

@@ -15,8 +15,8 @@ Deviations from the published code of Peng et al. 2020 are marked (*):
 - Colours are not inverted, over white; their order is R, G, B, not OpenCV's (*).
 - Colours and mask are reduced from 224 to 64 pixels by the mean over each pixel's area, so the mask has soft borders.
   skimage.transform.resize(anti_aliasing=True) of the published code is a little softer (*).
-- Training uses render 0 of each object alone (single view). Validation and test use as many renders as view.txt of the
-  first object has rows, 20 at most. `views_per_object` changes both.
+- Training uses render 0 of each object alone (single view: `training_views` of the layout). Validation and test use as
+  many renders as view.txt of the first object has rows, 20 at most. `views_per_object` changes both.
 - Three objects with broken renders are skipped, as by Kato and Harada 2019 (*).
 """
 
@@ -69,7 +69,7 @@ def load(
     """Read a split. View classes are cells of azimuth and elevation, see `VIEW_BINS`.
 
     image_size: side of the images in pixels, up to 224; masks always have 64. views_per_object:
-    use at most the first so many renders of each object; None: 1 for training, else all.
+    use at most the first so many renders of each object; None: all.
     """
     folder = Path(folder)
     synset = synset_of(category)
@@ -81,7 +81,7 @@ def load(
     lists = {s: [name for name in lists[synset].get(s, []) if name not in BROKEN] for s in SPLITS}
     ids = check_lists(path, lists, split, on_fault)
     root = folder / "renders" / synset
-    views = views_per_object or (1 if split == "train" else NUM_RENDERS)
+    views = views_per_object or NUM_RENDERS
     if views > 1:
         rows = attempt(on_fault, _count_rows, root / ids[0] / "view.txt")
         views = min(views, rows or NUM_RENDERS)

@@ -41,8 +41,6 @@ def estimate_poses(config: TrainConfig) -> None:
     """
     if config.poses.is_file():
         return
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
     datasets = load_views(config.layout, config.data, config.category, config.views_per_object)
     views = estimate_views(datasets, CameraOptions(), PoseOptions(seed=config.seed))
     comparison = compare(views)
@@ -75,6 +73,8 @@ def train_and_test(run: PlannedRun) -> bool:
     `train` and `evaluate_runs` do.
     """
     config = run.config
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
     if config.poses is not None:
         estimate_poses(config)
     resume = run_folder.is_run(config.output)

@@ -288,6 +288,17 @@ def test_evaluate_prints_a_table_and_writes_json(
     assert command(*words)[:2] == (1, out), "the table is not lost"
 
 
+def test_what_is_measured_is_not_lost_if_a_later_category_fails(
+    finished_run, tmp_path, command
+) -> None:
+    words = ("evaluate", finished_run, "--json", tmp_path / "t.json", "--category")
+    status, out, err = command(*words, "airplane,rocket")
+    assert (status, "airplane" in out, "rocket" in err) == (1, True, True)
+    assert len(json.loads((tmp_path / "t.json").read_text())["results"]) == 1
+    status, out, err = command(*words, ",")
+    assert (status, out) == (1, "") and "a category must be a name" in err
+
+
 def test_the_fit_of_pictures_is_measured(tmp_path, capsys) -> None:
     (tmp_path / "airplane").mkdir()
     numbered_shape("airplane", 1, 0).export(tmp_path / "airplane" / "plane.ply")

@@ -117,6 +117,12 @@ def test_several_categories_become_one_set_with_classes() -> None:
     assert concatenate([cups]) is cups
     with pytest.raises(ValueError, match="jar and cup differ in view classes"):
         concatenate([cups, dataclasses.replace(jars, view_names=("a", "b"))])
+    clouds = [
+        dataclasses.replace(d, points=np.zeros((d.num_objects, count, 3), np.float32))
+        for d, count in ((cups, 5), (jars, 7))
+    ]
+    with pytest.raises(ValueError, match=r"points of different sizes .* \[5, 3\] and \[7, 3\]"):
+        concatenate(clouds)
     turned = dataclasses.replace(jars, poses=RotationPoses(torch.eye(3).expand(6, 3, 3)))
     with pytest.raises(ValueError, match="poses of different kinds"):
         concatenate([cups, turned])
@@ -296,6 +302,16 @@ def test_colours_are_permuted_scaled_or_left_out(tiny_set) -> None:
         dataclasses.replace(batch, images=natural), ("colors",), 0, 1, inverted=False
     ).images
     assert torch.equal(255 - images[:, :3], changed.images[:, :3])
+
+
+def test_all_views_of_an_object_are_flipped_or_none(tiny_set) -> None:
+    options = SimpleNamespace(
+        sampling="pairs", batch_size=40, augment=("flip",), seed=0, iterations=1
+    )
+    (batch,) = batches(tiny_set, options)
+    before = tiny_set.batch(sample_indices(tiny_set, "pairs", 40, 0, 1))
+    flipped = (batch.images != before.images).flatten(1).any(1)
+    assert torch.equal(flipped[:20], flipped[20:]) and 0 < flipped.sum() < 40
 
 
 def test_batches_are_sampled_and_augmented_from_any_step_on(tiny_set) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import re
 import runpy
 import shutil
@@ -241,6 +242,17 @@ def test_photographs_without_poses_learn_from_an_estimate(
     for path in (chairs / "images").iterdir():
         path.unlink()
     refused(chairs, "images: is empty; expected photographs")
+
+
+def test_categories_with_poses_of_their_own_are_joined_by_common_classes(chairs: Path) -> None:
+    other = Path(shutil.copytree(chairs, chairs.parent / "stool"))
+    change_rows(other, lambda row: row | {"azimuth_deg": "10", "elevation_deg": "10"})
+    load = functools.partial(load_dataset, "photos", chairs.parent, "chair,stool", "train")
+    with pytest.raises(
+        ValueError, match="stool and chair differ in view classes; give --view-bins"
+    ):
+        load()
+    assert load(view_bins="90x90:-90:90").num_views == 8
 
 
 def test_other_files_than_tables_are_named(chairs: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_run_is_measured_with_its_poses_on_its_own_data(
 
     monkeypatch.setattr(measurement, "evaluate", look)
     for data in (None, tiny_folder):
-        measurement.evaluate_runs([run_folder], data=data, category="airplane", split="val")
+        next(measurement.evaluate_runs([run_folder], data=data, category="airplane", split="val"))
     assert measured == [True, False]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 from pathlib import Path
@@ -13,7 +14,8 @@ import torch
 from reader_checks import cut_short, expect, problems, silhouette_iou
 from shapenet_files import CHAIR, COLOR, box_mesh, save, shapes, swap_frames, write_dvr, write_kar
 
-from learn3d.data.conventions import KAR, KATO, PASCAL3D, view_poses
+from learn3d.data import shards
+from learn3d.data.conventions import KAR, KATO, PASCAL3D, shards_folder, view_poses
 from learn3d.data.layouts import load_dataset, reader
 from learn3d.data.readers import dvr, kar
 from learn3d.data.readers.kar import check_poses
@@ -100,7 +102,7 @@ def test_any_world_of_cameras_and_points_is_brought_into_the_object_frame(
 
 def test_kar_has_the_protocol_of_the_published_code(copy) -> None:
     folder = copy("kar")
-    train = kar.load(folder, "chair", "train")
+    train = load_dataset("kar", folder, "chair", "train")
     with pytest.raises(ValueError, match=r"views_per_object must lie in 1 \.\. 20, got 21"):
         load_dataset("kar", folder, "chair", "train", views_per_object=21)
     everything = kar.load(folder, "chair", "train", views_per_object=20)
@@ -114,6 +116,15 @@ def test_kar_has_the_protocol_of_the_published_code(copy) -> None:
     lists[CHAIR]["test"] = [*sorted(kar.BROKEN), "a0"]
     (folder / "splits.json").write_text(json.dumps(lists))
     assert len(kar.BROKEN) == 3 and kar.load(folder, "chair", "test").object_names == ("a0",)
+
+
+def test_kar_in_shards_with_all_views_has_the_same_protocol(copy) -> None:
+    folder = copy("kar")
+    load = functools.partial(load_dataset, "kar", folder, "chair", "train")
+    alone, three = load(), load(views_per_object=3)
+    shards.write_set(shards_folder(folder, "chair", "train"), "kar", load(views_per_object=20))
+    for wanted, found in ((alone, load()), (three, load(views_per_object=3))):
+        np.testing.assert_array_equal(found.images[np.arange(len(wanted))], wanted.images)
 
 
 def test_objects_may_have_fewer_renders(copy) -> None:

@@ -99,7 +99,7 @@ def test_names_are_text(page, tmp_path, runs, tiny_set, monkeypatch) -> None:
 
 
 def test_figures_are_those_of_evaluate(page, runs) -> None:
-    wanted, found = evaluate_runs(runs, split="train"), Page(page)
+    wanted, found = list(evaluate_runs(runs, split="train")), Page(page)
     rows = re.findall(
         r"<b>(.+)</b> \[(.+), (.+)\]</td>\n<td>[^<]*</td><td>([^<]+)</td>", page.read_text()
     )
