@@ -149,6 +149,9 @@ def test_without_voxels_silhouettes_at_other_cameras_are_compared(tiny_set) -> N
     facing = photographs.select(np.flatnonzero(np.isin(photographs.view_ids, (0, 6))))
     own, other = (evaluate(flat, facing).values["silhouette_iou"][k::2].mean() for k in (1, 0))
     assert own > 0.9 > 0.6 > other, "each image is judged by the other view"
+    around = photographs.select(np.flatnonzero(photographs.view_ids % 6 == 0))
+    own, other = (evaluate(flat, around).values["silhouette_iou"][k::2] for k in (1, 0))
+    assert own.min() > 0.9 > 0.6 > other.max(), "of four views by that a quarter turn further on"
     single = photographs.select(np.flatnonzero(photographs.view_ids == 0))
     assert evaluate(flat, single).means["silhouette_iou"] > 0.9, "or by itself if there is no other"
     nothing = evaluate(Constant(Grids(torch.zeros(1, 64, 64, 64))), photographs)

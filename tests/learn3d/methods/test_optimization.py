@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import math
 from pathlib import Path
 from typing import get_args
@@ -15,6 +16,7 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
 from learn3d import training
+from learn3d.evaluation import evaluate
 from learn3d.methods import _METHODS
 from learn3d.methods.method import Method
 from learn3d.methods.optimization import EMA, LRSchedule, TrainingSchedule, adam
@@ -161,6 +163,7 @@ def test_steps_follow_the_schedule_and_ignore_the_average(tiny_names, tiny_set) 
             rates = [o.param_groups[0]["lr"] for o in method.optimizers.values()]
             assert rates == [1e-3 * (1 - (step - 1) / 4)] * 3
             with method.in_use():
+                assert not method.networks.training
                 method.encode(tiny_set.batch(torch.arange(2)).images)
         ends.append(method.networks.state_dict())
     same_tensors(*ends)
@@ -195,14 +198,18 @@ def test_a_run_with_schedule_and_average_resumes_bit_for_bit(
 def test_what_a_run_is_evaluated_with_is_the_average(
     tiny_names, tiny_config, tmp_path: Path
 ) -> None:
-    train(tiny_config(tmp_path, **TINY, ema_decay=0.8, validate_every=4))
+    train(tiny_config(tmp_path, **TINY, ema_decay=0.8, validate_every=4, learning_rate=1e-2))
     last, best = (checkpoint.load(tmp_path / f"{file}.safetensors")[0] for file in ("last", "best"))
     averages, own, selected = (
         {key.removeprefix(kind): t for key, t in tensors.items() if key.startswith(kind)}
         for tensors, kind in ((last, "ema."), (last, "network."), (best, "network."))
     )
-    loaded = checkpoint.load_method(tmp_path / "last.safetensors")[0]
+    loaded, config, _ = checkpoint.load_method(tmp_path / "last.safetensors")
     same_tensors(loaded.networks.state_dict(), averages)
+    measured = evaluate(loaded, checkpoint.load_data(config, "val"), max_images=4).means
+    records = map(json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines())
+    (validation,) = (record for record in records if record["split"] == "val")
+    assert validation == {"step": 4, "split": "val"} | measured, "during the training, too"
     same_tensors(selected, averages)
     assert not any(name.startswith("ema.") for name in best)
     assert any(not torch.equal(own[name], value) for name, value in averages.items())

@@ -118,6 +118,8 @@ def test_depth_losses_count_pixels_where_both_show_a_surface() -> None:
     assert slope.item() == pytest.approx(0.4), "only the first row has a surface at both ends"
     (loss + slope).backward()
     assert depth.grad.tolist() == [[[-1.25, 0.0, 1.25], [0.0, 0.25, 0.25]]]
+    slope = depth_losses(torch.tensor([[[2.0, 2.0, 3.0, 2.0]]]), torch.full((1, 1, 4), 2.0))[1]
+    assert slope.item() == pytest.approx(0.5), "the mean over two pairs in the row"
 
 
 def test_losses_are_those_written_out(dataset: ViewDataset) -> None:
