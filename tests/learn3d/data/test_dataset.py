@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -114,6 +115,9 @@ def test_several_categories_become_one_set_with_classes() -> None:
     near = dataclasses.replace(jars, poses=dataclasses.replace(jars.poses, distance=2.0))
     distances = concatenate([cups, near]).poses.distance
     assert torch.equal(distances, torch.cat([cups.poses.distance, torch.full((6,), 2.0)]))
+    far = dataclasses.replace(near, poses=dataclasses.replace(near.poses, distance=3.0))
+    assert concatenate([near, near]).poses.distance == 2.0
+    assert concatenate([near, far]).poses.distance.tolist() == [2.0] * 6 + [3.0] * 6
     assert concatenate([cups]) is cups
     with pytest.raises(ValueError, match="jar and cup differ in view classes"):
         concatenate([cups, dataclasses.replace(jars, view_names=("a", "b"))])
@@ -155,13 +159,16 @@ def test_pairs_are_two_views_of_one_object() -> None:
 )
 def test_the_papers_seven_settings(w: int, h: int, count: int) -> None:
     bins = AngleBins.parse(f"{w}x{h}")
-    assert len(bins.names()) == count
+    names = bins.names()
+    assert len(names) == count
     rng = np.random.default_rng(0)
     azimuth, elevation = rng.uniform(-180, 180, 5000), rng.uniform(-20, 40, 5000)
     ids = bins.ids(LookAtPoses(azimuth, elevation, 2.0, 15.0))
     wanted = (azimuth + 180) // w * (60 / h) + (elevation + 20) // h
     assert (ids.numpy() == wanted).mean() > 0.998  # float32 angles on the edge of a cell
     assert len(ids.unique()) == count
+    middle = [float(word) for word in re.findall(r"-?[\d.]+", names[ids[0]])]
+    assert abs(azimuth[0] - middle[0]) <= w / 2 and abs(elevation[0] - middle[1]) <= h / 2
 
 
 def test_ends_of_the_range_belong_to_cells() -> None:
