@@ -11,7 +11,7 @@ from PIL import Image
 from shapenet_files import box_mesh
 
 import nmr
-from learn3d.data.framing import frame, read_photo
+from learn3d.data.framing import frame, read_framed, read_photo
 from learn3d.data.masks import mask_box
 
 
@@ -93,6 +93,31 @@ def test_masks_come_from_files_or_transparency(tmp_path: Path) -> None:
         np.testing.assert_array_equal(result[0], colors)
         np.testing.assert_array_equal(result[1], mask)
     assert read_photo(photo, optional=True)[1] is None
+    opaque = [
+        save(tmp_path / name, np.dstack([values, np.full((8, 6), 255, np.uint8)]))
+        for name, values in (("o.png", colors), ("om.png", mask[..., None].repeat(3, 2)))
+    ]
+    assert read_photo(opaque[0], optional=True)[1] is None, "nothing is cut out"
+    np.testing.assert_array_equal(read_photo(*opaque)[1], mask)
+
+
+@pytest.mark.parametrize("shape", [(30, 50), (50, 30)])
+@pytest.mark.parametrize(
+    ("rows", "columns", "touches"),
+    [
+        ((1, -1), (1, -1), False),
+        ((0, -1), (1, -1), True),
+        ((1, None), (1, -1), True),
+        ((1, -1), (0, -1), True),
+        ((1, -1), (1, None), True),
+    ],
+)
+def test_objects_at_the_border_are_noticed(tmp_path: Path, shape, rows, columns, touches) -> None:
+    rgba = np.full((*shape, 4), 100, np.uint8)
+    rgba[..., 3] = 0
+    rgba[slice(*rows), slice(*columns), 3] = 255
+    framed = read_framed(save(tmp_path / "a.png", rgba), None, 64)
+    assert framed.touches_border == touches
 
 
 def test_photos_are_turned_upright(tmp_path: Path) -> None:

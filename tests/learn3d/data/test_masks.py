@@ -67,6 +67,14 @@ def test_the_object_is_the_largest_region_and_its_parts(
     assert told == said
 
 
+def test_a_slanted_line_of_single_pixels_is_one_part() -> None:
+    mask = disc()
+    steps = np.arange(100)
+    mask[150 + steps, 170 + steps] = 255
+    found, told = keep_object(mask)
+    assert np.array_equal(found, mask) and told is None
+
+
 @pytest.mark.parametrize("kind", ["checkerboard", "dots", "noise", "full", "empty"])
 def test_masks_full_of_holes_take_no_longer_than_others(kind: str) -> None:
     rows, columns = np.indices((1024, 1024))

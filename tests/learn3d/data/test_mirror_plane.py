@@ -52,6 +52,7 @@ def some_views(whole: ViewDataset, of_each: int) -> np.ndarray:
         (37.5, 12, 24, True),
         (135.0, 12, 24, True),
         (90.0, 480, 1, True),  # no object is seen twice
+        (37.5, 160, 1, True),  # so few that noise must be subtracted
         (37.5, 40, 4, True),
         (None, 40, 4, False),
         (None, 60, 24, False),

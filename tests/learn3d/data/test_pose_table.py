@@ -47,6 +47,10 @@ def test_a_table_is_read_as_written_and_matched_by_image(
     part = table.apply(dataset.select(rows), "poses.npz")
     assert np.array_equal(part.poses.azimuth_deg, table.azimuth_deg[rows, 0])
     assert np.array_equal(part.candidates.weights, table.weights[rows])
+    whole = table.apply(dataset, "poses.npz")
+    assert part.view_names == whole.view_names, "a part has the classes of the whole table"
+    assert np.array_equal(part.view_ids, whole.view_ids[rows])
+    assert np.array_equal(part.candidates.view_ids[::3], part.view_ids), "candidates, too"
     with pytest.raises(
         ValueError, match=r"poses.npz has no pose for 72 of 72 test images .* of object 0000"
     ):
