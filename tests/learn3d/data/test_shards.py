@@ -217,6 +217,11 @@ def test_a_changed_table_is_refused(stored) -> None:
     path = shard_file(stored)
     flip_bit(path, "azimuth_deg")
     expect(stored, path, "another CRC-32")
+    flip_bit(path, "azimuth_deg")
+    content = path.read_bytes()
+    assert content.count(b'[\\"0000\\"]') == 1
+    path.write_bytes(content.replace(b'[\\"0000\\"]', b'[\\"0001\\"]'))
+    expect(stored, path, "another CRC-32")
 
 
 def test_a_shard_that_changed_after_a_kill_is_noticed(stored, tiny_config, tmp_path) -> None:

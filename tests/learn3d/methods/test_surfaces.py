@@ -59,7 +59,13 @@ def test_the_silhouette_comes_closer(tiny_set, steps: tuple[int, int]) -> None:
     with torch.no_grad():
         before = method.decode(method.encode(batch.images)).vertices
         after = refine(method, batch.images, batch.masks, batch.poses, steps_of(*steps))
+        free = dataclasses.replace(steps_of(*steps), smoothness=0.0)
+        rough = refine(method, batch.images, batch.masks, batch.poses, free)
     assert loss(after.vertices) < loss(before) - 0.02
+    smooth, rough = (
+        float(nmr.losses.smoothness_loss(each.vertices, method.edges)) for each in (after, rough)
+    )
+    assert smooth < rough
 
 
 def test_each_image_is_fitted_on_its_own_vertices_and_stays_symmetric(tiny_set) -> None:
