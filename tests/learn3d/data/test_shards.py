@@ -204,6 +204,15 @@ def test_bools_other_than_0_and_1_are_refused(stored) -> None:
         load_dataset("kato", stored, "airplane", "train").batch(torch.tensor([0]))
 
 
+def test_points_that_are_not_finite_are_refused(tiny_set, tmp_path) -> None:
+    points = np.full((tiny_set.num_objects, 2, 3), np.nan, np.float32)
+    folder = shards.shards_folder(tmp_path, "airplane", "test")
+    shards.write_set(folder, "kato", dataclasses.replace(tiny_set, points=points))
+    found = load_dataset("kato", tmp_path, "airplane", "test").points
+    with pytest.raises(DamagedFile, match="it has numbers that are not finite"):
+        found[np.array([0])]
+
+
 def test_a_changed_pixel_is_not_trained_on(stored, tiny_config, tmp_path, command) -> None:
     path = shard_file(stored)
     flip_bit(path, "images")

@@ -7,12 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from steps import INFO, TINY, make_method
 
 import nmr
 from learn3d.config import differences
 from learn3d.data.conventions import KATO
 from learn3d.data.dataset import DatasetInfo
+from learn3d.losses import silhouette_energy_distance
 from learn3d.methods.optimization import TrainingSchedule
 from learn3d.methods.plus import MaskBank, Plus, PlusSettings
 from learn3d.networks.generators import SmoothSphereGenerator, SphereGenerator
@@ -46,14 +48,15 @@ def test_the_mask_bank_keeps_the_newest() -> None:
 @pytest.mark.parametrize(("preset", "inside"), [("plus-kato", True), ("peng2020-kato", False)])
 def test_shapes_end_at_the_box_where_it_is_known(preset: str, inside: bool) -> None:
     codes = 100 * torch.randn(8, 512, generator=torch.Generator().manual_seed(0))
-    free, shapes = (
+    free, shapes, wide = (
         make_method(preset, dataclasses.replace(INFO, cube_side=side), **TINY).decode(codes)
-        for side in (None, 1.0)
+        for side in (None, 1.0, 1.5)
     )
     assert (free.vertices.abs().amax((1, 2)) > 0.5).all()
     wanted = free.vertices.clamp(-0.499, 0.499) if inside else free.vertices
     assert torch.equal(shapes.vertices, wanted)
     assert KATO.exceeds_grid(shapes.vertices, "kato19").any() != inside
+    assert (wide.vertices.abs().max() == 1.5 * 0.499) == inside
 
 
 def test_shapes_are_compared_at_novel_views_beside_the_alternation(batch) -> None:
@@ -101,6 +104,27 @@ def test_the_loss_at_novel_views_moves_vertices_where_the_projection_does_not(ba
     (gradient,) = torch.autograd.grad(loss, vertices)
     assert torch.isfinite(gradient).all()
     assert gradient.abs().sum() > 0
+
+
+def test_silhouettes_at_a_novel_view_are_compared_with_masks_of_its_class(batch) -> None:
+    def small(images: torch.Tensor) -> torch.Tensor:
+        return F.avg_pool2d(images[:, None], 2).flatten(1)
+
+    method, chosen = make(), set()
+    vertices = (method.generator.sphere * torch.tensor([0.5, 0.3, 0.1])).repeat(4, 1, 1)
+    method.novel_view_loss(vertices, batch)
+    for seed in range(8):
+        torch.manual_seed(seed)
+        view = int(torch.randint(4, ()))
+        torch.manual_seed(seed)
+        found = method.novel_view_loss(vertices, batch)["novel_view"][1]
+        drawn = small(method.render(vertices, batch.poses[torch.full((4,), view)]))
+        masks = batch.masks[batch.view_ids == batch.view_ids[view]]
+        torch.testing.assert_close(
+            found, silhouette_energy_distance(drawn, small(masks)), atol=5e-3, rtol=0
+        )
+        chosen.add(int(batch.view_ids[view]))
+    assert chosen == {0, 1}
 
 
 def test_every_second_image_is_flipped_to_a_view_of_its_own_if_shapes_are_symmetric(
