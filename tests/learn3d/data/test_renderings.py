@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.io
 import torch
+from PIL import Image
 from reader_checks import cut_short, expect, problems, silhouette_iou
 from shapenet_files import CHAIR, COLOR, box_mesh, save, shapes, swap_frames, write_dvr, write_kar
 
@@ -19,6 +20,7 @@ from learn3d.data.conventions import KAR, KATO, PASCAL3D, shards_folder, view_po
 from learn3d.data.layouts import load_dataset, reader
 from learn3d.data.readers import dvr, kar
 from learn3d.data.readers.kar import check_poses
+from learn3d.files.images import read_with_depth
 from learn3d.files.reading import DamagedFile
 from nmr.metrics import voxel_iou
 
@@ -135,6 +137,18 @@ def test_objects_may_have_fewer_renders(copy) -> None:
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:12]))
     assert len(kar.load(folder, "chair", "test")) == 12
     assert not problems("kar", folder, "test")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_the_mask_is_where_the_depth_is_below_250_in_8_bits(tmp_path, dtype) -> None:
+    near, far = (249, 250) if dtype == np.uint8 else (249 * 256 + 255, 250 * 256)
+    depth = np.full((64, 64), far, dtype)
+    depth[10:20, 30:40] = near
+    for name, array in (("color", np.zeros((64, 64, 3), np.uint8)), ("depth", depth)):
+        Image.fromarray(array).save(tmp_path / f"{name}.png")
+    image, mask, _ = read_with_depth(tmp_path / "color.png", tmp_path / "depth.png", 64)
+    np.testing.assert_array_equal(mask, np.where(depth == near, 255, 0))
+    np.testing.assert_array_equal(image[3], mask)
 
 
 def test_large_images_keep_their_size_and_masks_have_64_pixels(originals) -> None:

@@ -148,8 +148,11 @@ def test_shards_that_are_missing_or_too_many_are_refused(stored, tiny_folder, co
         load_dataset("kato", stored, "airplane", "train")
     (mine := other.with_name("photograph.png")).write_bytes(b"mine")
     set_file(stored).unlink()  # as an unfinished conversion leaves it
+    for name in (".00001.safetensors.a-1.partial", ".tmpA1b2c3"):
+        mine.with_name(name).touch()
     assert command("convert-dataset", "--data", tiny_folder, "--output", stored)[0] == 0
     assert mine.read_bytes() == b"mine" and not other.exists(), "only shards are removed"
+    assert not list(mine.parent.glob(".*")), "and half-written files"
     assert load_dataset("kato", stored, "airplane", "train").num_objects == 3
 
 
