@@ -66,6 +66,21 @@ def test_shapes_are_compared_at_novel_views_beside_the_alternation(batch) -> Non
     assert {"confusion", "novel_view"} <= set(second)
 
 
+@pytest.mark.parametrize(
+    ("step", "loss", "trained"),
+    [(1, "classification", {"discriminator"}), (2, "confusion", {"encoder"})],
+)
+def test_encoder_and_discriminator_learn_by_turns(batch, step, loss, trained) -> None:
+    method = make()
+    method.losses(batch, step)[loss][1].backward()
+    found = {
+        name
+        for name, network in method.networks.items()
+        if any(parameter.grad is not None for parameter in network.parameters())
+    }
+    assert found == trained
+
+
 def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
     method, without = make(lambda_view=1.0), make()
     assert without.view_probabilities(batch.images) is None

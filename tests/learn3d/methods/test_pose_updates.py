@@ -36,3 +36,19 @@ def test_poses_are_found_again_from_the_models_shapes() -> None:
         and update_steps(2, 3) == (1,)
         and update_steps(9, 0) == ()
     )
+
+
+def test_the_table_counts_and_azimuths_keep_their_frequency() -> None:
+    """Ten equal images with one shape, so only the table tells them apart."""
+    (vertices, faces), dataset = dart_shapes(1), darts(1).select(np.full(10, 2))
+    poses = LookAtPoses(torch.tensor([-30.0, 150.0]).repeat(10), 30.0, 2.732, 15.0)
+    prior = np.float32([[0.9, 0.1]] * 5 + [[0.3, 0.7]] * 5)
+    candidates = PoseCandidates(poses, np.zeros(20, int), prior, prior)
+    dataset = dataclasses.replace(dataset, candidates=candidates)
+    method = SimpleNamespace(
+        in_use=contextlib.nullcontext,
+        encode=torch.Tensor.float,
+        decode=lambda codes: Meshes(vertices.expand(len(codes), -1, -1), faces),
+    )
+    assert update_poses(method, dataset) == 0
+    np.testing.assert_allclose(candidates.weights, prior, atol=1e-3)

@@ -93,6 +93,17 @@ def test_odd_steps_move_shapes_as_without_a_discriminator() -> None:
         torch.testing.assert_close(own.grad, other.grad)
 
 
+def test_odd_steps_tell_the_input_view_from_another() -> None:
+    batch, method, copied = make_batch(), create(SETTINGS), create(SETTINGS)
+    loss = method.losses(batch, 1)["discrimination"][1]
+    vertices, logits = copied.predict(batch.images)[1], []
+    for views in (torch.tensor([0, 1]), torch.tensor([1, 0])):
+        drawn = copied.render(vertices, batch.poses[views])
+        logits.append(copied.discriminator(drawn, batch.view_ids[views]))
+    wanted = F.softplus(-logits[0]).mean() + F.softplus(logits[1]).mean()
+    assert loss.item() == pytest.approx(wanted.item(), rel=1e-5)
+
+
 def test_even_steps_pull_the_other_view_towards_real() -> None:
     """The gradient of an even step is that of projection + smoothness + lambda_D BCE(D(other view), 1)."""
     batch = make_batch()
