@@ -88,6 +88,9 @@ def test_azimuths_are_learnt_beside_the_shapes(batch) -> None:
         take_step(method, batch, step)
     found = method.view_probabilities(batch.images).argmax(1)
     assert torch.equal(found, ((batch.poses.azimuth_deg + 180) % 360 / 15).long())
+    symmetric = make(90.0, lambda_view=1.0)
+    loss = symmetric.losses(batch, 1)["view"][1]
+    assert loss == symmetric.view_loss(batch.images, batch.poses), "of images that are not flipped"
     rotations = DatasetInfo(24, inverted=False, pose_features=9)
     with pytest.raises(ValueError, match="--lambda-view needs azimuths"):
         dataclasses.replace(SMALL, lambda_view=1.0).for_data(rotations)

@@ -163,6 +163,9 @@ def test_the_azimuth_is_learnt_from_the_pose(dataset: ViewDataset) -> None:
         take_step(create(dataset), b, 1)["view"] for b in (batch, unknown, mirrored)
     )
     assert first == same != other
+    symmetric = make_method("many-views-around", dataset.info(90.0), **TINY)
+    loss = symmetric.losses(batch, 1)["view"][1]
+    assert loss == symmetric.view_loss(batch.images[:2], batch.poses[torch.arange(2)])
 
 
 def test_it_learns_the_shapes(dataset: ViewDataset) -> None:
