@@ -224,6 +224,9 @@ def test_spherical_harmonics_are_orthonormal_and_in_their_order():
     assert_close(fitted, 0.25 + z / 2 + 5 / 32 * (3 * z * z - 1), rtol=0, atol=1e-3)
     _, grad = value_and_gradients(light, uniform(9, 3), upstream=torch.ones(count).double())
     assert_close(grad[:, 0], basis.sum(1))
+    part = nmr.render_fragments(vertices * double([0.2, 0.2, 1.0]), faces, image_size=8)
+    lit = nmr.Lights(harmonics=uniform(9, 3)).shade(part)
+    assert torch.equal(lit.any(-1), part.covered) and not part.covered.all(), "0 on background"
 
 
 OPENGL_VIEW = [

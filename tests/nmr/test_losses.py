@@ -154,6 +154,12 @@ def test_closed_forms_on_an_octahedron(scale):
         assert loss.item() == pytest.approx(expected, abs=1e-12)
 
 
+def test_an_edge_alone_and_a_face_without_area():
+    points = double([[0.0, 0.0, 0.0], [1.0, 2.0, 2.0], [5.0, 0.0, 0.0], [2.0, 4.0, 4.0]])
+    assert laplacian_loss(points, torch.tensor([[0, 1]])) == 2 * 9, "two ends, others count 0"
+    assert normal_consistency_loss(points, torch.tensor([[0, 1, 2, 3]])) == 1
+
+
 @pytest.mark.parametrize("loss", ON_EDGES + ON_FACES)
 def test_batches_are_means_over_their_meshes(loss):
     vertices, faces = octahedron()
