@@ -101,6 +101,9 @@ def test_equal_geometries_differ_in_less_than_a_ten_thousandth() -> None:
     meshes = {"a": ball.vertices, "b": other.vertices, "c": rounded, "d": 2 * other.vertices}
     measures = {name: measure(vertices, ball.faces) for name, vertices in meshes.items()}
     assert find_equal(measures) == {"c": "a", "d": "b"}
+    areas = {"a": 1.0, "b": 1 - 1e-6, "c": 1 + 1e-6}
+    alike = {name: np.full(13, area) for name, area in areas.items()}
+    assert find_equal(alike) == {"b": "a", "c": "a"}, "the first of all"
 
 
 def test_links_and_formats_of_a_folder(tmp_path: Path) -> None:

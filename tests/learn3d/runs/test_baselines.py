@@ -64,6 +64,19 @@ def test_baselines_of_a_data_set_are_means_over_images(tiny_folder, finished_run
         assert [o[:2] for o in baseline.objects] == [o[:2] for o in result.objects]
 
 
+def test_objects_count_by_their_images(tiny_folder, monkeypatch) -> None:
+    whole = load_dataset("kato", tiny_folder, "airplane", "train")
+    uneven = whole.select(np.r_[0:4, 24, 48:50])
+    monkeypatch.setattr(
+        baselines, "load_dataset", lambda *where: whole if where[3] == "train" else uneven
+    )
+    found = measure_baselines("kato", tiny_folder, "airplane")
+    assert [one.images for one in found[0].objects] == [4, 1, 2]
+    ious = by_definition(whole.voxels, whole.voxels)
+    wanted = np.average(ious, axis=1, weights=[4, 1, 2])
+    assert [baseline.voxel_iou for baseline in found] == pytest.approx(wanted)
+
+
 def test_evaluate_adds_the_baselines_if_asked(finished_run, monkeypatch, capsys) -> None:
     monkeypatch.setattr("sys.argv", ["learn3d"])
     assert main("evaluate", str(finished_run)) == 0
