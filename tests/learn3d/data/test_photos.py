@@ -160,6 +160,8 @@ def test_the_split_of_an_object_is_a_matter_of_its_name(made: Path) -> None:
     assert split_objects(table, rows[::-1]) == one
     fewer = split_objects(table, rows[10:])
     assert sum(fewer[name] != one[name] for name in fewer) < 10
+    chosen = [name for name, split in one.items() if split == "test"]
+    assert chosen != sorted(one)[:40], "not those whose names come first"
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from learn3d.studio.picture_to_mesh.fit import (
     CENTRED_SIZE,
     Target,
     View,
+    belief,
     find_view,
     fit,
     frame_view,
@@ -37,6 +38,7 @@ from learn3d.studio.picture_to_mesh.options import DEFAULTS
 from learn3d.studio.picture_to_mesh.reconstruction import cut_out_pictures
 from learn3d.studio.picture_to_mesh.smoothing import divide, joined
 from learn3d.studio.picture_to_mesh.write import Reconstruction
+from nmr.losses import laplacian_loss, smoothness_loss
 
 
 def arrow() -> tuple[torch.Tensor, torch.Tensor]:
@@ -103,6 +105,41 @@ def test_probabilities_decide_between_views_with_one_outline() -> None:
         probabilities[int((azimuth + 180) // 15)] = 1.0
         view, _ = find_view(*arrow(), mask, probabilities)
         assert abs(float(view.azimuth_deg) - azimuth) < 25
+
+
+def test_belief_is_interpolated_between_the_centres_of_cells() -> None:
+    probabilities = torch.rand(AZIMUTHS, generator=torch.Generator().manual_seed(0))
+    logs = probabilities.clamp(min=1e-4).log()
+    centres = -172.5 + 15 * torch.arange(AZIMUTHS)
+    torch.testing.assert_close(belief(centres, probabilities, 2.0), 2 * logs)
+    torch.testing.assert_close(
+        belief(centres + 7.5, probabilities, 2.0), logs + logs.roll(-1), msg="also at 180 degrees"
+    )
+    assert belief(centres, None).tolist() == [0] * AZIMUTHS
+
+
+@pytest.mark.parametrize(
+    ("weight", "size"),
+    [
+        ("pull", lambda fitted, start, edges: (fitted - start).square().sum()),
+        ("stiffness", lambda fitted, start, edges: laplacian_loss(fitted - start, edges)),
+        ("smoothness", lambda fitted, start, edges: smoothness_loss(fitted, edges)),
+    ],
+)
+def test_every_weight_of_the_fit_counts(method: MeshMethod, weight: str, size) -> None:
+    vertices, faces = arrow()
+    mask = framed_mask(vertices * torch.tensor([1.4, 1.0, 1.0]), faces, 20.0, 15.0)
+    predicted = predict(method, torch.zeros(4, 64, 64, dtype=torch.uint8), mask)
+    free, held = (
+        fit(
+            method,
+            predicted,
+            mask,
+            options=dataclasses.replace(DEFAULTS.fit, **{weight: factor}),
+        ).vertices
+        for factor in (0.0, 10 * getattr(DEFAULTS.fit, weight))
+    )
+    assert size(held, vertices, method.edges) < 0.9 * size(free, vertices, method.edges)
 
 
 def test_the_shape_comes_closer_to_the_outline_and_stays_symmetric(method: MeshMethod) -> None:

@@ -18,7 +18,9 @@ def test_crossing_parts_become_one_closed_surface_and_thin_ones_stay() -> None:
     ]
     inverted = faces[:, [0, 2, 1]]
     triangles = torch.cat([faces, inverted + len(ball), faces + 2 * len(ball)])
+    twice, _ = outer_surface(2 * torch.cat(parts), triangles)
     vertices, triangles = outer_surface(torch.cat(parts), triangles)
+    torch.testing.assert_close(twice, 2 * vertices)
     mesh = trimesh.Trimesh(vertices.numpy(), triangles.numpy(), process=False)
     assert mesh.is_watertight and mesh.body_count == 1
     lens = torch.pi * 0.3**3 * 5 / 12  # of two balls of radius r at the distance r
