@@ -19,6 +19,7 @@ from learn3d.data.dataset import ViewDataset
 from learn3d.evaluation import (
     ANGLES_DEG,
     NO_MMD,
+    Evaluation,
     evaluate,
     images_by_angle,
     mean_mmd,
@@ -26,7 +27,12 @@ from learn3d.evaluation import (
     spread_samples,
 )
 from learn3d.methods.method import Grids, Meshes
-from learn3d.runs.measurement import class_means, evaluate_runs, format_table
+from learn3d.runs.measurement import (
+    _means_by_object,
+    class_means,
+    evaluate_runs,
+    format_table,
+)
 from nmr.metrics import voxel_iou
 
 
@@ -328,6 +334,13 @@ def test_evaluate_runs_reports_and_tabulates(finished_run, capsys) -> None:
     assert f"warning: {NO_MMD}" in said, "a single object has one image of each view"
     lines = format_table([result]).splitlines()
     assert len(lines) == 3 and f"{result.voxel_iou:.4f}" in lines[1]
+
+
+def test_means_of_objects_are_those_of_images_with_an_iou(tiny_set) -> None:
+    ids, iou = torch.tensor([0, 0, 1]), torch.tensor([torch.nan, 0.5, torch.nan])
+    result = Evaluation(ids, ids, {"voxel_iou": iou, "voxel_iou_kato19": iou}, {})
+    found = _means_by_object(result, tiny_set)
+    assert found == [("0000", 1, 0.5, 0.5), ("0001", 0, None, None)]
 
 
 def test_a_run_on_several_categories_is_measured_on_each(

@@ -47,6 +47,21 @@ def test_every_view_is_drawn_from_an_equal_share_of_v() -> None:
     assert int(method.view_ids(torch.ones(1, SHAPE_CODE + 1))) == VIEWS - 1
 
 
+def test_every_optimizer_has_its_published_numbers() -> None:
+    rates = {"generator": 0.3, "discriminator": 0.2, "encoder": 0.1}
+    method = small_prgan(**{f"{name}_learning_rate": rate for name, rate in rates.items()})
+    found = {
+        name: (optimizer.param_groups[0]["lr"], optimizer.param_groups[0]["betas"][0])
+        for name, optimizer in method.optimizers.items()
+    }
+    assert found == {
+        "generator": (0.3, 0.5),
+        "generator_statistics": (0.3, 0.5),
+        "discriminator": (0.2, 0.5),
+        "encoder": (0.1, 0.9),
+    }
+
+
 @pytest.mark.parametrize(
     ("name", "network", "step"),
     [
