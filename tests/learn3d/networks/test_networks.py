@@ -18,6 +18,7 @@ from learn3d.networks.encoders import (
     CENTRED_SIZE,
     ENCODERS,
     EncoderName,
+    ViewClassifier,
     centre,
     network_input,
 )
@@ -159,11 +160,11 @@ def test_centred_objects_take_the_same_part_of_the_image() -> None:
         assert box(image) == pytest.approx(wanted, abs=1)
     assert (centred[1:] - centred[:1]).abs().mean() < 0.02
     torch.manual_seed(0)
-    encoder = ENCODERS["conv-centred"](inverted=False)
-    with torch.no_grad():
-        wedges = [wedge(30, 3, 30), wedge(60, 2, 2), wedge(60, 2, 2).flip(2)]
-        small, large, other = encoder(torch.cat(wedges))
-    assert (small - large).norm() < 0.2 * (large - other).norm()
+    wedges = torch.cat([wedge(30, 3, 30), wedge(60, 2, 2), wedge(60, 2, 2).flip(2)])
+    for network in (ENCODERS["conv-centred"](inverted=False), ViewClassifier(24, inverted=False)):
+        with torch.no_grad():
+            small, large, other = network(wedges)
+        assert (small - large).norm() < 0.2 * (large - other).norm()
 
 
 def test_the_background_goes_on_beyond_the_border_and_the_mask_does_not() -> None:

@@ -6,7 +6,18 @@ import torch
 import trimesh
 
 import nmr
-from learn3d.studio.picture_to_mesh.smoothing import outer_surface
+from learn3d.studio.picture_to_mesh.smoothing import outer_surface, smooth
+
+
+def test_a_round_shrinks_by_a_half_and_grows_by_a_little_more() -> None:
+    ball, faces = nmr.icosphere(1)
+    vertices = ball + 0.1 * torch.rand(ball.shape, generator=torch.Generator().manual_seed(0))
+    edges, near = nmr.unique_edges(faces), torch.zeros(len(ball), len(ball))
+    near[edges[:, 0], edges[:, 1]] = near[edges[:, 1], edges[:, 0]] = 1
+    wanted = vertices
+    for step in (0.5, -0.53):
+        wanted = wanted + step * (near @ wanted / near.sum(1, keepdim=True) - wanted)
+    torch.testing.assert_close(smooth(vertices, faces, rounds=1), wanted)
 
 
 def test_crossing_parts_become_one_closed_surface_and_thin_ones_stay() -> None:

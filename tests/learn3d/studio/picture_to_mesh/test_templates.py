@@ -35,8 +35,10 @@ from learn3d.studio.picture_to_mesh.templates import (
     MIRROR,
     Candidates,
     bend,
+    bend_best,
     compare_lines,
     learn_templates,
+    likeness,
     spread_out,
     template,
 )
@@ -77,6 +79,9 @@ def test_lines_inside_the_same_outline_tell_a_shape() -> None:
         found = Candidates(shapes, faces, ["panel", "panel"], view, torch.zeros(2))
         lines = compare_lines(found, target, DEFAULTS.match)
         assert int(lines.argmin()) == number
+        ((made, _),) = bend_best(found, target)
+        assert np.ptp(made.vertices.numpy(), axis=0).max() == pytest.approx(1)
+        assert made.iou > 0.9, "the view grows with the shape"
 
 
 def test_a_template_is_found_by_its_code_and_fitted_to_the_outline(model: Model) -> None:
@@ -133,6 +138,9 @@ def test_a_table_gets_the_slanted_legs_and_the_round_top_of_a_picture() -> None:
     costs = [-float(each.prior.detach()) for each in (bent, whole)]
     assert costs[0] == pytest.approx(costs[1] / 2) and costs[1] > 0.01, "half of it ranks"
     assert torch.equal(bent.shapes[0], whole.shapes[0]), "the shape is bent at its full cost"
+    outline[:, 40:] = 0  # a picture of a part does not make the shape lop-sided
+    (lame,) = bend(found, outline, DEFAULTS.match).shapes
+    assert torch.cdist(lame @ MIRROR, lame).min(1).values.max() < 1e-3
 
 
 @pytest.mark.parametrize("roll_deg", [45.0, -60.0])
@@ -205,6 +213,26 @@ def test_colours_that_are_not_mirror_images_tell_a_wrong_camera() -> None:
     others = target.pixels[[2, 1, 0, 3]]
     lop_sided = Target(torch.where(torch.arange(256) < 128, target.pixels, others))
     assert right < 0.05 < 0.2 < clash((vertices, faces), view, lop_sided, MIRROR)
+
+
+def test_colours_and_edges_rank_candidates() -> None:
+    cube = trimesh.creation.box((0.6, 0.6, 0.6))
+    vertices, faces = divide(torch.tensor(cube.vertices).float(), torch.tensor(cube.faces), 0.1)
+    view = frame_view(vertices, torch.tensor([0.0, 90.0]), torch.tensor([10.0, 10.0]))
+    target = seen(vertices, faces, (0.2, 0.5, 0.3), view.select(torch.tensor([0])))
+    others = target.pixels[[2, 0, 1, 3]]  # the left half, of another colour
+    target = Target(torch.where(torch.arange(256) < 128, target.pixels, others))
+    prior = torch.tensor([0.01, 0.0])
+    found = Candidates([vertices] * 2, [faces] * 2, ["mirrored", "hidden"], view, prior)
+    for colors, kind in ((0.0, "mirrored"), (DEFAULTS.match.colors, "hidden")):
+        match = dataclasses.replace(DEFAULTS.match, colors=colors)
+        options = dataclasses.replace(DEFAULTS, match=match)
+        assert [each[1] for each in bend_best(found, target, options=options)] == [kind]
+    outline = target.outline()
+    holed = outline * (torch.arange(64) % 8 < 4)
+    alike, apart = (likeness(found, each, DEFAULTS.match)[0] for each in (outline, holed))
+    ious = view.ious(vertices, faces, outline)[0], view.ious(vertices, faces, holed)[0]
+    assert alike == pytest.approx(float(ious[0]), abs=0.01) and apart < ious[1] - 0.05
 
 
 def test_guesses_differ_and_a_known_category_is_obeyed(model: Model) -> None:
