@@ -40,6 +40,7 @@ from learn3d.studio.picture_to_mesh.templates import (
     learn_templates,
     likeness,
     spread_out,
+    stretch,
     template,
 )
 from learn3d.studio.picture_to_mesh.write import mesh_bytes
@@ -141,6 +142,25 @@ def test_a_table_gets_the_slanted_legs_and_the_round_top_of_a_picture() -> None:
     outline[:, 40:] = 0  # a picture of a part does not make the shape lop-sided
     (lame,) = bend(found, outline, DEFAULTS.match).shapes
     assert torch.cdist(lame @ MIRROR, lame).min(1).values.max() < 1e-3
+
+
+def test_a_stretched_template_fits_better_and_costs() -> None:
+    box = trimesh.creation.box((0.5, 0.4, 0.3))
+    vertices, faces = torch.tensor(box.vertices).float(), torch.tensor(box.faces)
+    view = frame_view(vertices, torch.tensor([30.0]), torch.tensor([20.0]))
+    outline = view.silhouettes(vertices * torch.tensor([1.2, 0.8, 1.0]), faces)[0]
+    found = Candidates([vertices], [faces], ["box"], view, torch.zeros(1))
+    made = stretch(found, outline, DEFAULTS.match)
+    before, after = (
+        float(each.views.ious(each.shapes, each.faces, outline).detach()) for each in (found, made)
+    )
+    assert after > before + 0.05
+    logs = (made.shapes[0].detach().amax(0) / vertices.amax(0)).log()
+    unequal = float((logs - logs.mean()).square().sum())
+    assert unequal > 1e-3
+    assert float(made.prior.detach()) == pytest.approx(
+        -DEFAULTS.match.stretching * unequal, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("roll_deg", [45.0, -60.0])
