@@ -261,22 +261,28 @@ class Fragments:
         the pixels ``[B, H, W, 3]``.
         """
         viewer = self._viewer(highlights)
-        if own is not None and own.ndim == 4:  # a mesh of one face with one vertex for each pixel
-            count, points = own.shape[1] * own.shape[2], torch.zeros_like(own)
-            if positions:
-                points = ops.interpolate(usable(self.world), self.faces, *self._at)
-            number = torch.arange(count, dtype=torch.int32, device=own.device)
-            index = number.view(1, *own.shape[1:3]) + count * self.is_back
-            index = torch.where(self.covered, index, -1).int()
-            faces = number.long().view(-1, 1).expand(-1, 3)
-            weights = own.new_tensor([1.0, 0.0, 0.0]).expand_as(own)
-            at = viewer, points.flatten(1, 2), faces, index, weights, None, True
-            return ops.lit(colors, -own.flatten(1, 2), parameters, layout, *at)
+        if own is not None and own.ndim == 4:
+            normals, at = -own.flatten(1, 2), self._as_pixels(own, positions)
+            return ops.lit(colors, normals, parameters, layout, viewer, *at, None, True)
         world = self.world.expand(len(self.faces), -1, -1) if self.faces.ndim == 3 else self.world
         normals = ops.normals(world, self.faces, self.mesh.starts, smooth) if own is None else -own
         points = usable(world) if positions else world.detach()
         at = viewer, points, self.faces, *self._at, smooth or own is not None
         return ops.lit(colors, normals, parameters, layout, *at)
+
+    def _as_pixels(self, like: Tensor, positions: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Points, faces, face indices and weights of a mesh of one face with one vertex for each
+        pixel of a raster like ``like [B, H, W, 3]``. Without ``positions`` the points are 0.
+        """
+        count, points = like.shape[1] * like.shape[2], torch.zeros_like(like)
+        if positions:
+            points = ops.interpolate(usable(self.world), self.faces, *self._at)
+        number = torch.arange(count, dtype=torch.int32, device=like.device)
+        index = number.view(1, *like.shape[1:3]) + count * self.is_back
+        index = torch.where(self.covered, index, -1).int()
+        faces = number.long().view(-1, 1).expand(-1, 3)
+        weights = like.new_tensor([1.0, 0.0, 0.0]).expand_as(like)
+        return points.flatten(1, 2), faces, index, weights
 
     @property
     def _at(self) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -28,42 +28,39 @@ def keep_object(mask: np.ndarray, near: float = NEAR) -> tuple[np.ndarray, str |
     if count < 2:
         return mask, None
     areas = np.bincount(regions.ravel(), pixels.ravel())[1:]
-    rows, columns = zip(*ndimage.find_objects(regions), strict=True)
-    lengths = np.array(
-        [max(y.stop - y.start, x.stop - x.start) for y, x in zip(rows, columns, strict=True)]
+    kept = _parts_of_object(regions, areas, near)
+    if kept.all():
+        return mask, None
+    cells = ndimage.distance_transform_edt(
+        regions == 0, return_distances=False, return_indices=True
     )
+    nearest = regions[tuple(cells)]
+    of_object = np.r_[False, kept][nearest].repeat(step, 0).repeat(step, 1)
+    of_object = of_object[: mask.shape[0], : mask.shape[1]]
+    return np.where(of_object, mask, np.uint8(0)), _describe(areas[~kept], areas[kept].sum())
+
+
+def _parts_of_object(regions: np.ndarray, areas: np.ndarray, near: float) -> np.ndarray:
+    """Which of the regions 1 .. N, int [H, W], belong to the object: bool [N]. areas: their pixels
+    [N].
+
+    The largest does, then, in rounds, those near the parts so far.
+    """
+    boxes = ndimage.find_objects(regions)
+    lengths = np.array([max(side.stop - side.start for side in box) for box in boxes])
     largest = int(areas.argmax())
-    kept = np.arange(count) == largest
+    kept = np.arange(len(areas)) == largest
     reach = near * lengths[largest] + _REACH * lengths
     rest = np.flatnonzero(~kept & (areas >= _SPECK * areas[largest]))
     for _ in range(_ROUNDS):
         if not len(rest):
             break
-        gaps = (
-            ndimage.minimum(
-                ndimage.distance_transform_edt(~np.r_[False, kept][regions]), regions, rest + 1
-            )
-            - 1
-        )
-        close = gaps <= reach[rest]
+        distances = ndimage.distance_transform_edt(~np.r_[False, kept][regions])
+        close = ndimage.minimum(distances, regions, rest + 1) - 1 <= reach[rest]
         if not close.any():
             break
         kept[rest[close]], rest = True, rest[~close]
-    if kept.all():
-        return mask, None
-    nearest = regions[
-        tuple(
-            ndimage.distance_transform_edt(
-                regions == 0, return_distances=False, return_indices=True
-            )
-        )
-    ]
-    of_object = (
-        np.r_[False, kept][nearest]
-        .repeat(step, 0)
-        .repeat(step, 1)[: mask.shape[0], : mask.shape[1]]
-    )
-    return np.where(of_object, mask, np.uint8(0)), _describe(areas[~kept], areas[kept].sum())
+    return kept
 
 
 def _describe(left_out: np.ndarray, area: float) -> str | None:

@@ -158,48 +158,67 @@ def read_ply(content: bytes) -> Triangles:
 
 
 def _ply_element(
-    body: bytes, at: int, name: str, count: int, columns: list[tuple[str, list[np.dtype]]]
+    body: bytes, start: int, name: str, count: int, columns: list[tuple[str, list[np.dtype]]]
 ) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], int]:
     """The values of each column with the length of each row's list (1 without a list), and the
     end of the element.
     """
-    end = EOFError(f"it ends within its {count} elements `{name}`")
-    if count < 0 or count * max(sum(types[0].itemsize for _, types in columns), 1) > len(body) - at:
-        raise end
-    start, rows, parts = at, [], [[] for _ in columns]
-    for number in range(count):
-        rows.append([])
-        for (_, types), part in zip(columns, parts, strict=True):
-            length = 1
-            if len(types) > 1:
-                if at + types[0].itemsize > len(body):
-                    raise end
-                length = int(np.frombuffer(body, types[0], 1, at)[0])
-                at += types[0].itemsize
-            if length < 0:
-                raise ValueError("a list has a negative length")
-            rows[-1].append(length)
-            part.append(body[at : at + length * types[-1].itemsize])
-            at += length * types[-1].itemsize
-        if at > len(body):
-            raise end
-        if number == 0 and (at - start) * count <= len(body) - start:
-            table = np.frombuffer(body, _ply_layout(columns, rows[0]), count, start)
-            if all(
-                (table[key] == table[key][0]).all() for key in table.dtype.names if key[0] == "n"
-            ):
-                lengths = [np.full(count, length) for length in rows[0]]
-                values = [table[f"v{k}"].ravel() for k in range(len(columns))]
-                at = start + (at - start) * count
-                break
-    else:
-        lengths = np.array(rows, np.int64).reshape(count, -1).T if columns and count else parts
-        values = [
-            np.frombuffer(b"".join(part), types[-1])
-            for part, (_, types) in zip(parts, columns, strict=True)
-        ]
-    names = [column for column, _ in columns]
-    return dict(zip(names, zip(values, lengths, strict=True), strict=True)), at
+    at, rows = start, []
+    try:
+        if (
+            not 0
+            <= count * max(sum(types[0].itemsize for _, types in columns), 1)
+            <= len(body) - at
+        ):
+            raise EOFError
+        if count:
+            lengths, _, end = _ply_row(body, at, columns)
+            end = start + (end - start) * count
+            if end <= len(body):  # are all rows as long as the first?
+                table = np.frombuffer(body, _ply_layout(columns, lengths), count, start)
+                if all((table[k] == table[k][0]).all() for k in table.dtype.names if k[0] == "n"):
+                    return {
+                        column: (table[f"v{k}"].ravel(), np.full(count, length))
+                        for k, ((column, _), length) in enumerate(
+                            zip(columns, lengths, strict=True)
+                        )
+                    }, end
+        for _ in range(count):
+            rows.append(_ply_row(body, at, columns))
+            at = rows[-1][2]
+    except EOFError:
+        raise EOFError(f"it ends within its {count} elements `{name}`") from None
+    return {
+        column: (
+            np.frombuffer(b"".join(parts[k] for _, parts, _ in rows), types[-1]),
+            np.array([lengths[k] for lengths, _, _ in rows], np.int64),
+        )
+        for k, (column, types) in enumerate(columns)
+    }, at
+
+
+def _ply_row(
+    body: bytes, at: int, columns: list[tuple[str, list[np.dtype]]]
+) -> tuple[list[int], list[bytes], int]:
+    """The length and the bytes of each column of the row at `at`, and its end. Raises EOFError if
+    the file ends before.
+    """
+    lengths, parts = [], []
+    for _, types in columns:
+        length = 1
+        if len(types) > 1:
+            if at + types[0].itemsize > len(body):
+                raise EOFError
+            length = int(np.frombuffer(body, types[0], 1, at)[0])
+            at += types[0].itemsize
+        if length < 0:
+            raise ValueError("a list has a negative length")
+        lengths.append(length)
+        parts.append(body[at : at + length * types[-1].itemsize])
+        at += length * types[-1].itemsize
+    if at > len(body):
+        raise EOFError
+    return lengths, parts, at
 
 
 def _ply_layout(columns: list[tuple[str, list[np.dtype]]], lengths: list[int]) -> np.dtype:
