@@ -51,7 +51,7 @@ def uninterrupted(
     for path in tiny_folder.iterdir():  # not compressed: the tests read them a hundred times
         with np.load(path) as archive:
             np.savez(folder / path.name, archive["arr_0"])
-    small = {"generator": "sphere", "learning_rate": 1e-2, "batch_size": 2, "threads": 1}
+    small = {"generator": "sphere-small", "learning_rate": 1e-2, "batch_size": 2, "threads": 1}
     often = {"validate_every": 2, "checkpoint_every": 3, "pictures_every": 4}
     output = folder / "whole"
     config = tiny_config(output, data=folder, iterations=10, **small, **often)
