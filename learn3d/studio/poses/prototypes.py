@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import nmr
+from learn3d.methods.optimization import adam
 from learn3d.methods.pose_updates import SIZE, TEMPERATURE
 from learn3d.networks.encoders import CODE_SIZE
 from learn3d.networks.generators import GENERATORS
@@ -100,10 +101,9 @@ class Shapes:
         The temperature falls from `start` to `TEMPERATURE`. log_prior: [N, A, E].
         """
         self.codes.requires_grad_()
-        groups = [{"params": self.network.parameters()}]
+        optimizer = adam(self.network, 4e-4)
         if len(self.codes) > 1:
-            groups.append({"params": [self.codes], "lr": 1e-2})
-        optimizer = torch.optim.Adam(groups, 4e-4)
+            optimizer.add_param_group({"params": [self.codes], "lr": 1e-2})
         masks, allowed, _ = self.data
         steps = self.options.steps
         rows = torch.arange(len(masks))

@@ -8,6 +8,7 @@ processes of their own are in `test_runs`.
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import shutil
@@ -19,6 +20,7 @@ import stub_work
 
 from learn3d import commands
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset
+from learn3d.studio.poses.options import PoseOptions
 from learn3d.studio.tables import experiment
 from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS
 
@@ -31,6 +33,7 @@ DATA = {
     "kar": {"procedural": 7, "test": 2, "val": 1, "views": 20},
     "pascal3d": {"procedural": 6, "val": 2, "views": 6},
 }
+QUICK_POSES = {"steps": 5, "restarts": 1, "repeats": 1}
 _SMALL = ("encoder=conv-small", "generator=sphere-small")
 #: --set of every variant: its smallest networks.
 SMALLER = dict.fromkeys(VARIANTS, _SMALL) | {
@@ -75,6 +78,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         ):
             patch.setattr("sys.argv", ["learn3d"])
             patch.setattr(experiment, "run_tasks", stub_work.run_tasks_here)
+            patch.setattr(experiment, "PoseOptions", functools.partial(PoseOptions, **QUICK_POSES))
             assert commands.main("experiment", *words.split(), *smaller) == 0, said.getvalue()
         for path in folder.glob("out/runs/*/*vpl-seed*/*.safetensors"):
             path.unlink()
