@@ -239,9 +239,17 @@ def _number(text: str) -> int:
 
 async def _send_away(scope: Scope, receive: Receive, send: Send) -> None:
     """Ask to come again. The picture is read first, as browsers lose an answer that comes before its end."""
-    with contextlib.suppress(HTTPException, asyncio.TimeoutError, ClientDisconnect):
-        await asyncio.wait_for(_read(Request(scope, receive)), PATIENCE)
+    with contextlib.suppress(asyncio.TimeoutError, ClientDisconnect):
+        await asyncio.wait_for(_discard(Request(scope, receive)), PATIENCE)
     await PlainTextResponse("many visitors are here; try again later", 503)(scope, receive, send)
+
+
+async def _discard(request: Request) -> None:
+    left = MOST_BYTES
+    async for chunk in request.stream():
+        left -= len(chunk)
+        if left < 0:
+            break
 
 
 class Gate:
@@ -264,16 +272,17 @@ class Gate:
 
         headers = Headers(scope=scope)
         address, app = (scope["client"] or ("",))[0], self._app
-        sent = Counter([address] if scope["method"] == "POST" else [])
+        taken = Counter([address] if scope["method"] == "POST" else [])
+        full = self._pictures.total() >= VISITORS or self._pictures[address] >= OF_ADDRESS
         if reason := self._refuse(headers.get("host", ""), headers.get("origin")):
             app = PlainTextResponse(reason, 403)
-        elif sent and (self._pictures.total() >= VISITORS or self._pictures[address] >= OF_ADDRESS):
-            app = _send_away
-        self._pictures += sent
+        elif taken and full:
+            app, taken = _send_away, Counter()  # pictures that are not taken fill no place
+        self._pictures += taken
         try:
             await app(scope, receive, send_with_headers)
         finally:
-            self._pictures -= sent
+            self._pictures -= taken
 
     def _refuse(self, host: str, origin: str | None) -> str | None:
         """The reason to refuse a request with these headers, None for one of the page."""

@@ -292,7 +292,7 @@ def visitor_who_leaves_at_work(page: Page) -> None:
 
 def pictures_of_one_address(page: Page) -> None:
     with contextlib.ExitStack() as crowd:
-        for _ in range(serving.OF_ADDRESS + 10):
+        for _ in range(serving.VISITORS + 10):
             crowd.enter_context(page.connect("127.0.0.2")).sendall(
                 page.head() + page.box.content[:100]
             )
