@@ -15,6 +15,8 @@ class CutOptions:
     """Longer side in pixels of the picture for GrabCut."""
     searched_side: int = 512
     """Longer side in pixels to which a picture is reduced before its object is searched."""
+    cut_out_side: int = 1024
+    """Longer side in pixels to which an object with a mask is reduced."""
     frame: float = 0.15
     """Widest frame around a picture that is peeled off, as a share of its shorter side."""
     frames: int = 4

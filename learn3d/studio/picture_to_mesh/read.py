@@ -48,6 +48,8 @@ def read_picture(
         mask, how, doubt = find_outline(colors, box, options)
         wrong = "if the outline in the strip of views is wrong, give --box or --masks"
         note(f"note: {path}: the object was searched, {how}; {wrong}")
+    else:
+        colors, mask = _reduce_cut_out(colors, mask, options.cut_out_side)
     try:
         check_mask(mask, cropped=not searched)
     except ValueError as error:
@@ -100,6 +102,21 @@ def _reduce(colors: np.ndarray, box: Box | None, side: int) -> tuple[np.ndarray,
         if box == (0, 0, *image.size):  # nearly the whole picture
             box = None
     return np.asarray(image), box
+
+
+def _reduce_cut_out(
+    colors: np.ndarray, mask: np.ndarray, side: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A picture and its mask, reduced until the longer side of the object has at most `side` pixels."""
+    if not (mask > 127).any():
+        return colors, mask
+    left, top, right, bottom = mask_box(mask)
+    scale = side / max(right - left, bottom - top)
+    if scale >= 1:
+        return colors, mask
+    size = [max(1, round(scale * length)) for length in (mask.shape[1], mask.shape[0])]
+    images = (Image.fromarray(each) for each in (colors, mask))
+    return tuple(np.asarray(each.resize(size, Image.Resampling.BOX)) for each in images)
 
 
 def prepare_image(

@@ -144,6 +144,15 @@ def test_a_large_picture_and_its_box_are_reduced_together(tmp_path) -> None:
         read_picture(tmp_path / "large.png", None, (1000, 0, 300, 300))
 
 
+def test_a_large_cut_out_object_is_reduced(tmp_path) -> None:
+    pixels = np.zeros((3000, 4500, 4), np.uint8)
+    pixels[500:1500, 600:2648] = (220, 30, 30, 255)
+    Image.fromarray(pixels).save(tmp_path / "large.png")
+    photo = read_picture(tmp_path / "large.png")
+    assert photo.mask.shape == (1500, 2250) and (photo.mask > 127).sum() == 500 * 1024
+    assert (photo.colors[photo.mask > 127] == (220, 30, 30)).all()
+
+
 def test_a_black_drawing_with_colours_keeps_them() -> None:
     mask, drawn = np.full((40, 40), 255, np.uint8), np.zeros((40, 40, 3), np.uint8)
     for color, without in (((255, 255, 255), True), ((40, 60, 200), False)):
