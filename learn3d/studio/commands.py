@@ -191,6 +191,10 @@ class Reconstruct(OnDataset):
             raise ValueError("give either image files, or --data with --indices")
         if self.box is not None and (len(self.images) > 1 or self.masks):
             raise ValueError("--box is for one photograph, without --masks")
+        if self.smooth:
+            self.refuse("--smooth", "category", "guesses", "refine")
+        if self.model is None and self.which != "last":
+            raise ValueError("--checkpoint chooses one of a run's checkpoints; give --run, too")
         own = ("masks", "box", "crop", "guesses", "smooth")  # options for image files
         self.refuse(*(("--data", *own) if self.data else ("image files", "split", "indices")))
         check_target(self.output, "--output", folder=True)
@@ -202,7 +206,8 @@ class Reconstruct(OnDataset):
             options = {name: getattr(self, name) for name in names}
             options["refined"] = self.refine is not False
             paths = reconstruct_files(self.model, self.output, mesh_format=self.format, **options)
-        say("\n".join(map(str, paths)))
+        for path in paths:
+            say(str(path))
 
 
 class Export(Command):

@@ -1,6 +1,6 @@
 """Reconstruction: from image files, or images of a data set, to mesh files and pictures of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,20 +55,20 @@ def reconstruct_files(
     guesses: int = 1,
     which: str = "last",
     mesh_format: MeshFormat = "glb",
-) -> list[Path]:
+) -> Iterator[Path]:
     """Reconstruct image files with the networks of a run (see `load_model`) and save the results in `folder`.
 
     masks: a file for each image. Without them the object is searched in images without
     transparency, and in all of them with a `box` (see `cutting`). refined, category, smooth, guesses: see
-    `reconstruct_guesses`. Returns the files, named after the images, with "-2" and so on for
-    further guesses (see `save`). Raises ValueError if a mask is empty, or if a result would
+    `reconstruct_guesses`. Yields each file when it is written, named after the image, with "-2" and
+    so on for further guesses (see `save`). Raises ValueError if a mask is empty, or if a result would
     replace an input file. A file that cannot be used is an error after all others are done.
     """
     names = check_files(folder, images, masks, guesses)
     model = load_model(run, which)
     if category is not None:
         check_category(model, category)
-    paths, faults = [], []
+    faults = []
     for name, image, mask in zip(names, images, masks or [None] * len(images), strict=True):
         try:
             photo = read_picture(image, mask, box)
@@ -93,12 +93,11 @@ def reconstruct_files(
         if made[0].kind:
             note(f"{name}: category {', '.join(each.kind for each in made)}")
         results = _result_names(name, len(made))
-        paths += save(folder, results, made, model.config.layout, mesh_format)
+        yield from save(folder, results, made, model.config.layout, mesh_format)
     for error in faults[1:]:
         note(f"error: {error}")
     if faults:
         raise faults[0]
-    return paths
 
 
 def check_files(

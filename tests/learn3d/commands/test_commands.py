@@ -187,6 +187,14 @@ def test_help_names_presets_their_settings_and_columns(command, monkeypatch) -> 
         ),
         ("reconstruct --data {tmp} --output {tmp}/out --no-crop", "--crop does not go with --data"),
         (
+            "reconstruct a.png --output {tmp}/out --smooth --category car --guesses 3",
+            "--category, --guesses does not go with --smooth",
+        ),
+        (
+            "reconstruct a.png --output {tmp}/out --checkpoint best",
+            "--checkpoint chooses one of a run's checkpoints; give --run, too",
+        ),
+        (
             "reconstruct --run {run} --data {data} --output {tmp}/file/x",
             "cannot write {tmp}/file/x: Not a directory; give another",
         ),

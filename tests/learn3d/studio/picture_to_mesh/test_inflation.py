@@ -114,5 +114,5 @@ def test_an_empty_shape_of_a_file_is_said(tmp_path, capsys) -> None:
     pixels = np.zeros((512, 512, 4), np.uint8)
     pixels[20:490, 250] = 255  # a line of one pixel
     Image.fromarray(pixels).save(tmp_path / "line.png")
-    reconstruct_files(None, tmp_path / "meshes", [tmp_path / "line.png"], smooth=True)
+    list(reconstruct_files(None, tmp_path / "meshes", [tmp_path / "line.png"], smooth=True))
     assert "line: the shape is empty" in capsys.readouterr().err

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +28,10 @@ from learn3d.studio.picture_to_mesh.write import export_mesh
 from learn3d.studio.shapes import make_shape
 
 
+def written_files(*arguments: Any, **options: Any) -> list[Path]:
+    return list(reconstruct_files(*arguments, **options))
+
+
 def test_data_set_image_survives_the_way_out_and_back(tiny_set) -> None:
     stored = tiny_set.images[3]
     again = prepare_image(255 - stored[:3].transpose(1, 2, 0), stored[3], crop=False)
@@ -36,7 +42,7 @@ def test_a_plain_background_is_cut_away(finished_run, tmp_path, short_turntables
     picture = np.full((120, 160, 3), 240, np.uint8)
     picture[30:90, 50:110] = (180, 40, 30)
     Image.fromarray(picture).save(tmp_path / "box.png")
-    written = reconstruct_files(finished_run, tmp_path / "out", [tmp_path / "box.png"])
+    written = written_files(finished_run, tmp_path / "out", [tmp_path / "box.png"])
     assert len(trimesh.load(written[0], force="mesh").faces) > 100
     Image.fromarray(np.full((40, 40, 3), 9, np.uint8)).save(tmp_path / "plain.png")
     with pytest.raises(
@@ -62,7 +68,7 @@ def test_a_doubtful_outline_is_said_beside_the_mesh(
     colors = np.full((100, 120, 3), 200, np.uint8)
     colors[40:60] = (150, 30, 30)  # from side to side
     Image.fromarray(colors).save(tmp_path / "band.png")
-    paths = reconstruct_files(finished_run, tmp_path / "out", [tmp_path / "band.png"])
+    paths = written_files(finished_run, tmp_path / "out", [tmp_path / "band.png"])
     said = capsys.readouterr().err
     assert (
         paths[0].is_file()
@@ -169,7 +175,7 @@ def test_results_never_replace_the_images(finished_run, tmp_path) -> None:
     with pytest.raises(
         ValueError, match=r"chair\.png would replace an image that was given; give another --output"
     ):
-        reconstruct_files(finished_run, tmp_path, [tmp_path / "chair.png"])
+        written_files(finished_run, tmp_path, [tmp_path / "chair.png"])
     assert (tmp_path / "chair.png").read_bytes() == before
 
 
@@ -178,9 +184,7 @@ def test_guesses_replace_no_file(finished_run, tmp_path) -> None:
     assert check_files(tmp_path, images, ()) == ["a", "a-2"]
     assert check_files(tmp_path, images, (), guesses=2) == ["000_a", "001_a-2"]
     with pytest.raises(ValueError, match=r"a-2\.png would replace an image that was given"):
-        reconstruct_files(
-            finished_run, tmp_path / "in", [tmp_path / "a.png"], [images[1]], guesses=3
-        )
+        written_files(finished_run, tmp_path / "in", [tmp_path / "a.png"], [images[1]], guesses=3)
 
 
 def test_an_empty_shape_is_an_empty_file(tmp_path) -> None:
@@ -291,7 +295,7 @@ def test_files_and_data_sets_give_the_same_mesh(
     (tmp_path / "in").mkdir()
     Image.fromarray(rgba).save(tmp_path / "photo.png")
     Image.fromarray(rgba).save(tmp_path / "in" / "photo.png")
-    files = reconstruct_files(
+    files = written_files(
         finished_run, tmp_path / "b", [tmp_path / "photo.png"], crop=False, refined=False
     )
     meshes = [trimesh.load(path[0], force="mesh") for path in (files, paths)]
@@ -303,15 +307,13 @@ def test_files_and_data_sets_give_the_same_mesh(
         (surface.vertices.numpy() @ mesh_to_object()).max(0), meshes[0].bounds[1], atol=1e-5
     )
     twins = [tmp_path / "photo.png", tmp_path / "in" / "photo.png"]
-    files = reconstruct_files(finished_run, tmp_path / "c", twins, mesh_format="ply")
+    files = written_files(finished_run, tmp_path / "c", twins, mesh_format="ply")
     assert [p.name for p in files[::3]] == ["000_photo.ply", "001_photo.ply"]
     with pytest.raises(ValueError, match="2 images but 1 masks"):
-        reconstruct_files(finished_run, tmp_path / "d", twins, [tmp_path / "photo.png"])
+        written_files(finished_run, tmp_path / "d", twins, [tmp_path / "photo.png"])
     (tmp_path / "bad.png").write_text("no picture")
     with pytest.raises(ValueError, match=r"bad\.png"):
-        reconstruct_files(
-            finished_run, tmp_path / "e", [tmp_path / "bad.png", tmp_path / "photo.png"]
-        )
+        written_files(finished_run, tmp_path / "e", [tmp_path / "bad.png", tmp_path / "photo.png"])
     assert (tmp_path / "e" / "photo.glb").is_file(), "the others are done"
 
 
