@@ -32,6 +32,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from learn3d.data.conventions import synset_of
 from learn3d.studio.demo.picture import (
     EXAMPLES,
     SIDE,
@@ -180,8 +181,9 @@ def _json_line(message: dict) -> bytes:
 
 def application(models: dict[str, Model], host: str, jobs: JobQueue) -> Starlette:
     """The page for these models, by their displayed names, served under the name `host`."""
-    pictures = {category: example(category) for category in EXAMPLES}
     kinds = dict.fromkeys(kind for model in models.values() for kind in model.categories)
+    known = set(map(synset_of, kinds))
+    pictures = {kind: example(kind) for kind in EXAMPLES if synset_of(kind) in known}
 
     def about(_: Request) -> Response:
         return JSONResponse({"kinds": list(kinds), "examples": list(pictures), "side": SIDE})

@@ -80,7 +80,7 @@ addEventListener("drop", (event) => { event.preventDefault(); $("over").hidden =
 $("undo").onclick = () => goBack(requests.length - 1);
 $("again").onclick = () => goBack(1);
 $("cancel").onclick = () => {
-  const waited = document.body.classList.contains("waiting");
+  const waited = $("views").inert;
   cancel();
   say(`Cancelled.${!waited ? "" : shown ? BACK : " “Start over” makes the mesh."}`);
 };
@@ -100,9 +100,9 @@ function cancel() {
 
 /** Go back to the meshes that were there before the work, and to what belongs to them. */
 function restore() {
-  if (!document.body.classList.contains("waiting")) return;
+  if (!$("views").inert) return;
   if (!shown) return showNothing();
-  document.body.classList.remove("waiting");
+  $("views").inert = false;
   ({ kind, smooth } = shown);
   requests = [...shown.requests];
   stage.showMask(...shown.outline);
@@ -115,7 +115,7 @@ function restore() {
 
 function allowUndo() {
   $("undo").disabled = requests.length < 2;
-  $("again").disabled = requests.length < 2 && (shown || document.body.classList.contains("waiting"));
+  $("again").disabled = requests.length < 2 && (shown || $("views").inert);
 }
 
 /** Say what the object is, or nothing if `which` was said already. */
@@ -169,7 +169,7 @@ async function send() {
   const hints = Object.entries({ box, category: kind, smooth: smooth && 1 }).filter(([, value]) => value);
   const query = new URLSearchParams([["width", width], ["height", height], ...hints]);
   $("downloads").hidden = $("doubt").hidden = true;
-  document.body.classList.add("waiting");
+  $("views").inert = true;
   allowUndo();
   showKind();
   say("Finding the object …");
@@ -245,7 +245,7 @@ async function handle(message, mine) {
 
 function showNothing() {
   [views, shown] = [[], null];
-  document.body.classList.remove("waiting");
+  $("views").inert = false;
   allowUndo();
   $("views").innerHTML = '<div class="card view empty"><p class="quiet">The mesh appears here.</p></div>';
 }
@@ -256,7 +256,7 @@ function addDoubt(text) {
 }
 
 function present(meshes) {
-  document.body.classList.remove("waiting");
+  $("views").inert = false;
   $("views").replaceChildren();
   $("downloads").replaceChildren();
   $("downloads").hidden = $("smooth").hidden = false;
@@ -353,6 +353,7 @@ fetch("about").then((response) => response.json()).then((about) => {
   $("kinds").append($("smooth"));
   showKind();
   $("trained").textContent = new Intl.ListFormat("en-GB", { type: "disjunction" }).format(about.kinds);
+  $("tries").hidden = !about.examples.length;
   for (const example of about.examples) {
     const image = Object.assign(document.createElement("img"), { src: `examples/${example}.png`, alt: example });
     const button = makeButton("", () => take(image.src, example), $("examples"));

@@ -63,7 +63,7 @@ def test_other_pages_cannot(client, server, box, header) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["", "page.js", "about", "examples/chair.png", "none", "../server.py"]
+    "path", ["", "page.js", "about", "examples/airplane.png", "none", "../server.py"]
 )
 def test_browsers_are_told_to_run_and_fetch_nothing_else(client, path) -> None:
     headers = client.get(path).headers
