@@ -24,15 +24,15 @@ from learn3d.terminal import unknown_name
 T = TypeVar("T")
 
 
-def checked(cls: type[T]) -> type[T]:
+def checked(cls: type[T], *, kw_only: bool = False) -> type[T]:
     """Class decorator: a frozen dataclass that raises a ValueError naming each wrong, missing or
     unknown field.
 
+    kw_only: fields are given by name, so those without defaults may follow others.
     `__post_init__` checks fields against each other; it may raise a ValueError, too.
     """
-    cls = dataclass(
-        frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-    )(cls)
+    config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    cls = dataclass(frozen=True, kw_only=kw_only, config=config)(cls)
     check: Callable[..., None] = cls.__init__
 
     @functools.wraps(check)

@@ -15,6 +15,8 @@ import docstring_parser
 import tyro
 from typing_extensions import Self, dataclass_transform  # in typing from Python 3.11 on
 
+from learn3d.settings import checked
+
 Split: TypeAlias = Literal["train", "val", "test"]
 Which: TypeAlias = Annotated[Literal["last", "best"], tyro.conf.arg(name="checkpoint")]
 Runs = tyro.conf.Positional[
@@ -29,13 +31,13 @@ FLAT = (tyro.conf.OmitArgPrefixes, tyro.conf.AvoidSubcommands)
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Command:
-    """Base class of commands, which become frozen dataclasses.
+    """Base class of commands, which become `checked` dataclasses.
 
     `run` does the work and may return an exit status.
     """
 
     def __init_subclass__(cls) -> None:
-        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        checked(cls, kw_only=True)
 
     @classmethod
     def about(cls) -> str:

@@ -8,7 +8,7 @@ from learn3d.data import shards
 from learn3d.data.conventions import IMAGE_SIZE, SET_FILE, has_shards, shards_folder, synset_of
 from learn3d.data.layouts import Layout, check_folder, check_options, load_dataset, reader
 from learn3d.files.writing import check_target, write_json
-from learn3d.settings import Count, split_names
+from learn3d.settings import Count, Pixels, split_names
 from learn3d.tasks import Task, Workers, make_missing
 from learn3d.terminal import align, say
 
@@ -84,7 +84,7 @@ class ConvertDataset(Command):
     """Categories, separated by commas. If not given: all."""
     layout: Layout = "kato"
     """Arrangement of the files of the data set, see docs/data-sets.md."""
-    image_size: int = IMAGE_SIZE
+    image_size: Pixels = IMAGE_SIZE
     """Side of the images in pixels, for the method's encoder; larger images are scaled down."""
     views_per_object: Count | None = None
     """Number of training images to keep of each object. If not given: the layout's protocol, one

@@ -107,7 +107,7 @@ def load_dataset(
             f"category must be one name, or different names joined by commas, got {category!r}"
         )
     protocol = LAYOUTS[layout].training_views
-    views = views_per_object or (protocol if split == "train" else None)
+    views = protocol if views_per_object is None and split == "train" else views_per_object
     options = {"image_size": image_size, "views_per_object": views}
     bins = None if view_bins is None else AngleBins.parse(view_bins)
     check = f"learn3d check-dataset {shlex.quote(str(folder))} --layout {layout}"

@@ -261,7 +261,7 @@ class Figures(OnDataset):
     """File to write; its ending is replaced by those of the figure's formats."""
     labels: tuple[str, ...] = ()
     """Names of the runs. If not given: those of their presets."""
-    images: int | None = None
+    images: Count | None = None
     """Number of images. If not given: 6 in a grid, 3 in an interpolation."""
     indices: tuple[int, ...] = ()
     """Samples of the data set in a grid or an interpolation. If not given: --images of different
@@ -279,6 +279,11 @@ class Figures(OnDataset):
         ]
         self.refuse(f"the figure {self.figure}", *refused)
         runs = open_runs(self.runs, **self.pick("labels"))
+        without = [run.dataset.category for run in runs if run.dataset.poses is None]
+        if without and self.figure != "tsne":
+            raise ValueError(
+                f"the figure {self.figure} needs camera poses, which the data of {without[0]} do not have"
+            )
         save = {
             "grid": grids.save_grid,
             "interpolation": grids.save_interpolation,
@@ -302,7 +307,7 @@ class Report(OnDataset):
     """File to write, .html."""
     labels: tuple[str, ...] = ()
     """Names of the runs. If not given: those of their presets."""
-    objects: int = 12
+    objects: Count = 12
     """Number of objects to show, spread from the best IoU to the worst."""
 
     def run(self) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from learn3d.config import TrainConfig, all_options
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.presets import PRESETS, USUAL_OPTIONS, configure
-from learn3d.settings import split_names
+from learn3d.settings import Count, Step, checked, split_names
 from learn3d.studio.tables.tables import BATCH_DIVISOR, TABLES, VARIANTS, Row
 from learn3d.tasks import ONE_WORKER, Workers
 from learn3d.terminal import unknown_name
@@ -18,7 +18,7 @@ from learn3d.terminal import unknown_name
 _FIXED = (*USUAL_OPTIONS, "layout", "device", "threads", "poses")
 
 
-@dataclass(frozen=True)
+@checked
 class Request:
     """The table that the user asks for, with options."""
 
@@ -32,18 +32,18 @@ class Request:
     """Categories, separated by commas, each trained by itself. If not given: the table's."""
     methods: tuple[str, ...] = ()
     """Methods of the table: labels of rows, or names of variants. If not given: all."""
-    iterations: int | None = None
+    iterations: Step | None = None
     """Training steps; methods with a quarter of the batch, such as Plus, take four times as many.
     If not given: the preset's."""
-    batch_size: int | None = None
+    batch_size: Count | None = None
     """Images per step; Plus and others take a quarter of it. If not given: the preset's."""
-    seeds: int | None = None
+    seeds: Count | None = None
     """Number of seeds, 0 .. seeds - 1. If not given: the table's."""
     layout: Layout | None = None
     """Layout of the data set. If not given: the table's."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device on which the networks run."""
-    threads: int | None = None
+    threads: Count | None = None
     """CPU threads of each run. If not given: cores, or OMP_NUM_THREADS, divided by --jobs; 1 with
     --cluster."""
     set: tuple[str, ...] = ()
@@ -56,8 +56,6 @@ class Request:
     def __post_init__(self) -> None:
         if self.table not in TABLES:
             raise ValueError(f"{unknown_name('table', self.table, TABLES)} (see --list)")
-        if self.seeds is not None and self.seeds < 1:
-            raise ValueError(f"seeds must be at least 1, got {self.seeds}")
 
 
 @dataclass(frozen=True)

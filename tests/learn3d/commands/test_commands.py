@@ -101,16 +101,24 @@ def test_a_mistyped_name_leads_to_the_right_one(words: str, near: str, command) 
     assert status == 2 or f"did you mean {near}" in said
 
 
+PLUS = "train --data x --category chair --output y --preset plus --bank-size 2"
+
+
 @pytest.mark.parametrize(
-    ("option", "said"),
+    ("words", "said"),
     [
-        ("--batch-size 0", "batch_size must be greater than or equal to 1, got 0"),
-        ("--learning-rate -1", "learning_rate must be greater than 0, got -1.0"),
-        ("--batch-size 3", "batch_size must lie in 2 .. 2, got 3"),
+        (f"{PLUS} --batch-size 0", "batch_size must be greater than or equal to 1, got 0"),
+        (f"{PLUS} --learning-rate -1", "learning_rate must be greater than 0, got -1.0"),
+        (f"{PLUS} --batch-size 3", "batch_size must lie in 2 .. 2, got 3"),
+        ("convert-dataset --data x --output y --image-size 0", "image_size must be greater"),
+        ("convert-dataset --data x --output y --views-per-object 0", "views_per_object must be"),
+        ("reconstruct x --output y --guesses 0", "guesses must be greater than or equal to 1"),
+        ("figures grid --runs x --output y --images 0", "images must be greater than or equal"),
+        ("report x --output y --objects -1", "objects must be greater than or equal to 1, got -1"),
+        ("experiment kato --data x --output y --threads 0", "threads must be greater than"),
     ],
 )
-def test_a_refused_value_is_named(option: str, said: str, command) -> None:
-    words = f"train --data x --category chair --output y --preset plus --bank-size 2 {option}"
+def test_a_refused_value_is_named(words: str, said: str, command) -> None:
     status, _, text = command(*words.split())
     assert status == 2 and said in " ".join(text.replace("│", " ").split())
 

@@ -238,7 +238,7 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
         (("tsne", "--truth", "--runs", finished_run), "--truth does not go with the figure tsne"),
         (("grid", "--runs", tmp_path / "nowhere"), "nowhere"),
         (("grid", "--runs", finished_run, "--labels", "a", "b"), "there are 1 runs but 2 labels"),
-        (("grid", "--runs", finished_run, "--images", 0), "has 24 images, 0 were asked for"),
+        (("grid", "--runs", finished_run, "--images", 25), "has 24 images, 25 were asked for"),
         (
             ("tsne", "--runs", finished_run, "--category", "lamp"),
             "03636649_test_images.npz: is missing",
@@ -252,6 +252,15 @@ def test_wrong_inputs_are_errors_in_one_line(call, finished_run, tmp_path) -> No
         assert (code, out) == (1, ""), arguments
         assert err.splitlines()[-1].startswith("error: ") and message in err, (arguments, err)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_figures_need_poses(call, tiny_set, monkeypatch, tmp_path) -> None:
+    without = TrainedModel("a", Ellipsoids(), dataclasses.replace(tiny_set, poses=None))
+    opened = "learn3d.studio.tables.trained_models.open_runs"
+    monkeypatch.setattr(opened, lambda *_, **__: [without])
+    for figure in ("grid", "interpolation"):
+        code, _, err = call(figure, "--runs", "x", "--output", tmp_path / "x")
+        assert code == 1 and f"the figure {figure} needs camera poses" in err
 
 
 def test_other_data_are_shown_without_the_poses_of_the_training(

@@ -132,7 +132,7 @@ def test_changes_reach_the_methods_that_they_name(request_for) -> None:
             {"table": "prgan", "methods": ("prgan",), "set": ("discriminator_channels=8,a",)},
             "discriminator_chan",
         ),
-        ({"seeds": 0}, "seeds must be at least 1"),
+        ({"seeds": 0}, "seeds must be greater than or equal to 1, got 0"),
         ({"iterations": -1}, "iterations must be"),
         ({"layout": "dvr"}, "the layout 'dvr' has no true voxels"),
     ],
