@@ -76,7 +76,7 @@ class DatasetConfig:
     """Replace files of this category that are already in the folder."""
     shards: bool = False
     """Write shards, for data sets that exceed the memory (docs/scale.md). Only for the layouts kato
-    and around. If the command is interrupted, run it again: it continues."""
+    and around. If the command is interrupted, run it again without --overwrite: it continues."""
     workers: Workers = ONE_WORKER
 
     def __post_init__(self) -> None:

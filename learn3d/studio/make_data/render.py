@@ -3,6 +3,7 @@
 `writers` has cameras and files of each layout.
 """
 
+import itertools
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -215,6 +216,8 @@ def make_shards(config: DatasetConfig) -> int:
             )
     note(f"{config.category}: logs are in {folder / '*.log'}")
     if status := make_missing(tasks, config.workers, "shards"):
+        if config.overwrite:
+            note("to keep the shards that are made, run the command again without --overwrite")
         return status
     lists = [
         read_json(path.with_suffix(LIST), 2**28, "the list of a shard's meshes") for path in tasks
@@ -270,6 +273,12 @@ def _parts(items: Sequence[Item]) -> list[list[Item]]:
     return parts
 
 
+def _name_and_size(source: Path | None, item: Item) -> str:
+    """The name of a mesh, and the size of its file if it is from a folder."""
+    path = source / item.file if source else None
+    return f"{item.name} {path.stat().st_size}" if path and path.is_file() else item.name
+
+
 def _check_settings(config: DatasetConfig, folder: Path, splits: dict[str, list[Item]]) -> None:
     """Make the category's folder, and write its settings.
 
@@ -281,9 +290,9 @@ def _check_settings(config: DatasetConfig, folder: Path, splits: dict[str, list[
         for split in SPLITS:
             remove(folder / split)
         path.unlink(missing_ok=True)
-    names = sorted((item.number, item.name) for items in splits.values() for item in items)
-    crc = zlib.crc32("\n".join(name for _, name in names).encode())
-    settings = config.to_dict() | {"list of meshes": f"{len(names)}, CRC-32 {crc:08x}"}
+    items = sorted(itertools.chain(*splits.values()), key=lambda item: item.number)
+    crc = zlib.crc32("\n".join(_name_and_size(config.source, item) for item in items).encode())
+    settings = config.to_dict() | {"list of meshes": f"{len(items)}, CRC-32 {crc:08x}"}
     before = read_json(path, 2**20, "the settings of shards") if path.is_file() else settings
     if different := sorted(k for k in {*settings, *before} if settings.get(k) != before.get(k)):
         raise ValueError(

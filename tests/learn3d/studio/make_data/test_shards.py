@@ -95,6 +95,11 @@ def test_bad_meshes_are_listed_and_another_list_of_meshes_is_refused(
     assert render.make_shards(config) == 0
     out = capsys.readouterr().out
     assert ", 2 skipped" in out and "skipped a.obj" in out and "skipped zz.ply" in out
+    (folder / "a.obj").write_text("v 0\n")
+    with pytest.raises(ValueError, match="were made with another list of meshes"):
+        render.make_shards(config)
+    (folder / "a.obj").write_text("v 0 0\n")
+    assert render.make_shards(config) == 0
     (folder / "a.obj").rename(folder / "zzz.obj")
     with pytest.raises(ValueError, match="were made with another list of meshes"):
         render.make_shards(config)
