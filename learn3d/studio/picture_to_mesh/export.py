@@ -51,6 +51,10 @@ def export(source: Path, target: Path, *, which: str = "last", others: Tensor | 
         tensors |= known_codes(method, dataset, others).tensors()
         if (templates := learn_templates(method, dataset)) is not None:
             tensors |= dict(zip(TEMPLATES, templates, strict=True))
+        else:
+            note(
+                "note: the file has no templates: in the training data no shape has a name of make-dataset --procedural"
+            )
     settings = {name: value for name, value in _UNUSED.items() if hasattr(config.settings, name)}
     settings = dataclasses.replace(config.settings, **settings)
     config = dataclasses.replace(config, settings=settings, data=Path("data"), output=Path("run"))

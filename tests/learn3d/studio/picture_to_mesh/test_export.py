@@ -34,7 +34,7 @@ def test_an_exported_model_gives_the_shapes_of_the_run(
     assert set(method.networks) == {"encoder", "generator"}
 
 
-def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch) -> None:
+def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch, capsys) -> None:
     load = checkpoint.load_method
 
     def with_weights(*arguments, **options):
@@ -45,6 +45,7 @@ def test_no_path_of_the_maker_is_in_the_file(finished_run, tmp_path, monkeypatch
 
     monkeypatch.setattr(checkpoint, "load_method", with_weights)
     export(finished_run, tmp_path / "small.safetensors")
+    assert "note: the file has no templates" in capsys.readouterr().err
     content = (tmp_path / "small.safetensors").read_bytes()
     assert not [path for path in (tmp_path, finished_run) if str(path).encode() in content]
 
