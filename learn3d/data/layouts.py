@@ -17,6 +17,7 @@ from learn3d.data.conventions import (
     LAYOUTS,
     SET_FILE,
     SPLITS,
+    SYNSETS,
     find_splits,
     has_shards,
     shards_folder,
@@ -70,6 +71,37 @@ def require_folder(folder: Path | str) -> None:
         absolute = "" if folder.is_absolute() else f" ({folder.absolute()})"
         advice = "give the folder of the data set, or make it (learn3d make-dataset)"
         raise MissingFile(folder, f"there is no such folder{absolute}; {advice}")
+
+
+def find_categories(layout: str, folder: Path | str) -> dict[str, tuple[str, ...]]:
+    """The categories of a folder (names or synset ids), as files or shards, and the splits of each.
+
+    Raises what the layout's reader raises if there are neither.
+    """
+    found = find_splits(folder, f"*/SPLIT/{SET_FILE}")
+    try:
+        for category, there in reader(layout).contents(folder).items():
+            both = {*there, *found.get(category, ())}
+            found[category] = tuple(split for split in SPLITS if split in both)
+    except (ValueError, OSError):
+        if not found:
+            raise
+    return found
+
+
+def require_categories(layout: str, folder: Path | str, wanted: Sequence[str]) -> None:
+    """Raise MissingFile if a folder does not exist, or has nothing of a category."""
+    require_folder(folder)
+    try:
+        found = set(map(synset_of, find_categories(layout, folder)))
+    except FAULTS:
+        _check_layout(folder, layout)
+        raise
+    if missing := [category for category in wanted if synset_of(category) not in found]:
+        names = {synset: name for name, synset in SYNSETS.items()}
+        there = ", ".join(sorted(names.get(each, each) for each in found)) or "nothing"
+        has = f"has no {', '.join(missing)}; in the layout {layout!r} it has {there}"
+        raise MissingFile(Path(folder), f"{has}; give --category, or another folder")
 
 
 def load_dataset(
@@ -211,14 +243,11 @@ def check_folder(
     """
     check_options(layout)
     require_folder(folder)
-    found = find_splits(folder, f"*/SPLIT/{SET_FILE}")
+    found = {}
     try:
-        for category, there in reader(layout).contents(folder).items():
-            found[category] = tuple(
-                split for split in SPLITS if split in (*there, *found.get(category, ()))
-            )
+        found = find_categories(layout, folder)
     except (ValueError, OSError):  # the check finds this fault, too
-        if not found and not categories:
+        if not categories:
             _check_layout(folder, layout)
             raise
     if not found and not categories:

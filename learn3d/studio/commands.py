@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 import tyro
 
 from learn3d.commands.command import Command, DataFolder, OnDataset, Runs, Which
-from learn3d.data.layouts import Layout
+from learn3d.data.layouts import Layout, require_categories
 from learn3d.files.writing import check_target
 from learn3d.pictures import save_png
-from learn3d.settings import Count
+from learn3d.settings import Count, split_names
 from learn3d.studio.make_data.render import DatasetConfig, make_dataset, make_shards
 from learn3d.studio.picture_to_mesh.export import export
 from learn3d.studio.picture_to_mesh.make import load_model
@@ -41,6 +41,7 @@ class MakeDataset(Command):
     config: DatasetConfig
 
     def run(self) -> int:
+        check_target(self.config.output, "--output", folder=True)
         if self.config.shards:
             return make_shards(self.config)
         say(make_dataset(self.config).text())
@@ -134,6 +135,11 @@ class Experiment(Request, Command):
         if self.list:
             say(describe_tables())
             return 0
+        if not self.report_only:
+            table = TABLES[self.table]
+            check_target(self.output, "--output", folder=True)
+            categories = split_names(self.category) or table.categories
+            require_categories(self.layout or table.layout, self.data, categories)
         return run_experiment(self)
 
 

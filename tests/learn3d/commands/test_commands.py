@@ -181,6 +181,12 @@ def test_help_names_presets_their_settings_and_columns(command, monkeypatch) -> 
             "estimate-poses {data} --category airplane --output {tmp}/poses.png",
             "--output must end in .npz, got {tmp}/poses.png",
         ),
+        ("make-dataset --output {tmp}/file --category chair --procedural 3", "cannot write"),
+        ("experiment kato --data {data} --output {tmp}/file", "cannot write {tmp}/file"),
+        (
+            "experiment kato --data {data} --output {tmp}/x --category airplane,car",
+            "has no car; in the layout 'kato' it has airplane; give --category",
+        ),
         ("evaluate", "give at least one run"),
         ("evaluate {run} {tmp}/nope", "there is no checkpoint {tmp}/nope"),
         (
