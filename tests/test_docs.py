@@ -213,6 +213,7 @@ def test_the_commands_of_the_results_do_not_conflict(monkeypatch):
     """Commands that write into one folder ask for the same runs there."""
     planned, requests = {}, []
     monkeypatch.setattr(sys, "argv", ["learn3d"])
+    monkeypatch.setattr("learn3d.studio.commands.require_categories", lambda *_: None)
     monkeypatch.setattr(
         "learn3d.studio.commands.run_experiment", lambda request: requests.append(request) or 0
     )
