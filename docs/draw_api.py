@@ -92,8 +92,8 @@ def main(output: Path = Path("output")) -> None:
     ]
     pictures = {
         "render_silhouette": gray(1 - nmr.render_silhouette(*mesh, **square)),
-        "render_soft_silhouette": gray(1 - nmr.render_soft_silhouette(*mesh, sigma=1e-3, **square)),
-        "render_soft": nmr.render_soft(*mesh, sigma=1e-3, **look).rgb,
+        "render_soft_silhouette": gray(1 - nmr.render_soft_silhouette(*mesh, sigma=2e-4, **square)),
+        "render_soft": nmr.render_soft(*mesh, sigma=2e-4, **look).rgb,
         "render_transparent": nmr.render_transparent(*mesh, opacity=0.4, **look).rgb,
         "render_rgb": nmr.render_rgb(*mesh, **look),
         "render_depth": gray(
