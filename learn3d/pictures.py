@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from learn3d.data.conventions import DISTANCE
 from learn3d.data.poses import LookAtPoses, Poses
 from learn3d.files import writing
 
+PROGRAM = "learn3d"  # named in the files
 # towards the light, object frame (x right, y up, -z towards the camera of view 0)
 KEY_LIGHT = (0.45, 0.8, -0.4)
 BACK_LIGHT = 0.35  # strength of the light from the opposite side, relative to the key light
@@ -255,8 +257,9 @@ def natural_colors(images: np.ndarray, *, inverted: bool = True) -> np.ndarray:
 
 def save_png(path: Path, rgb: np.ndarray) -> None:
     """Write a picture uint8 [H,W,3], or [H,W,4] with opacity."""
-    buffer = io.BytesIO()
-    Image.fromarray(rgb).save(buffer, format="PNG", optimize=True)
+    buffer, about = io.BytesIO(), PngInfo()
+    about.add_text("Software", PROGRAM)
+    Image.fromarray(rgb).save(buffer, format="PNG", optimize=True, pnginfo=about)
     writing.write_bytes(path, buffer.getvalue())
 
 
@@ -266,6 +269,6 @@ def save_gif(path: Path, frames: np.ndarray, *, frames_per_second: float = 15.0)
     first, *rest = [
         Image.fromarray(f).convert("P", palette=Image.Palette.ADAPTIVE, colors=64) for f in frames
     ]
-    times = {"duration": round(1000 / frames_per_second), "loop": 0}
-    first.save(buffer, format="GIF", save_all=True, append_images=rest, optimize=True, **times)
+    about = {"duration": round(1000 / frames_per_second), "loop": 0, "comment": PROGRAM}
+    first.save(buffer, format="GIF", save_all=True, append_images=rest, optimize=True, **about)
     writing.write_bytes(path, buffer.getvalue())

@@ -22,7 +22,7 @@ from learn3d.studio.picture_to_mesh.make import (
     reconstruct_guesses,
 )
 from learn3d.studio.picture_to_mesh.read import read_picture
-from learn3d.studio.picture_to_mesh.write import MeshFormat, Reconstruction, save
+from learn3d.studio.picture_to_mesh.write import MeshFormat, Reconstruction, check_replaced, save
 from learn3d.terminal import note
 
 
@@ -62,9 +62,11 @@ def reconstruct_files(
     transparency, and in all of them with a `box` (see `cutting`). refined, category, smooth, guesses: see
     `reconstruct_guesses`. Yields each file when it is written, named after the image, with "-2" and
     so on for further guesses (see `save`). Raises ValueError if a mask is empty, or if a result would
-    replace an input file. A file that cannot be used is an error after all others are done.
+    replace a file that this program has not written. A file that cannot be used is an error after all others are done.
     """
     names = check_files(folder, images, masks, guesses)
+    every = [result for name in names for result in _result_names(name, guesses)]
+    check_replaced(folder, every, mesh_format)
     model = load_model(run, which)
     if category is not None:
         check_category(model, category)
@@ -145,11 +147,14 @@ def reconstruct_dataset(
     """Reconstruct images of a data set (indices object * views + view) and save the results in `folder`.
 
     refined: fit the shapes to the masks at the data set's poses; ValueError if it has none.
-    Returns the files, named after category, split and index (see `save`).
+    Returns the files, named after category, split and index (see `save`). ValueError if one would
+    replace a file that this program has not written.
     """
     require_folder(data)
     model = load_model(run, which)
     dataset = checkpoint.load_data(model.config, split, data=data, category=category)
+    names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
+    check_replaced(folder, names, mesh_format)
     batch = dataset.batch(torch.tensor(indices, dtype=torch.int64))
     if refined and batch.poses is None:
         raise ValueError(
@@ -166,6 +171,5 @@ def reconstruct_dataset(
         ]
     else:
         azimuths = azimuths_deg(batch.poses).tolist()
-    names = [f"{dataset.category}_{split}_{index:06}" for index in indices]
     made = list(map(Reconstruction, surfaces, stored, azimuths))
     return save(folder, names, made, model.config.layout, mesh_format)

@@ -13,6 +13,7 @@ from learn3d.data.conventions import mesh_to_object
 from learn3d.data.layouts import LAYOUTS, Layout
 from learn3d.files import writing
 from learn3d.pictures import (
+    PROGRAM,
     Surface,
     draw_around,
     natural_colors,
@@ -26,7 +27,7 @@ from learn3d.studio.picture_to_mesh.fit import View
 MeshFormat: TypeAlias = Literal["glb", "obj", "ply"]
 
 STRIP_SIZE = 192  # side of each picture in a strip, in pixels
-PROGRAM = "learn3d"  # named in the files
+_HEADER_BYTES = 2**16  # part of a file that names the program
 
 
 class Reconstruction(NamedTuple):
@@ -91,6 +92,22 @@ def _finish(tree: dict) -> None:
         views[indices["bufferView"]]["target"] = 34963  # and for their numbers
 
 
+def _paths(folder: Path, name: str, mesh_format: MeshFormat) -> tuple[Path, Path, Path]:
+    """The mesh, the turntable and the strip of a shape."""
+    return tuple(folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png"))
+
+
+def check_replaced(folder: Path, names: Sequence[str], mesh_format: MeshFormat) -> None:
+    """Raise ValueError if `save` would replace a file that this program has not written."""
+    for path in (path for name in names for path in _paths(folder, name, mesh_format)):
+        if path.is_file():
+            with path.open("rb") as file:
+                if PROGRAM.encode() not in file.read(_HEADER_BYTES):
+                    raise ValueError(
+                        f"{path} would be replaced, and is no file of {PROGRAM}; give another --output"
+                    )
+
+
 def save(
     folder: Path,
     names: Sequence[str],
@@ -107,9 +124,7 @@ def save(
     titles = ["input", "mask", "from the input's side", *(f"turned by {k}°" for k in turns[1:])]
     paths = []
     for name, (surface, stored, azimuth_deg, *_) in zip(names, made, strict=True):
-        mesh, animation, strip = (
-            folder / f"{name}.{suffix}" for suffix in (mesh_format, "gif", "png")
-        )
+        mesh, animation, strip = _paths(folder, name, mesh_format)
         export_mesh(mesh, surface)
         save_gif(animation, turntable(surface))
         colors = natural_colors(stored, inverted=LAYOUTS[layout].inverted)

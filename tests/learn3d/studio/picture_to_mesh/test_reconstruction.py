@@ -187,6 +187,22 @@ def test_guesses_replace_no_file(finished_run, tmp_path) -> None:
         written_files(finished_run, tmp_path / "in", [tmp_path / "a.png"], [images[1]], guesses=3)
 
 
+@pytest.mark.parametrize("kind", ["glb", "obj", "ply"])
+def test_files_of_others_are_not_replaced(finished_run, tiny_folder, tmp_path, kind) -> None:
+    def make() -> list[Path]:
+        return reconstruct_dataset(finished_run, tmp_path, tiny_folder, [5], mesh_format=kind)
+
+    files = make()
+    assert make() == files, "a second call replaces its own"
+    for path in files:
+        before = path.read_bytes()
+        path.write_bytes(b"mine")
+        with pytest.raises(ValueError, match=rf"{path.name} would be replaced, and is no file of"):
+            make()
+        assert path.read_bytes() == b"mine"
+        path.write_bytes(before)
+
+
 def test_an_empty_shape_is_an_empty_file(tmp_path) -> None:
     export_mesh(
         tmp_path / "empty.glb", Surface(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int64))
