@@ -6,6 +6,8 @@ const HINTS = {
   add: "Paint over the missing part.",
   remove: "Paint over the part that does not belong to it.",
 };
+const KEYS = " Arrow keys move the cross, with Shift by one pixel; the space bar begins and ends.";
+const MOVES = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const OBJECT = 1, BACKGROUND = 2, OPEN = 3; // the values of learn3d.studio.picture_to_mesh.cutting
 const BRUSH = 12, REACH = 34; // radii in pixels: of a stroke, and of the region around it in which the outline may move
 const LEAST = 8; // pixels of a side of a box
@@ -41,16 +43,22 @@ export class Stage {
   mask = null; // of its object, bytes 0 or 255; null if not known yet
   #tool = null;
   #drag = null;
+  #cross = null; // a point that keys move
   #outline = null; // a canvas
   #found = "";
 
   /** correct({ alpha, strokes, box, before }) is called for each correction; before: the mask that was shown, or null. */
   constructor(canvas, hint, buttons, correct) {
     Object.assign(this, { canvas, hint, buttons, correct });
-    for (const button of buttons) button.onclick = () => this.choose(this.#tool === button.dataset.tool ? null : button.dataset.tool);
+    for (const button of buttons)
+      button.onclick = (event) => {
+        this.choose(this.#tool === button.dataset.tool ? null : button.dataset.tool);
+        if (this.#tool && !event.detail) this.#takeKeys(); // a key has pressed the button
+      };
     this.area = canvas.parentElement; // a box may begin beside the picture
+    this.area.onkeydown = (event) => this.#press(event);
     this.area.onpointerdown = (event) => {
-      this.#drag = null; // a second finger ends a stroke
+      this.#drag = this.#cross = null; // a second finger ends a stroke
       if (!this.#tool) return;
       if (event.button || !event.isPrimary) return this.#draw();
       this.area.setPointerCapture(event.pointerId);
@@ -80,10 +88,11 @@ export class Stage {
   }
 
   choose(tool) {
-    if (tool !== this.#tool) this.#drag = null; // what is drawn belongs to the tool that began it
+    if (tool !== this.#tool) this.#drag = this.#cross = null; // what is drawn belongs to the tool that began it
     this.#tool = tool;
     this.area.classList.toggle("tool", Boolean(tool));
-    this.hint.textContent = `${this.#found}${HINTS[tool] || HINT}`;
+    this.area.tabIndex = this.#cross ? 0 : -1;
+    this.hint.textContent = `${this.#found}${HINTS[tool] || HINT}${this.#cross ? KEYS : ""}`;
     for (const button of this.buttons) button.ariaPressed = button.dataset.tool === tool;
   }
 
@@ -103,6 +112,25 @@ export class Stage {
     const side = Math.ceil(Math.max(right - left, low - top) / share), canvas = canvasOf(side, side);
     canvas.getContext("2d").drawImage(this.cutOut(), side / 2 - (left + right) / 2, side / 2 - (top + low) / 2);
     return canvas;
+  }
+
+  #takeKeys() {
+    this.#cross = [this.canvas.width / 2, this.canvas.height / 2];
+    this.choose(this.#tool);
+    this.area.focus();
+    this.#draw();
+  }
+
+  #press(event) {
+    const move = MOVES[event.key];
+    if (!this.#cross || !(move || event.key === " ")) return;
+    event.preventDefault(); // the page does not scroll
+    if (!move && this.#drag) return this.#finish();
+    const most = [this.canvas.width, this.canvas.height], step = event.shiftKey ? 1 : Math.max(...most) / 40;
+    if (move) this.#cross = this.#cross.map((value, axis) => Math.min(most[axis], Math.max(0, value + step * move[axis])));
+    if (move) this.#drag?.push(this.#cross);
+    else this.#drag = [this.#cross];
+    this.#draw();
   }
 
   #at(event) {
@@ -144,6 +172,11 @@ export class Stage {
     const context = this.canvas.getContext("2d");
     context.putImageData(this.picture.colors, 0, 0);
     if (this.#outline) context.drawImage(this.#outline, 0, 0);
+    this.#drawDrag(context);
+    if (this.#cross) drawCross(context, ...this.#cross);
+  }
+
+  #drawDrag(context) {
     if (!this.#drag) return;
     if (this.#tool === "box") {
       context.setLineDash([8, 6]);
@@ -178,6 +211,18 @@ function drawOutline(mask, width, height) {
   const canvas = canvasOf(width, height);
   canvas.getContext("2d").putImageData(image, 0, 0);
   return canvas;
+}
+
+function drawCross(context, x, y) {
+  for (const [strokeStyle, lineWidth] of [["#000", 6], ["#fff", 3]]) {
+    Object.assign(context, { strokeStyle, lineWidth });
+    context.beginPath();
+    for (const [u, v] of [[16, 0], [0, 16]]) {
+      context.moveTo(x - u, y - v);
+      context.lineTo(x + u, y + v);
+    }
+    context.stroke();
+  }
 }
 
 function boxOf(points) {

@@ -307,6 +307,16 @@ def test_the_outline_is_corrected_by_brushes_and_a_box(single, visit, tmp_path) 
     assert part(left) == 0 and part(right) > 0.3
     correct("Box", (-0.02, 0.2), (0.57, 0.8))  # it begins beside the picture
     assert part(left) > 0.3 and part(right) == 0
+    tab.get_by_role("button", name="Box", exact=True).press("Enter")  # it was on
+    tab.get_by_role("button", name="Box", exact=True).press("Enter")
+    assert "Arrow keys move the cross" in tab.locator("#hint").inner_text()
+    for keys in (["ArrowRight"] * 3 + ["ArrowUp"] * 9, ["ArrowRight"] * 14 + ["ArrowDown"] * 18):
+        for key in keys:
+            tab.keyboard.press(key)
+        if keys[-1] == "ArrowUp":
+            tab.keyboard.press("Space")
+    answered(tab, lambda: tab.keyboard.press("Space"))
+    assert part(left) == 0 and part(right) > 0.3, "a box by keys"
     press(tab, "Add")()
     tab.locator("#picture").click(button="right")
     assert tab.locator(".busy").count() == 0, "the other button does not paint"
