@@ -33,7 +33,8 @@ def check_same(folder: Path, other: Path) -> None:
         for values in map(dataclasses.asdict, (about, about_other)):
             del values["progress"]["seconds"], values["config"]["output"]
             described.append(values)
-        assert described[0] == described[1]
+        differ = [name for name, value in described[0].items() if value != described[1][name]]
+        assert not differ, [tuple(each[key] for each in described) for key in differ]
     assert (folder / "metrics.jsonl").read_text() == (other / "metrics.jsonl").read_text()
     pictures = [
         {path.name: path.read_bytes() for path in (f / "pictures").iterdir()}
