@@ -55,7 +55,7 @@ class PrGANSettings(MethodSettings):
     """Channels at 32^2, 16^2, 8^2 and 4^2; fewer on a small machine."""
     occupancy_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """Predicted voxels with a higher mean are occupied. Not published; Kato's grids hold every
-    cell that a shape touches, so even true shapes reach an IoU of only .35 at 0.5, but .74 at
+    cell that a shape touches, so true airplanes reach an IoU of about 0.46 at 0.5, and 0.95 at
     0.1."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 30.0
     """Elevation of the K views, whose azimuths are equally spaced."""

@@ -60,8 +60,8 @@ class DatasetConfig:
     """Share (below 1, at least 4 meshes) or number of the meshes for the test split. If not given:
     0.2; pascal3d has no test split."""
     val: Weight | None = None
-    """Share or number of the meshes for the validation split, 0 for none. If not given: 0.1, for
-    pascal3d 0.2."""
+    """Share (below 1, at least 4 meshes) or number of the meshes for the validation split, 0 for
+    none. If not given: 0.1, for pascal3d 0.2."""
     augment: WholeNumber = 0
     """Additional copies of each training mesh, with each axis scaled by a random factor in 0.75 ..
     1.25. With --source, shapes of --procedural get none."""
